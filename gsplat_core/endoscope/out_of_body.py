@@ -123,17 +123,19 @@ def evidence_of(image: NDArray[np.uint8]) -> Evidence | None:
     # Average to suppress noise, which would look like varied colours.
     small = averaged(image, _size(image, LONG_SIDE_PX), samples=3)
     cv2.GaussianBlur(small, (0, 0), 1.0, dst=small)
-    ordered = np.sort(small, axis=2)
-    brightness = np.ascontiguousarray(ordered[..., 2])
-    seen = brightness >= DARKEST
-    if not seen.any():
+    brightness, middle = _highest_and_middle(small)
+    levels = _histogram(brightness)
+    seen = levels[DARKEST:].sum()
+    if seen == 0:
         return None
-    lit = brightness >= max(DARKEST, 0.25 * float(brightness[seen].mean()))
-    judged = lit & (ordered[..., 1] < CLIPPED)
-    if np.count_nonzero(lit) < LEAST_LIT * lit.size or np.count_nonzero(judged) < LEAST_JUDGED * np.count_nonzero(lit):
+    mean = float(levels[DARKEST:] @ np.arange(DARKEST, 256)) / seen
+    lit = brightness >= max(DARKEST, 0.25 * mean)
+    judged = lit & (middle < CLIPPED)
+    lit_count, judged_count = np.count_nonzero(lit), np.count_nonzero(judged)
+    if lit_count < LEAST_LIT * lit.size or judged_count < LEAST_JUDGED * lit_count:
         return None
-    levels = np.sort(brightness[judged])
-    quarter, high = (float(levels[int(share * (levels.size - 1))]) for share in (0.25, 0.95))
+    until = np.cumsum(_histogram(brightness, judged))
+    quarter, high = (float(np.searchsorted(until, int(share * (judged_count - 1)), "right")) for share in (0.25, 0.95))
     if high < DIM:
         return None
     red_green, red_blue = (plane[judged] for plane in channels(cv2.transform(cv2.LUT(small, LOGS), RATIOS)))
@@ -224,12 +226,29 @@ def _size(image: NDArray[np.uint8], long_side_px: int) -> tuple[int, int]:
     return max(8, round(width * scale)), max(8, round(height * scale))
 
 
+def _highest_and_middle(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Return the largest and the middle channel of each pixel, uint8 [h, w], of RGB [h, w, 3]."""
+    red, green, blue = channels(image)
+    higher, lower = np.empty_like(red), np.empty_like(red)
+    cv2.max(red, green, dst=higher)
+    cv2.min(red, green, dst=lower)
+    middle = cv2.max(lower, cv2.min(higher, blue, dst=red), dst=lower)
+    return np.asarray(cv2.max(higher, blue, dst=higher), np.uint8), np.asarray(middle, np.uint8)
+
+
+def _histogram(plane: NDArray[np.uint8], counted: NDArray[np.bool_] | None = None) -> NDArray[np.float64]:
+    """Return the number of pixels of each level, [256], of a plane [h, w] where `counted`."""
+    mask = None if counted is None else counted.view(np.uint8)
+    return cv2.calcHist([plane], [0], mask, [256], [0, 256]).ravel().astype(np.float64)
+
+
 def _gradient(
     plane: NDArray[np.uint8], scale: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """Return derivatives along x and y and the gradient's magnitude, by the Sobel kernel times `scale`."""
     across, down = (np.asarray(cv2.Sobel(plane, cv2.CV_32F, x, 1 - x, scale=scale), np.float32) for x in (1, 0))
-    return across, down, np.asarray(cv2.magnitude(across, down), np.float32)
+    # cv2.magnitude rounds differently at other addresses of its arguments.
+    return across, down, np.sqrt(across * across + down * down)
 
 
 def _smooth(grey: NDArray[np.uint8], judged: NDArray[np.bool_]) -> float:
