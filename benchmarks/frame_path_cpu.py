@@ -30,7 +30,7 @@ from operators.graph import Application
 from operators.messages import PictureState, RenderedFrame, ShownPicture
 from operators.metrics import MetricsOp
 from operators.pipeline import analysis_operator
-from operators.side_by_side import Chains, through, with_findings
+from operators.side_by_side import through, with_findings
 from operators.sources.registry import SourceOptions, open_source
 from operators.sources.source import SourceState
 
@@ -57,14 +57,12 @@ class FramePath:
     def take(self, frame: Frame) -> None:
         """Run and time the host's work for one frame."""
         analysis, start = self._analysis, time.thread_time()
-        chains = analysis.chains
-        assert isinstance(chains, Chains)
         with self._timed("out-of-body gate"):
-            gated = through(chains.gate, frame)
+            gated = through(analysis.gate, frame)
         with self._timed("checks of the picture"):
-            decided = through(chains.first, frame)
+            decided = through(analysis.first, frame)
         with self._timed("tool mask and highlights"):
-            found = [through(each, frame) for each in chains.beside]
+            found = [through(each, frame) for each in analysis.beside]
         with self._timed("checks of the tissue"):
             decided = reduce(with_findings, found, decided) if gated.withheld is None else gated
             decided = through(analysis.then, decided)

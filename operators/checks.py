@@ -160,11 +160,6 @@ class OrdinaryStream:
         self._members = 0
         self.reset()
 
-    @property
-    def members(self) -> int:
-        """Number of stages in the rotation."""
-        return self._members
-
     def join(self, stages: int) -> range:
         """Add stages to the rotation, in which each stage checks only some of the ordinary frames.
 
@@ -191,14 +186,6 @@ class OrdinaryStream:
             self._due = self._turns.due(pts_ns)
         else:
             self._turns.all_looked(pts_ns)
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the selection for the current frame, for `take_over` in another process."""
-        return {"ordinary": self.frame_is_ordinary, "due": sorted(self._due)}
-
-    def take_over(self, selection: Mapping[str, Any]) -> None:
-        """Set the selection for the current frame to that of another process."""
-        self.frame_is_ordinary, self._due = bool(selection["ordinary"]), frozenset(selection["due"])
 
     def looks(self, member: int) -> bool:
         """Return True if the stage with this member number runs on the current frame."""

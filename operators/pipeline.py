@@ -25,12 +25,14 @@ from gsplat_core.io.recordings.truth import TissueBehindTools
 from gsplat_core.io.sessions import SessionReader
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.reconstructor import Reconstructor
-from operators.analysis_process import AnalysisProcess, new_chains
 from operators.applications.device import scheduler_for
 from operators.checks import (
+    PICTURE_STAGES,
     TISSUE_STAGES,
     OrdinaryStream,
+    PictureStagesOp,
     SceneNumberStage,
+    StageOp,
     TissueStagesOp,
     new_stages,
 )
@@ -45,12 +47,12 @@ from operators.graph import Application, GreedyScheduler, MultiThreadScheduler, 
 from operators.ingest import SourceOp
 from operators.messages import RenderedFrame, ShownPicture
 from operators.metrics import MetricsOp, ScoredFrame
+from operators.out_of_body import OutOfBodyGateOp
 from operators.pose import pose_operators
 from operators.rasterize import DeformOp, RasterizeOp, Rasterizer
 from operators.reconstruct import ReconstructOp
 from operators.settings import EngineOptions, JobOptions, OutputSection
 from operators.side_by_side import SideBySideOp
-from operators.side_thread import usable_cores
 from operators.sinks.callback import CallbackSinkOp
 from operators.sinks.output_videos import OutputVideosOp
 from operators.sinks.registry import SinkOptions, input_of
@@ -62,14 +64,14 @@ from operators.sinks.session_recorder import (
 )
 from operators.sources.source import FrameSource
 from operators.storage import StorageReserve
-from operators.tool_mask import RecordedToolMaskOp
+from operators.tool_mask import RecordedToolMaskOp, new_tool_mask
 from operators.training import EveryFrame, RecordedCalls, Training, UntilDisplay
 from operators.truth import TruthOp
 
 REPORT_RESERVE_BYTES = 8 * 2**20
 """Disk space reserved for the video's index and the report, in bytes."""
-LEAST_CORES = 4
-"""Number of CPU cores from which the frames of a live run on a GPU are analysed in a process of their own."""
+SIDE_STAGE = "highlights"
+"""A stage with no dependencies; runs concurrently with the other picture stages."""
 
 
 def analysis_operator(
@@ -80,11 +82,10 @@ def analysis_operator(
     *,
     behind_gate: Sequence[Operator] = (),
     behind: Sequence[Operator] = (),
-    apart: bool = False,
 ) -> SideBySideOp:
     """Return the operator between source and reconstruction, with the input and output `frame`.
 
-    Tools and highlights are detected in parallel to the other checks of the picture.
+    Tools, highlights and the other checks of the picture run in parallel.
 
     Args:
         fragment: the graph.
@@ -93,13 +94,19 @@ def analysis_operator(
         positions: operators that set pose and depth of a frame.
         behind_gate: operators inserted directly after the out-of-body gate.
         behind: operators appended at the end.
-        apart: True to analyse pictures in a child process.
     """
+    others = [name for name in PICTURE_STAGES if name != SIDE_STAGE]
     stream = OrdinaryStream()
+    picture_stages = new_stages(PICTURE_STAGES, without=[SIDE_STAGE])
     return SideBySideOp(
         fragment,
         name="analysis",
-        chains=(AnalysisProcess if apart else new_chains)(tool_mask, out_of_body, stream, fragment),
+        gate=[OutOfBodyGateOp(fragment, name="out_of_body", policy=out_of_body)],
+        first=[PictureStagesOp(fragment, name="picture", stages=picture_stages, stream=stream)],
+        beside=[
+            [new_tool_mask(fragment, tool_mask)],
+            [StageOp(fragment, name=SIDE_STAGE, stages=new_stages(PICTURE_STAGES, without=others))],
+        ],
         then=[
             *behind_gate,
             *positions,
@@ -278,7 +285,6 @@ class Pipeline(Application):
                 (*poses, depth),
                 behind_gate=[RecordFramesOp(self, name="recorded_frames", recorder=recorder)] if recorder else [],
                 behind=[RecordPreparationOp(self, name="recorded_preparation", recorder=recorder)] if recorder else [],
-                apart=self.pace.clock is not None and settings.device != "cpu" and usable_cores() >= LEAST_CORES,
             ),
         )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import chain
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -14,94 +14,12 @@ from operators.graph import Operator, OperatorSpec
 from operators.outcome import Contributor, OutcomeBuilder
 
 
-class FrameAnalysis(Protocol):
-    """Analysis of the frames of one stream, in order."""
-
-    def start(self) -> None:
-        """Prepare for the first frame of a stream."""
-        ...
-
-    def stop(self) -> None:
-        """Release all resources, after the last frame of a stream."""
-        ...
-
-    def decide(self, frame: Frame) -> Frame:
-        """Return the frame with the findings in its fields."""
-        ...
-
-    def contribute(self, outcome: OutcomeBuilder) -> None:
-        """Add the results to the outcome of the run."""
-        ...
-
-
-class Chains:
-    """Analysis by several chains of operators that run on each frame in parallel, each in its own thread.
+class SideBySideOp(Operator):
+    """Runs several chains of operators on each frame in parallel, merges their results, and runs a final chain.
 
     Each operator of a chain reads a `Frame` at its input `frame` and emits it with more fields at its output `frame`.
     The result is the frame of the chain `first`, with the `TAKEN_OVER` fields and loss masks of the other chains. If
     the gate withholds the frame, the gate's frame is used instead.
-
-    The operators belong to no graph. They are started and stopped with the chains.
-    """
-
-    def __init__(
-        self, *, gate: Sequence[Operator], first: Sequence[Operator], beside: Sequence[Sequence[Operator]] = ()
-    ) -> None:
-        """Store the chains.
-
-        Args:
-            gate: chain that may withhold a frame from downstream; the other chains see its picture.
-            first: chain whose frame is passed on.
-            beside: chains that run in parallel to `first`; only their `TAKEN_OVER` fields and loss masks are used.
-        """
-        self.gate, self.first = tuple(gate), tuple(first)
-        self.beside = tuple(tuple(part) for part in beside)
-        self._pool: ThreadPoolExecutor | None = None
-
-    @property
-    def parts(self) -> tuple[Operator, ...]:
-        """Return the operators of all chains."""
-        return (*self.gate, *self.first, *chain.from_iterable(self.beside))
-
-    def start(self) -> None:
-        self._pool = ThreadPoolExecutor(1 + len(self.beside), thread_name_prefix="analysis")
-        for operator in self.parts:
-            operator.initialize()
-            operator.start()
-
-    def stop(self) -> None:
-        if self._pool is not None:
-            self._pool.shutdown()
-            self._pool = None
-        for operator in self.parts:
-            operator.stop()
-
-    def decide(self, frame: Frame) -> Frame:
-        assert self._pool is not None
-        # Submit the slowest chains first.
-        others = [self._pool.submit(through, part, frame) for part in (*self.beside, self.gate)]
-        try:
-            decided = through(self.first, frame)
-        finally:
-            # Wait for all chains even if the first one raises, so that none overlaps with the next
-            # frame.
-            for other in others:
-                other.exception()
-        *found, gated = [other.result() for other in others]
-        if gated.withheld is not None:
-            return gated.with_fields(seq=decided.seq, pts_ns=decided.pts_ns)
-        for each in found:
-            decided = with_findings(decided, each)
-        return decided
-
-    def contribute(self, outcome: OutcomeBuilder) -> None:
-        for operator in self.parts:
-            if isinstance(operator, Contributor):
-                operator.contribute(outcome)
-
-
-class SideBySideOp(Operator):
-    """Runs an analysis and then a chain of operators on each frame.
 
     The operators belong to no graph. This operator starts and stops them and forwards their contributions to the
     outcome.
@@ -113,39 +31,71 @@ class SideBySideOp(Operator):
         frame: `Frame`.
 
     Params:
-        chains: the analysis.
-        then: final chain, run on the result of the analysis.
+        gate: chain that may withhold a frame from downstream; the other chains see its picture.
+        first: chain whose frame is passed on.
+        beside: chains that run in parallel to `first`; only their `TAKEN_OVER` fields and loss masks are used.
+        then: final chain, run on the merged frame.
     """
 
     def __init__(
-        self, fragment: Any, *args: Any, chains: FrameAnalysis, then: Sequence[Operator] = (), **kwargs: Any
+        self,
+        fragment: Any,
+        *args: Any,
+        gate: Sequence[Operator],
+        first: Sequence[Operator],
+        beside: Sequence[Sequence[Operator]] = (),
+        then: Sequence[Operator] = (),
+        **kwargs: Any,
     ) -> None:
-        self.chains, self.then = chains, tuple(then)
+        self.gate, self.first, self.then = tuple(gate), tuple(first), tuple(then)
+        self.beside = tuple(tuple(part) for part in beside)
+        self._pool: ThreadPoolExecutor | None = None
         super().__init__(fragment, *args, **kwargs)
+
+    @property
+    def parts(self) -> tuple[Operator, ...]:
+        """Return the operators of all chains."""
+        return (*self.gate, *self.first, *chain.from_iterable(self.beside), *self.then)
 
     def setup(self, spec: OperatorSpec) -> None:
         spec.input("frame", type=Frame)
         spec.output("frame", type=Frame)
 
     def start(self) -> None:
-        self.chains.start()
-        for operator in self.then:
+        self._pool = ThreadPoolExecutor(1 + len(self.beside), thread_name_prefix=self.name)
+        for operator in self.parts:
             operator.initialize()
             operator.start()
 
     def stop(self) -> None:
-        self.chains.stop()
-        for operator in self.then:
+        if self._pool is not None:
+            self._pool.shutdown()
+        for operator in self.parts:
             operator.stop()
 
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
-        decided = self.chains.decide(op_input.receive("frame"))
+        assert self._pool is not None
+        frame: Frame = op_input.receive("frame")
+        # Submit the slowest chains first.
+        others = [self._pool.submit(through, part, frame) for part in (*self.beside, self.gate)]
+        try:
+            decided = through(self.first, frame)
+        finally:
+            # Wait for all chains even if the first one raises, so that none overlaps with the next
+            # frame.
+            for other in others:
+                other.exception()
+        *found, gated = [other.result() for other in others]
+        if gated.withheld is None:
+            for each in found:
+                decided = with_findings(decided, each)
+        else:
+            decided = gated.with_fields(seq=decided.seq, pts_ns=decided.pts_ns)
         op_output.emit(through(self.then, decided), "frame")
 
     def contribute(self, outcome: OutcomeBuilder) -> None:
-        """Add the results of the analysis and of the operators to the outcome of the run."""
-        self.chains.contribute(outcome)
-        for operator in self.then:
+        """Add the results of the operators of all chains to the outcome of the run."""
+        for operator in self.parts:
             if isinstance(operator, Contributor):
                 operator.contribute(outcome)
 

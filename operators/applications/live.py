@@ -5,9 +5,14 @@ Before the first frame, models and operators are warmed up and the interpreter i
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import gc
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
+
+import cv2
 
 from gsplat_core.models.model import Model
 from gsplat_core.models.snapshots import Snapshot
@@ -29,7 +34,6 @@ from operators.applications.working_size import (
     trial_run,
 )
 from operators.frame_clock import FrameClock
-from operators.low_latency import low_latency
 from operators.messages import DeformedScene, ShownPicture
 from operators.metrics import ScoredFrame
 from operators.pipeline import REPORT_RESERVE_BYTES, Outputs, Pace, Pipeline
@@ -40,6 +44,15 @@ from operators.sources.derived import ScaledSource, scaled_description
 from operators.sources.registry import open_source
 from operators.sources.source import FrameSource, SourceDescription
 from operators.storage import StorageReserve
+
+GARBAGE_THRESHOLDS = (20_000, 20, 1000)
+"""Thresholds of the garbage collector. Collections are rare and mostly of young objects: processing
+a frame creates no cycles, and a full collection takes tens of milliseconds.
+"""
+SWITCH_INTERVAL_S = 0.0002
+"""Interpreter switch interval in seconds. With the default of 5 ms, a thread could wait that long for the GIL."""
+OPENCV_THREADS = 1
+"""Number of OpenCV threads. Starting more takes longer than processing a small picture."""
 
 
 def new_live_reconstructor(settings: LiveSettings, source: FrameSource) -> Reconstructor:
@@ -79,6 +92,26 @@ def warm_up(settings: LiveSettings, source: FrameSource) -> LiveParts:
     with seeded(settings.seed, settings.device):
         warm_reconstructor(parts.reconstructor, draw, stereo=source.description.is_stereo)
     return parts
+
+
+@contextmanager
+def low_latency() -> Iterator[None]:
+    """Context manager with a short interpreter switch interval and existing objects exempt from garbage collection."""
+    interval_s = sys.getswitchinterval()
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(min(threads, OPENCV_THREADS))
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
+    gc.collect()
+    gc.freeze()
+    thresholds = gc.get_threshold()
+    gc.set_threshold(*GARBAGE_THRESHOLDS)
+    try:
+        yield
+    finally:
+        gc.set_threshold(*thresholds)
+        gc.unfreeze()
+        cv2.setNumThreads(threads)
+        sys.setswitchinterval(interval_s)
 
 
 def live_graph(

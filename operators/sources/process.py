@@ -22,7 +22,7 @@ import threading
 import time
 import weakref
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
@@ -252,19 +252,12 @@ class Served:
 class ToParent(logging.Handler):
     """Log handler that forwards records to the parent."""
 
-    def __init__(self, send: Callable[..., None]) -> None:
-        """Forward records by `send`, called with the kind and the content of a message."""
+    def __init__(self, served: Served) -> None:
         super().__init__(logging.INFO)
-        self._send = send
+        self._served = served
 
     def emit(self, record: logging.LogRecord) -> None:
-        self._send("log", level=record.levelno, text=record.getMessage()[:2000])
-
-
-def log_record(content: Mapping[str, Any]) -> None:
-    """Log the record of a `ToParent` message in the parent."""
-    level = content.get("level")
-    log.log(level if isinstance(level, int) else logging.INFO, "%s", content.get("text"))
+        self._served.send("log", level=record.levelno, text=record.getMessage()[:2000])
 
 
 def serve_source(connection_fd: int, memory_fd: int) -> None:
@@ -283,7 +276,7 @@ def serve_source(connection_fd: int, memory_fd: int) -> None:
         signal.signal(number, signal.SIG_IGN)
     connection = Connection(connection_fd)
     served = Served(connection, memory_fd)
-    logging.getLogger().addHandler(ToParent(served.send))
+    logging.getLogger().addHandler(ToParent(served))
     logging.getLogger().setLevel(logging.INFO)
     asked = parsed(connection.recv_bytes())
     threading.Thread(target=served.listen, name="listen to the parent", daemon=True).start()
@@ -308,9 +301,8 @@ _BOOT = (
     "import signal, sys, json\n"
     "for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP): signal.signal(number, signal.SIG_IGN)\n"
     "sys.path[:] = json.loads(sys.argv[1])\n"
-    "from importlib import import_module\n"
-    "module, name = sys.argv[2].split(':')\n"
-    "getattr(import_module(module), name)(*map(int, sys.argv[3:]))\n"
+    "from operators.sources.process import serve_source\n"
+    "serve_source(int(sys.argv[2]), int(sys.argv[3]))\n"
 )
 
 
@@ -327,53 +319,37 @@ class Opening:
     address: str = field(repr=False)  # may contain a password
     options: SourceOptions
 
-    def start(self) -> ChildProcess:
-        """Start a process, which opens the source immediately."""
-        return ChildProcess(
-            "operators.sources.process:serve_source",
-            {"opener": self.opener, "address": self.address, "options": asdict(self.options)},
-        )
-
 
 class ChildProcess:
-    """Child process that exchanges messages and frames with this process, as seen by the parent.
+    """Child process that reads one source, as seen by the parent."""
 
-    Attributes:
-        memory_fds: file descriptors of the shared memory.
-    """
-
-    def __init__(self, main: str, asked: Mapping[str, object], memories: int = 1) -> None:
-        """Start the process and send it the message `ask`.
-
-        Args:
-            main: `module:function`, called with the file descriptors of the connection and of each shared memory.
-            asked: content of the message.
-            memories: number of separate shared memories.
-        """
-        self.memory_fds = [new_memory() for _ in range(memories)]
+    def __init__(self, opening: Opening) -> None:
+        """Start the process, which opens its source immediately."""
+        memory_fd = new_memory()
         ours, theirs = Pipe()
-        fds = theirs.fileno(), *self.memory_fds
         try:
             self._process = subprocess.Popen(
-                [sys.executable, "-P", "-c", _BOOT, json.dumps(sys.path), main, *map(str, fds)],
+                [sys.executable, "-P", "-c", _BOOT, json.dumps(sys.path), str(theirs.fileno()), str(memory_fd)],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,  # its output arrives as messages
-                pass_fds=fds,
+                pass_fds=(theirs.fileno(), memory_fd),
                 start_new_session=True,  # keeps Ctrl-C from reaching the process
                 env={**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
             )
         except BaseException:
             ours.close()
-            self._close_memories()
+            os.close(memory_fd)
             raise
         finally:
             theirs.close()
         self.connection: Connection = ours
-        self.frames = FrameReader(self.memory_fds[0])
+        self.frames = FrameReader(memory_fd)
+        self._memory_fd = memory_fd
         self.message_s = time.monotonic()
         """Time of the last received message, by `time.monotonic`."""
-        self.send("ask", **asked)
+        content = {"opener": opening.opener, "address": opening.address, "options": asdict(opening.options)}
+        self.send("ask", **content)
 
     def send(self, kind: str, **content: object) -> None:
         """Send a message to the process. No effect if it has ended."""
@@ -422,11 +398,9 @@ class ChildProcess:
 
     def _forget(self) -> None:
         self.frames.close()
-        self._close_memories()
-
-    def _close_memories(self) -> None:
-        while self.memory_fds:
-            os.close(self.memory_fds.pop())
+        if self._memory_fd >= 0:
+            os.close(self._memory_fd)
+            self._memory_fd = -1
 
     def _how_it_ended(self) -> str:
         try:
@@ -575,8 +549,7 @@ class ProcessSource(LiveSource):
         child = self._child
         assert child is not None
         child.send("open")
-        # The process sends nothing between its description and this message, however long that takes.
-        last_s = child.message_s = time.monotonic()
+        last_s = time.monotonic()
         while not self.wait(0):
             message = child.receive(LOOK_S)
             if message is None:
@@ -613,7 +586,8 @@ class ProcessSource(LiveSource):
                 raise ChildLost(f"its state is {message.get('state')!r:.40}") from error
             self._child_counts = finite_counts(message.get("counts"))
         elif kind == "log":
-            log_record(message)
+            level = message.get("level")
+            log.log(level if isinstance(level, int) else logging.INFO, "%s", message.get("text"))
         elif kind in ("refused", "failed"):
             raise ChildLost(str(message.get("error")))
 
@@ -624,7 +598,7 @@ class ProcessSource(LiveSource):
             SourceUnavailable: the source cannot be opened.
             ChildLost: the process failed or timed out.
         """
-        child = self._opening.start()
+        child = ChildProcess(self._opening)
         self._child = child
         self._finalizer = weakref.finalize(self, child.end)  # ends the process of a source that was never closed
         try:

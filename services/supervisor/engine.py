@@ -27,14 +27,13 @@ from gsplat_core.rendering.registry import check_renderer
 from gsplat_core.transfers import StagedCopies
 from operators.applications.device import check_device
 from operators.applications.limits import check_picture
-from operators.applications.live import LiveParts, live_graph, measured_size, new_parts, warm_up
+from operators.applications.live import LiveParts, live_graph, low_latency, measured_size, new_parts, warm_up
 from operators.applications.live_settings import LiveSettings
 from operators.applications.session import Session
 from operators.applications.working_size import WorkingSize, trial_run
 from operators.errors import SourceUnavailable
 from operators.graph.application import Application
 from operators.graph.tracking import Histogram
-from operators.low_latency import low_latency
 from operators.messages import ShownPicture
 from operators.metrics import ScoredFrame
 from operators.pipeline import Pipeline

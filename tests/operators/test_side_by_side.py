@@ -10,7 +10,7 @@ import pytest
 from gsplat_core.scene.frames import Frame
 from operators.graph import Operator
 from operators.outcome import OutcomeBuilder
-from operators.side_by_side import Chains, SideBySideOp
+from operators.side_by_side import SideBySideOp
 
 
 class Changes(Operator):
@@ -51,8 +51,7 @@ def make():
             name: [Changes(None, change, name=f"{name}{k}") for k, change in enumerate(changes)]
             for name, changes in (("gate", gate), ("first", first), ("second", second), ("then", then))
         }
-        then, beside = chains.pop("then"), [chains.pop("second")]
-        operator = SideBySideOp(None, name="all", chains=Chains(beside=beside, **chains), then=then)
+        operator = SideBySideOp(None, name="all", beside=[chains.pop("second")], **chains)
         operator.start()
         made.append(operator)
         return operator
@@ -129,9 +128,9 @@ def test_an_error_of_either_chain_is_raised_and_the_next_frame_goes_through(make
 
 def test_its_parts_are_started_stopped_and_contribute(make):
     operator = make([fields()], [fields()], [fields()])
-    assert all(part.running for part in (*operator.chains.parts, *operator.then))
+    assert all(part.running for part in operator.parts)
     outcome = OutcomeBuilder()
     operator.contribute(outcome)
     assert set(outcome.notes) == {"first0", "second0", "then0"}
     operator.stop()
-    assert not any(part.running for part in (*operator.chains.parts, *operator.then))
+    assert not any(part.running for part in operator.parts)
