@@ -13,7 +13,7 @@ CPP := $(shell git ls-files 'gsplat_core/*.cpp' 'gsplat_core/*.h' 'gsplat_core/*
 CUDA_ARCHITECTURES ?= native
 CUDA_TOOLKIT := build/cuda-toolkit
 
-.PHONY: demo results mutants test test-all test-isa lint format fuzz bench native cuda compilers lock licences sbom clean always
+.PHONY: demo results mutants test test-all test-again test-isa lint format fuzz bench native cuda compilers lock licences sbom clean always
 
 # Runs on the NVIDIA GPU if torch can use one. The CUDA kernels are built first; a failed build ends the target.
 demo: native
@@ -62,8 +62,17 @@ $(GROUPS:%=test-of-%): export OPENCV_FOR_THREADS_NUM ?= 1
 $(NUMERIC:%=test-of-%): NICE := nice -n 10
 # Child processes load compiled modules instead of compiling them again.
 $(GROUPS:%=test-of-%): export PYTHONDONTWRITEBYTECODE :=
+# Each group keeps its exit code and its failed tests in build/tests, for `test-again`.
 $(GROUPS:%=test-of-%):
-	$(NICE) $(BIN)/python -m pytest $(if $(MARKED),-m "$(MARKED)") $(TESTS)
+	@mkdir -p build/tests; echo 2 > build/tests/$(@:test-of-%=%).code
+	@rc=0; set -x; $(NICE) $(BIN)/python -m pytest -o cache_dir=build/tests/$(@:test-of-%=%) $(if $(MARKED),-m "$(MARKED)") $(AGAIN) $(TESTS) || rc=$$?; \
+	  { set +x; } 2> /dev/null; echo $$rc > build/tests/$(@:test-of-%=%).code; exit $$rc
+
+# Run the tests that failed in the last run once more, one group at a time, and only if the groups ended with failed tests.
+test-again: native .venv/.development
+	@set -e; for group in $(GROUPS); do code=$$(cat build/tests/$$group.code); \
+	  if [ $$code = 1 ]; then $(MAKE) --no-print-directory test-of-$$group MARKED= NICE= AGAIN="--last-failed --last-failed-no-failures none"; \
+	  elif [ $$code != 0 ]; then echo "tests of $$group ended with code $$code"; exit 1; fi; done
 
 lint: .venv/.development
 	$(BIN)/ruff check .
