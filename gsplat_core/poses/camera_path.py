@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from gsplat_core.errors import InvalidInput
 from gsplat_core.geometry.tracks import Points, followed
 from gsplat_core.poses.odometry import LEAST_POINTS, Trajectory, followed_part, trajectory_of
 from gsplat_core.poses.se3 import between
@@ -42,6 +43,8 @@ LEAST_MOTION = 0.005
 """Median motion of the corners, as a share of the longer side, below which the scope counts as static."""
 MOVING_SHARE = 0.75
 """Share of the image motion from which poses are worth an estimate, see `rigid_share`."""
+MOST_FRAMES = 600
+"""Largest number of frames of which a path is estimated. More would take minutes."""
 CERTAIN_SHARE = 0.97
 """Share of the image motion from which poses are estimated without a comparison on validation frames."""
 
@@ -164,8 +167,12 @@ def camera_path_of(frames: Sequence[Frame], camera: Camera) -> CameraPath:
         camera: intrinsics, and the pose of the first frame.
 
     Raises:
-        InvalidInput: as `trajectory_of`.
+        InvalidInput: for more than `MOST_FRAMES` frames, and as `trajectory_of`.
     """
+    if len(frames) > MOST_FRAMES:
+        raise InvalidInput(
+            f"a path is estimated for at most {MOST_FRAMES} frames, not for {len(frames)}: write poses with `intrasplat poses`"
+        )
     found = trajectory_of(frames, camera, separate_breathing=False)
     poses = found.poses.copy()
     poses[:, :3, 3] *= _unit(frames, found, camera)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from gsplat_core.errors import InvalidInput
 from gsplat_core.poses.camera_path import MOVING_SHARE, CameraPath, camera_path_of, rigid_share
 from gsplat_core.poses.se3 import exp
 from tests.gsplat_core.geometry.moving_scope import FIRST, SIDEWAYS, depth_of_surface, video
@@ -44,3 +45,8 @@ def test_the_path_has_the_unit_of_the_depth(frames):
     path = camera_path_of(trained, FIRST)
     centre = -path.at(0.5)[:3, :3].T @ path.at(0.5)[:3, 3]
     np.testing.assert_allclose(centre, 5 * np.array(SIDEWAYS), atol=0.02)
+
+
+def test_a_path_of_many_frames_is_left_to_the_command(frames):
+    with pytest.raises(InvalidInput, match="at most 600 frames, not for 601"):
+        camera_path_of([frames[0]] * 601, FIRST)
