@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.endoscope.reduced import averaged, channels, luma
+from gsplat_core.endoscope.reduced import averaged, channels, luma, median_of
 from gsplat_core.errors import InvalidInput
 
 LONG_SIDE_PX = 96
@@ -134,8 +134,8 @@ def evidence_of(image: NDArray[np.uint8]) -> Evidence | None:
     lit_count, judged_count = np.count_nonzero(lit), np.count_nonzero(judged)
     if lit_count < LEAST_LIT * lit.size or judged_count < LEAST_JUDGED * lit_count:
         return None
-    until = np.cumsum(_histogram(brightness, judged))
-    quarter, high = (float(np.searchsorted(until, int(share * (judged_count - 1)), "right")) for share in (0.25, 0.95))
+    levels = _histogram(brightness, judged)
+    quarter, high = _level_at(levels, 0.25), _level_at(levels, 0.95)
     if high < DIM:
         return None
     red_green, red_blue = (plane[judged] for plane in channels(cv2.transform(cv2.LUT(small, LOGS), RATIOS)))
@@ -242,6 +242,12 @@ def _histogram(plane: NDArray[np.uint8], counted: NDArray[np.bool_] | None = Non
     return cv2.calcHist([plane], [0], mask, [256], [0, 256]).ravel().astype(np.float64)
 
 
+def _level_at(histogram: NDArray[np.float64], share: float) -> float:
+    """Return the level at a quantile of a histogram, [256]; between two pixels the lower one."""
+    below = np.cumsum(histogram)
+    return float(np.searchsorted(below, int(share * (below[-1] - 1)), "right"))
+
+
 def _gradient(
     plane: NDArray[np.uint8], scale: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
@@ -277,11 +283,11 @@ def _straight(image: NDArray[np.uint8], lit: NDArray[np.bool_]) -> float:
     if area < 100:
         return 0.0
     across, down, steepness = _gradient(grey, 1.0)
-    inside = steepness[inner]
-    brightest = float(np.percentile(grey[inner], 95))
-    least = max(float(np.percentile(inside, 100 * (1 - EDGE_SHARE))), EDGE_CONTRAST * brightest)
-    edges = inner & (steepness > least)
-    if np.count_nonzero(edges) < 0.01 * area:
+    brightest = _level_at(_histogram(grey, inner), 0.95)
+    least = max(median_of(steepness[inner], 1 - EDGE_SHARE), EDGE_CONTRAST * brightest)
+    edges = np.flatnonzero(inner & (steepness > least))
+    if len(edges) < 0.01 * area:
         return 0.0
-    directions = (across[edges] + 1j * down[edges]) / steepness[edges]
-    return float(abs((directions**4).mean()))
+    x, y, length = (plane.ravel()[edges] for plane in (across, down, steepness))
+    doubled = ((x + 1j * y) / length) ** 2
+    return float(abs((doubled * doubled).mean()))
