@@ -167,7 +167,7 @@ def local_planes(values: np.ndarray, known: np.ndarray) -> np.ndarray:
 def scared_pair(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
     """Measure stereo depth and a model trained on it against the reference without its rounding error."""
     recording = open_recording(folder)
-    reference = cv2.imread(str(folder / "disparity.tiff"), cv2.IMREAD_UNCHANGED).astype(np.float64)
+    reference = np.asarray(cv2.imread(str(folder / "disparity.tiff"), cv2.IMREAD_UNCHANGED), np.float64)
     smooth = local_planes(reference, (reference > 0).astype(np.float64))
     (frame,), camera, estimator = list(recording), recording.camera, StereoDepth()
     found = estimator.estimate(frame, camera)

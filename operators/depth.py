@@ -220,8 +220,13 @@ class BackgroundDepth:
                 scene = frame.scene
                 found = finder.find(frame.with_fields(new_scene="passed over") if is_new else frame)
                 if found is not None:
-                    fields = {"depth": found.kept, "depth_confidence": found.confidence, "depth_origin": found.origin}
-                    self._put(frame.with_fields(**fields), places=scene != placed)
+                    given = frame.with_fields(
+                        depth=found.kept,
+                        depth_confidence=found.confidence,
+                        depth_origin=found.origin,
+                        depth_error=found.error,
+                    )
+                    self._put(given, places=scene != placed)
                     placed = scene
                 self._rest((time.thread_time() - began_s) * (1 / self._share - 1))
         except BaseException as error:  # noqa: BLE001 - raised again in the operator's thread by `raise_failure`
@@ -321,7 +326,7 @@ class DepthOp(Operator):
         if self._finder is not None:
             given = self._finder.with_depth(frame, shown_only=self.held_out(frame))
         elif frame.depth is not None and not keeps_recorded(self.choice):
-            given = frame.with_fields(depth=None, depth_confidence=None, depth_origin=None)
+            given = frame.with_fields(depth=None, depth_confidence=None, depth_origin=None, depth_error=None)
         self._counts.take(frame, given)
         if self.background is not None:
             self.background.raise_failure()

@@ -176,8 +176,12 @@ class Learner:
             self._record(lambda: Rehearsed(steps=steps))
 
     def whole_model(self) -> Model | None:
-        """Return the model with its deformable past as an independent copy; None before the first publication."""
-        return None if self.newest is None else self.reconstructor.whole_model(self.newest)
+        """Return the model with its deformable past and the errors of its depth, as an independent copy; None before the first
+        publication.
+        """
+        if self.newest is None:
+            return None
+        return self.reconstructor.with_depth_errors(self.reconstructor.whole_model(self.newest))
 
     def _record(self, line: Callable[[], ScheduleLine]) -> None:
         if self._recorder is not None:

@@ -44,6 +44,8 @@ class DepthMap:
     origin: DepthOrigin
     metric: bool
     """True if the depth is in millimetres; otherwise it is known up to one factor."""
+    error: float | None = None
+    """Typical standard error of the confident depth, relative to it; None for the one assumed for its origin."""
     doubt: str | None = None
     """Reason why the whole map is rejected, as a sentence, or None. A rejected map has zero confidence everywhere."""
 

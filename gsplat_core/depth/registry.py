@@ -207,9 +207,11 @@ class DepthFinder:
         """Return the frame with the selected depth, or without depth if there is none."""
         found = self.find(frame, shown_only=shown_only)
         if found is None:
-            return frame.with_fields(depth=None, depth_confidence=None, depth_origin=None)
+            return frame.with_fields(depth=None, depth_confidence=None, depth_origin=None, depth_error=None)
         if found.depth is frame.depth:
             # A second plane is stored only if some known depth is rejected.
             doubts = bool(np.any((found.confidence == 0) & (frame.depth > 0)))
             return frame.with_fields(depth_confidence=found.confidence) if doubts else frame
-        return frame.with_fields(depth=found.kept, depth_confidence=found.confidence, depth_origin=found.origin)
+        return frame.with_fields(
+            depth=found.kept, depth_confidence=found.confidence, depth_origin=found.origin, depth_error=found.error
+        )

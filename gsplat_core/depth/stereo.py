@@ -403,7 +403,16 @@ class StereoDepth(Estimator):
         if why is not None:
             self._look_in = 0
             return doubted(shape, STEREO, why)
-        return found
+        return found if found.doubt is not None else replace(found, error=self._typical_error(found, frame, camera))
+
+    def _typical_error(self, found: DepthMap, frame: Frame, camera: Camera) -> float:
+        """Return the median relative standard error of confident depth."""
+        step = max(1, frame.width_px // SAMPLED_PX)
+        some = replace(found, depth=found.depth[::step, ::step], confidence=found.confidence[::step, ::step])
+        known = (some.confidence >= BELIEVED) & (some.depth > 0)
+        if not known.any():
+            return STEREO.relative_error
+        return float(np.median((self.standard_error(some, frame, camera)[known]) / some.depth[known]))
 
     def standard_error(self, found: DepthMap, frame: Frame, camera: Camera) -> NDArray[np.float32]:
         """Return the standard error of the last estimated depth [H, W] in its unit; meaningless where it is unknown.

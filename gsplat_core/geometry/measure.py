@@ -1,7 +1,7 @@
 """Measurement of points, distances and lengths on a model's surface, each with a standard error.
 
 The standard error of a point has two independent parts: the depth ambiguity of pixels that show several surfaces, and
-the error of the model's depth (`DepthOrigin.relative_error`). Half of the variance of the second part is a scale error
+the error of the model's depth (`DepthSource.relative_error`). Half of the variance of the second part is a scale error
 of the whole scene. The other half is independent between two points. The thickness of the splats and the opacity of a
 pixel do not predict its depth error, so they are not part of it. The camera is assumed exact.
 """
@@ -82,7 +82,8 @@ class Measurement:
         self.metric = model.metric
         self.origin = None if model.depth_source is None else model.depth_source.origin
         self._surface = _on_host(model.surface(time_s, self.camera))
-        self._relative_error = UNKNOWN_ERROR if self.origin is None else self.origin.relative_error
+        source = model.depth_source
+        self._relative_error = UNKNOWN_ERROR if source is None else source.relative_error(time_s)
         pixels = self.camera.width_px * self.camera.height_px
         self._splat_px = math.sqrt(pixels / max(model.gaussians.count, 1))
 

@@ -42,6 +42,7 @@ Side = Annotated[int, Field(ge=1, le=MAX_SIDE_PX)]
 Text = Annotated[str, Field(max_length=MAX_TEXT)]
 Number = Annotated[float, Field(ge=-1e9, le=1e9)]
 Positive = Annotated[float, Field(gt=0, le=1e9)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
 class InvalidMessage(Exception):
@@ -145,6 +146,8 @@ class FrameFields(Record):
     """Camera of the right eye; its pose maps left-camera coordinates to its own."""
     depth_origin: Origin | None = None
     """None if the frame has no depth, or in recordings of earlier versions."""
+    depth_error: NotNegative | None = None
+    """Relative standard error of the depth; None if unknown, or in recordings of earlier versions."""
     arrived_ns: Nanoseconds | None = None
     exposure: tuple[Positive, Positive, Positive] | None = None
     """Gain of red, green and blue; None for 1 each."""
@@ -192,6 +195,7 @@ def fields_of(frame: Frame) -> dict[str, Any]:
         "damage": short(frame.damage),
         "right_camera": None if frame.right_camera is None else camera_record(frame.right_camera),
         "depth_origin": None if frame.depth_origin is None else frame.depth_origin.name,
+        "depth_error": frame.depth_error,
         "arrived_ns": frame.arrived_ns,
         "exposure": None if frame.exposure == (1.0, 1.0, 1.0) else tuple(map(float, frame.exposure)),
         "withheld": short(frame.withheld),
@@ -222,6 +226,7 @@ def frame_from(seq: int, pts_ns: int, fields: FrameFields, arrays: Mapping[str, 
         "damage": fields.damage,
         "right_camera": None if fields.right_camera is None else camera_of(fields.right_camera),
         "depth_origin": None if fields.depth_origin is None else DEPTH_ORIGINS[fields.depth_origin],
+        "depth_error": fields.depth_error,
         "arrived_ns": fields.arrived_ns,
         "exposure": fields.exposure or (1.0, 1.0, 1.0),
         "withheld": fields.withheld,

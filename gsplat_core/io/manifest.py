@@ -7,6 +7,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from dataclasses import field as dataclass_field
+from itertools import pairwise
 from typing import Any, cast
 
 import numpy as np
@@ -19,7 +20,7 @@ from gsplat_core.io.json_object import JsonObject
 from gsplat_core.models.model import Model, TrainedBy
 from gsplat_core.scene.cameras import CAMERA_MODELS, Camera, CameraModel
 from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
-from gsplat_core.scene.depth_source import DepthSource
+from gsplat_core.scene.depth_source import DepthError, DepthSource
 from gsplat_core.scene.gaussians import MAX_SH_DEGREE, Gaussians
 from gsplat_core.value_ranges import IntegerIn, NumberIn, shortened
 
@@ -44,6 +45,7 @@ ROTATION_TOLERANCE = 2e-3
 """Tolerance of the pose's R Rᵀ from the identity (per entry) and of its determinant from 1."""
 TENSOR_BYTES = IntegerIn(0, 1 << 40)
 PARAMETERS = IntegerIn(0, 1 << 38)
+DEPTH_ERROR, MOST_DEPTH_ERRORS = NumberIn(0, 1), 1024
 EXTRA_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
 MOST_EXTRA = 16
 """Largest number of extra tensors."""
@@ -162,7 +164,26 @@ def _depth_source(reader: JsonObject) -> DepthSource:
     metric = reader.boolean("metric")
     if metric and not origin.is_metric(eyes_calibrated=True):
         raise BundleCorrupt(f"{reader.name}: depth of origin {origin.name!r} has no unit, and metric is true")
-    return DepthSource(origin, metric)
+    return DepthSource(origin, metric, _depth_errors(reader) if "errors" in reader.values else ())
+
+
+def _depth_errors(reader: JsonObject) -> tuple[DepthError, ...]:
+    """Return the errors of a model's depth, listed as pairs of time and relative error."""
+    listed = reader.values["errors"]
+    if not isinstance(listed, list) or not 1 <= len(listed) <= MOST_DEPTH_ERRORS:
+        raise BundleCorrupt(
+            f"{reader.name}: errors must be a list of 1 to {MOST_DEPTH_ERRORS} pairs, got {shortened(listed)}"
+        )
+    name = f"{reader.name}: errors"
+    pairs = [JsonObject({"time_s": pair[0], "relative": pair[1]}, name) for pair in listed if _is_pair(pair)]
+    found = tuple(DepthError(pair.number("time_s", TIME_S), pair.number("relative", DEPTH_ERROR)) for pair in pairs)
+    if len(found) != len(listed) or any(second.time_s <= first.time_s for first, second in pairwise(found)):
+        raise BundleCorrupt(f"{name} must be pairs of time and relative error in temporal order")
+    return found
+
+
+def _is_pair(value: object) -> bool:
+    return isinstance(value, list) and len(value) == 2
 
 
 def _camera(reader: JsonObject) -> Camera:

@@ -182,7 +182,11 @@ class Model:
         """Return everything except tensors and version as JSON-serialisable values."""
         source = self.depth_source
         # Omitted if unknown, which preserves the digest of models of earlier versions.
-        depth = {} if source is None else {"depth": {"origin": source.origin.name, "metric": source.metric}}
+        depth: dict[str, Any] = {}
+        if source is not None:
+            depth = {"depth": {"origin": source.origin.name, "metric": source.metric}}
+            if source.errors:
+                depth["depth"]["errors"] = [list(each) for each in source.errors]
         right: dict[str, Any] = {} if self.gaussians.right_sh is None else {"right_eye": True}
         if self.gaussians.extra:
             right["extra"] = {name: list(tensor.shape[1:]) for name, tensor in self.gaussians.extra.items()}

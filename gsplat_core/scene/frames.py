@@ -46,6 +46,8 @@ class Frame:
     """Confidence of each pixel's depth [H, W], 0 to 1; None for full confidence."""
     depth_origin: DepthOrigin | None = None
     """Origin of `depth`; None without depth. Depth without an origin counts as recorded with the frame (`MEASURED`)."""
+    depth_error: float | None = None
+    """Typical standard error of `depth`, relative to it; None for the one assumed for its origin."""
     ranges: RangeScan | None = None
     """Scan of a range sensor at the camera's position; None without one."""
     mask: NDArray[np.uint8] | None = None
@@ -121,6 +123,8 @@ class Frame:
                 raise InvalidInput(f"frame {self.seq}: {name} is {list(plane.shape)}, the image is {list(size)}")
         if self.pose is not None and self.pose.shape != (4, 4):
             raise InvalidInput(f"frame {self.seq}: pose must be [4, 4] world-to-camera, got {list(self.pose.shape)}")
+        if self.depth_error is not None and not (math.isfinite(self.depth_error) and self.depth_error >= 0):
+            raise InvalidInput(f"frame {self.seq}: depth_error is {self.depth_error}; it must be at least 0")
         if not all(math.isfinite(gain) and gain > 0 for gain in self.exposure):
             raise InvalidInput(f"frame {self.seq}: exposure must be three positive numbers, got {self.exposure}")
 

@@ -34,6 +34,8 @@ class Observation:
     """Mask uint8 [H, W]; 1 = tissue."""
     depth: Tensor | None
     """Depth float32 [H, W] in millimetres; 0 = unknown."""
+    depth_error: float = 0.0
+    """Typical relative standard error of the depth."""
     rehearsal_mask: Tensor | None = None
     """Mask uint8 [H, W]; 0 = ignored when the frame is trained on again later."""
     right_eye: RightEye | None = None
@@ -93,6 +95,7 @@ class Observation:
             image=tensor_of(scene_colours(frame.image, frame.exposure), device),
             mask=tensor_of(mask.astype(np.uint8, copy=False), device),
             depth=learned_depth(frame, device),
+            depth_error=error_of_depth(frame),
             rehearsal_mask=None if frame.rehearsal_mask is None else tensor_of(frame.rehearsal_mask, device),
             ranges=frame.ranges,
             labels=None if frame.labels is None else tensor_of(frame.labels, device),
@@ -119,6 +122,13 @@ def scene_colours(image: NDArray[np.uint8], exposure: tuple[float, float, float]
     if exposure == (1.0, 1.0, 1.0):
         return image
     return np.rint(np.clip(image / np.array(exposure, np.float32), 0, 255)).astype(np.uint8)
+
+
+def error_of_depth(frame: Frame) -> float:
+    """Return the typical relative standard error of a frame's depth; 0 without depth."""
+    if frame.depth is None or frame.depth_origin is None:
+        return 0.0
+    return frame.depth_origin.relative_error if frame.depth_error is None else frame.depth_error
 
 
 def learned_depth(frame: Frame, device: torch.device | str = "cpu") -> Tensor | None:

@@ -34,7 +34,7 @@ from gsplat_core.scene.gaussians import LOG_SCALE, POSITION, Gaussians
 from gsplat_core.training.growth.covering import UNCOVERED_ALPHA
 from gsplat_core.training.growth.initialisation import filled, tissue_depth
 from gsplat_core.training.motion.image_motion import NEAREST, Seen, beside
-from gsplat_core.training.observations import Observation, known_depth, learned_depth
+from gsplat_core.training.observations import Observation, error_of_depth, known_depth, learned_depth
 from gsplat_core.training.steps.step import TrainingStep
 from gsplat_core.transfers import tensor_of
 
@@ -73,9 +73,9 @@ class LateDepth:
         possible = possible_depth(frame)
         return LateDepth(None, known_depth(possible, device) if possible.any() else None, None)
 
-    def added_to(self, seen: Observation) -> Observation:
-        """Return the observation with `believed` as the target of its depth loss."""
-        return replace(seen, depth=self.believed)
+    def added_to(self, seen: Observation, frame: Frame) -> Observation:
+        """Return the observation of `frame` with `believed` as the target of its depth loss."""
+        return replace(seen, depth=self.believed, depth_error=error_of_depth(frame))
 
 
 LARGEST_STEP = 1.4

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -23,6 +24,7 @@ from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.budget import Budget, ObserveReport
 from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.depth_errors import depth_errors
 from gsplat_core.training.growth.covering import Covering
 from gsplat_core.training.growth.initialisation import gaussians_from_frame
 from gsplat_core.training.growth.start_on_device import StartOnDevice
@@ -208,7 +210,7 @@ class Reconstructor:
             return False
         self._schedule.settle(self._step)
         late = late or LateDepth.of(frame, self.device)
-        observation, was_placed = late.added_to(seen), self._placement.is_placed
+        observation, was_placed = late.added_to(seen, frame), self._placement.is_placed
         self._window.replace(observation)
         self._placement.apply(self._step, frame, observation, self._learned_s, late)
         is_first = self._placement.is_placed and not was_placed
@@ -382,6 +384,16 @@ class Reconstructor:
         self._version += 1
         with continued(step, prior, self._learned_s):
             return self._slots.publish(step.gaussians, step.field, **self._facts())
+
+    def with_depth_errors(self, model: Model) -> Model:
+        """Return a model of this reconstructor that states the errors of its depth at frames of the training window.
+
+        Renders a few depth maps, and synchronises.
+        """
+        if self._step is None or model.depth_source is None:
+            return model
+        errors = depth_errors(model, self._step.frames())
+        return replace(model, depth_source=replace(model.depth_source, errors=errors))
 
     def whole_model(self, shown: Model | Snapshot) -> Model:
         """Return the model with its past in its own memory. `shown` is the last published model."""

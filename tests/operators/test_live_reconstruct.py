@@ -37,6 +37,9 @@ class FakeReconstructor:
     def whole_model(self, shown):
         return self.make_model(shown.version + 100)
 
+    def with_depth_errors(self, model):
+        return model
+
     def begin_scene(self, frame, *, anew=False):
         self.calls.append(("begin_scene", frame.seq, anew) if anew else ("begin_scene", frame.seq))
         return False

@@ -217,7 +217,7 @@ def late_depth_of(line: DepthTaken, pictures: SegmentPictures) -> dict[str, Any]
     if damage is not None or "depth" not in planes:
         return None
     confidence, origin = planes.get("depth_confidence"), DEPTH_ORIGINS[line.origin]
-    return {"depth": planes["depth"], "depth_confidence": confidence, "depth_origin": origin}
+    return {"depth": planes["depth"], "depth_confidence": confidence, "depth_origin": origin, "depth_error": line.error}
 
 
 def _frame(line: FrameLine | PreparedLine, planes: dict[str, NDArray[Any]], damage: str | None) -> Frame | None:

@@ -21,6 +21,7 @@ from gsplat_core.io.frame_codec import (
     Count,
     FrameFields,
     Nanoseconds,
+    NotNegative,
     Origin,
     Pose,
     Record,
@@ -185,6 +186,8 @@ class DepthTaken(Record):
     event: Literal["take_depth"] = "take_depth"
     seq: Count
     origin: Origin
+    error: NotNegative | None = None
+    """Relative standard error of the depth; None if unknown, or in recordings of earlier versions."""
     width_px: Side
     height_px: Side
     tracks: Tracks

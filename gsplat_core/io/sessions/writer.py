@@ -266,7 +266,12 @@ class SessionWriter:
         width_px, height_px = frame.width_px, frame.height_px
         self._segment.line(
             DepthTaken(
-                seq=frame.seq, origin=frame.depth_origin.name, width_px=width_px, height_px=height_px, tracks=tracks
+                seq=frame.seq,
+                origin=frame.depth_origin.name,
+                error=frame.depth_error,
+                width_px=width_px,
+                height_px=height_px,
+                tracks=tracks,
             )
         )
 

@@ -14,7 +14,7 @@ from gsplat_core.errors import InvalidSetting
 from gsplat_core.geometry.measure import Measurement, SurfacePoint
 from gsplat_core.io.recordings.synthetic.rendered import RenderSettings, render_recording
 from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
-from gsplat_core.scene.depth_source import DepthSource
+from gsplat_core.scene.depth_source import DepthError, DepthSource
 
 CAMERA = Camera.from_focal(60.0, 64, 48)
 MEASURED = DepthSource(DEPTH_ORIGINS["measured"], metric=True)
@@ -186,6 +186,16 @@ def test_the_error_of_a_point_contains_that_of_the_depth_source():
     assert without[None] == pytest.approx(without["measured"], abs=1e-6 * 2500)
     np.testing.assert_allclose(list(without.values()), without["measured"], atol=1e-6 * 2500)
     assert 0 <= without["measured"] < (0.01 * 50) ** 2
+
+
+def test_measured_errors_of_depth_replace_the_assumed_one():
+    source = replace(MEASURED, errors=(DepthError(0.2, 0.02), DepthError(0.6, 0.04)))
+    model, plain = slope(0.0, source=source), Measurement(slope(0.0), 0.0).point(20, 30)
+    own = plain.depth_error**2 - plain.source_error**2
+    for time_s, relative in ((0.0, 0.02), (0.4, 0.03), (1.0, 0.04)):
+        point = Measurement(model, time_s).point(20, 30)
+        assert point.source_error == pytest.approx(relative * point.depth)
+        assert point.depth_error == pytest.approx(math.sqrt(own + point.source_error**2))
 
 
 def test_a_point_belongs_to_the_middle_of_its_pixel():

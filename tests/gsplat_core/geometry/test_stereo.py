@@ -348,3 +348,7 @@ def test_the_interval_contains_the_depth_and_grows_with_the_row_error(left, righ
     lower = StereoDepth()
     moved = lower.estimate(lowered, camera())
     assert np.median(lower.standard_error(moved, lowered, camera())[seen]) > 5 * np.median(error[seen])
+    # The map states the median of that error, relative to the depth.
+    for each, errors in ((found, error), (moved, lower.standard_error(moved, lowered, camera()))):
+        sure = each.confidence >= 0.5
+        assert each.error == pytest.approx(np.median(errors[sure] / each.depth[sure]), rel=0.05)

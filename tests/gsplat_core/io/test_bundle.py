@@ -15,7 +15,7 @@ from gsplat_core.io.bundle import load_bundle, save_bundle
 from gsplat_core.models.model import Model
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
-from gsplat_core.scene.depth_source import DepthSource
+from gsplat_core.scene.depth_source import DepthError, DepthSource
 
 CAMERA = Camera([[812.5, 0, 319.25], [0, 811.0, 255.75], [0, 0, 1]], 640, 512)
 
@@ -86,7 +86,12 @@ def test_extra_tensors_are_kept_and_part_of_the_digest(make_gaussians, tmp_path)
 
 
 @pytest.mark.parametrize(
-    "source", [None, *(DepthSource(origin, metric=False) for origin in (DEPTH_ORIGINS[name] for name in DEPTH_ORIGINS))]
+    "source",
+    [
+        None,
+        *(DepthSource(DEPTH_ORIGINS[name], metric=False) for name in DEPTH_ORIGINS),
+        DepthSource(DEPTH_ORIGINS["stereo"], False, (DepthError(0.25, 0.01), DepthError(0.5, 0.02))),
+    ],
 )
 def test_where_depth_comes_from_is_kept_and_part_of_the_digest(source, make_gaussians, tmp_path):
     model = replace(make_model(make_gaussians(4)), depth_source=source)
@@ -106,6 +111,11 @@ def test_where_depth_comes_from_is_kept_and_part_of_the_digest(source, make_gaus
         ({"origin": "parallax", "metric": True}, "depth of origin 'parallax' has no unit"),
         ({"origin": "learned", "metric": True}, "depth of origin 'learned' has no unit"),
         ([], "must be a JSON object"),
+        ({"origin": "stereo", "metric": True, "errors": []}, "errors must be a list of 1 to 1024 pairs"),
+        ({"origin": "stereo", "metric": True, "errors": [[0, 0.1], 3]}, "errors must be pairs of time and relative"),
+        ({"origin": "stereo", "metric": True, "errors": [[1, 0.1], [0, 0.1]]}, "in temporal order"),
+        ({"origin": "stereo", "metric": True, "errors": [[0, 2]]}, "relative"),
+        ({"origin": "stereo", "metric": True, "errors": [[0, "0.1"]]}, "relative"),
     ],
 )
 def test_claims_about_depth_that_cannot_be_true_are_refused(depth, said, make_gaussians, tmp_path):
