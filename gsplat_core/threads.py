@@ -1,4 +1,4 @@
-"""Limit on the number of threads that torch uses for operations called from one Python thread.
+"""Number of usable cores, and a limit on the number of threads that torch uses for operations called from one Python thread.
 
 LAPACK, BLAS and torch's reductions split long sums among threads, so rounding depends on the thread count. The solution
 of a system with 200 unknowns, or the mean of 40,000 pixels, differs in its last bits between one and two threads.
@@ -7,11 +7,17 @@ Geometry runs such operations within `one_thread` to be reproducible.
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 import torch
+
+
+def usable_cores() -> int:
+    """Number of CPU cores available to this process."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def use_one_thread() -> None:

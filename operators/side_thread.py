@@ -16,8 +16,3 @@ def step_back() -> None:
     if sys.platform == "linux":  # on other systems the nice value applies to the whole process
         with suppress(OSError):  # if not permitted, keep the normal priority
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)
-
-
-def usable_cores() -> int:
-    """Number of CPU cores available to this process."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -28,6 +29,7 @@ from gsplat_core.geometry.tracks import followed
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_origin import BELIEVED, PARALLAX
 from gsplat_core.scene.frames import Frame
+from gsplat_core.threads import usable_cores
 
 WINDOW_PX = 7
 """Side of the correlation window in pixels."""
@@ -603,19 +605,24 @@ def _compared(frames: Sequence[Frame], cameras: Sequence[Camera]) -> tuple[list[
     given, doubts = list(frames), Counter[str]()
     views = [view_of(frame, camera) for frame, camera in zip(frames, cameras, strict=True)]
     count = min(MOST_OFFLINE, len(frames))
-    for number in np.linspace(0, len(frames) - 1, count).round().astype(int).tolist():
+    chosen: list[int] = np.linspace(0, len(frames) - 1, count).round().astype(int).tolist()
+
+    def depth_at(number: int) -> DepthMap:
         frame = frames[number]
         near = [
             view for view, other in zip(views, frames, strict=True)
             if other is not frame and abs(other.time_s - frame.time_s) <= LONGEST_S
         ]  # fmt: skip
-        found = depth_of_view(views[number], near, frame.image.shape[:2])
-        if found.doubt is not None:
-            doubts[found.doubt] += 1
-            continue
-        if not np.any(found.believed):
-            doubts[DEFORMS] += 1
-        given[number] = _with(frame, found)
+        return depth_of_view(views[number], near, frame.image.shape[:2])
+
+    with ThreadPoolExecutor(usable_cores(), thread_name_prefix="parallax") as pool:
+        for number, found in zip(chosen, pool.map(depth_at, chosen), strict=True):
+            if found.doubt is not None:
+                doubts[found.doubt] += 1
+                continue
+            if not np.any(found.believed):
+                doubts[DEFORMS] += 1
+            given[number] = _with(frames[number], found)
     return given, doubts
 
 

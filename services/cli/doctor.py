@@ -84,7 +84,7 @@ def _versions() -> list[Check]:
 def _processor() -> list[Check]:
     import torch
 
-    from operators.side_thread import usable_cores
+    from gsplat_core.threads import usable_cores
     from services.reports.machine import processor_name
 
     threads, cores = torch.get_num_threads(), usable_cores()

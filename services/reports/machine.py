@@ -7,7 +7,7 @@ import platform
 import torch
 
 from gsplat_core.ops.native import instruction_set
-from operators.side_thread import usable_cores
+from gsplat_core.threads import usable_cores
 
 
 def machine_facts() -> dict[str, str]:

@@ -8,7 +8,8 @@ import threading
 
 import pytest
 
-from operators.side_thread import NICENESS, step_back, usable_cores
+from gsplat_core.threads import usable_cores
+from operators.side_thread import NICENESS, step_back
 
 
 def in_a_thread(work):

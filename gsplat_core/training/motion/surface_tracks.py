@@ -25,6 +25,7 @@ from gsplat_core.depth.plane_fits import filled_depth
 from gsplat_core.ops.surface_motion.surface_motion import surface_path
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
+from gsplat_core.threads import usable_cores
 from gsplat_core.training.motion.image_motion import SMALLEST_PX, Flow, ImageMotion, Seen, SurfaceMotion, beside
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.steps.step import TrainingStep
@@ -227,7 +228,7 @@ def _path(points: Tensor, flows: Tensor, cameras: Sequence[Camera]) -> Tensor:
 
 def _flows(pairs: Sequence[tuple[Frame, Frame]]) -> list[Flow]:
     """Return the flow from the first to the second frame of each pair."""
-    with ThreadPoolExecutor(torch.get_num_threads(), thread_name_prefix="flow") as pool:
+    with ThreadPoolExecutor(usable_cores(), thread_name_prefix="flow") as pool:
         return list(pool.map(_flow, pairs))
 
 
