@@ -287,6 +287,7 @@ class _Fitting:
                     f"{reason}: validation frames score {trial.psnr_db:.2f} dB, otherwise {first.psnr_db:.2f} dB"
                 )
                 inputs, first, learned = other, trial, self._learning
+        self._posed_inputs = None  # frees its frames
         spent_s = self._clock() - self._begin_s
         chosen = choose_steps(self._trial(inputs), limit_s, self._clock, spent_s, first)
         if len(chosen.trials) == 1 and not self._is_stopped:
