@@ -549,7 +549,8 @@ class ProcessSource(LiveSource):
         child = self._child
         assert child is not None
         child.send("open")
-        last_s = time.monotonic()
+        # The process sends nothing between its description and this message, however long that takes.
+        last_s = child.message_s = time.monotonic()
         while not self.wait(0):
             message = child.receive(LOOK_S)
             if message is None:

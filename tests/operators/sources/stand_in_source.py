@@ -49,6 +49,8 @@ class StandIn(LiveSource):
                 self.lost(value)
             elif what == "log":
                 logging.getLogger("stand-in").warning(value)
+            elif what == "pause":
+                time.sleep(float(value))
             elif what == "block":
                 time.sleep(1000)
 

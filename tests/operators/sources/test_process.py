@@ -138,6 +138,15 @@ def test_a_process_that_says_nothing_is_replaced(stand_in):
 
 
 @pytest.mark.slow
+def test_a_process_that_was_opened_late_is_not_replaced(stand_in):
+    source = stand_in("pause=0.3,frames=1", hung_after_s=2.0)
+    time.sleep(2.1)
+    source.open()
+    assert read(source).seq == 0
+    assert "process_restarts" not in source.counts()
+
+
+@pytest.mark.slow
 def test_a_source_that_is_stuck_in_its_driver_gets_another_process(stand_in):
     source = stand_in("frames=1,block", stuck_after_s=1.5)
     source.open()
