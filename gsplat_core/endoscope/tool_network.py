@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.endoscope.reduced import averaged
+from gsplat_core.endoscope.reduced import averaged, lowest_and_highest
 from gsplat_core.endoscope.tools import SMALLEST_PX, field_of_view, size_of
 
 NETWORK = Path(__file__).with_name("tool_network.onnx")
@@ -56,7 +56,7 @@ class NetworkToolFinder:
         self._network.setInput(planes)
         smoothed = along_edges(self._network.forward()[0, 0], planes[0])
         levels = (smoothed * np.float32(127 / CERTAIN) + 128).clip(0, 255).astype(np.uint8)
-        levels *= field_of_view(np.asarray(small.max(axis=2), np.uint8))
+        levels *= field_of_view(lowest_and_highest(small)[1])
         cv2.resize(levels, (width, height), dst=tissue, interpolation=cv2.INTER_LINEAR)
         cv2.threshold(tissue, 128, 1, cv2.THRESH_BINARY_INV, dst=tissue)
         return tissue
