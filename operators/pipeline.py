@@ -104,8 +104,10 @@ def analysis_operator(
         gate=[OutOfBodyGateOp(fragment, name="out_of_body", policy=out_of_body)],
         first=[PictureStagesOp(fragment, name="picture", stages=picture_stages, stream=stream)],
         beside=[
-            [new_tool_mask(fragment, tool_mask)],
-            [StageOp(fragment, name=SIDE_STAGE, stages=new_stages(PICTURE_STAGES, without=others))],
+            [
+                new_tool_mask(fragment, tool_mask),
+                StageOp(fragment, name=SIDE_STAGE, stages=new_stages(PICTURE_STAGES, without=others)),
+            ]
         ],
         then=[
             *behind_gate,
