@@ -42,7 +42,15 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.reconstructor import Reconstructor
 from operators.applications.device import check_device, seeded
-from operators.applications.evaluated import EvaluatedRun, Playback, SeenFrames, fitting_source, frame_tolerance_s
+from operators.applications.evaluated import (
+    EvaluatedRun,
+    Playback,
+    SeenFrames,
+    fitting_source,
+    frame_tolerance_s,
+    poses_of_run,
+    with_poses_of_run,
+)
 from operators.applications.limits import check_picture, render_bytes, replay_bytes, require_memory
 from operators.applications.progress import Progress, ProgressCallback
 from operators.applications.replay import ReplaySettings
@@ -76,7 +84,7 @@ class EvaluationSettings:
     """Time ranges of visits to the same tissue, for the retention protocol; None to detect them from the poses."""
     poses: Path | None = None
     """File `poses.npy` with the poses that the model was made with, for the geometry protocol; None
-    for the recording's.
+    for those that the run estimated, or else the recording's.
     """
 
     def __post_init__(self) -> None:
@@ -365,7 +373,7 @@ class _Work:
             self.model.to(settings.device),
             SeenFromAnywhere(settings.device, settings.renderer),
             open_truth(Path(settings.recording), count, self.scale),
-            settings.poses,
+            settings.poses or poses_of_run(self.source, self.run),
         )
 
     def _second_eye(self) -> SecondEye | None:
@@ -422,7 +430,11 @@ class _Work:
         until_s = self.window_s[1]
         if math.isinf(from_s):
             until_s = min(until_s, self.playback.round_s - 0.5 / self.source.description.fps * self.playback.stretch)
-        return SeenFrames(self.source, from_s, until_s, self.playback, self.stop_requested, self._progress(stage))
+        source = self.source
+        # Other protocols learn anew, or take the recording's poses as the truth.
+        if stage in ("heldout", "retention", "second_eye"):
+            source = with_poses_of_run(source, self.run)
+        return SeenFrames(source, from_s, until_s, self.playback, self.stop_requested, self._progress(stage))
 
     def _progress(self, stage: str) -> Callable[[int], None]:
         total = self.source.description.frame_count or 0

@@ -11,12 +11,15 @@ from pathlib import Path
 import numpy as np
 
 from gsplat_core.choices import Eyes
-from gsplat_core.errors import InvalidSetting
+from gsplat_core.errors import InvalidSetting, RecordingInvalid
+from gsplat_core.io.recordings.calibration import POSES_FILE, read_poses
+from gsplat_core.io.recordings.findings import Findings
 from gsplat_core.io.sessions import SessionReader, is_session
 from gsplat_core.models.model import Model
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from operators.applications.session import FirstFrames
+from operators.sources.derived import PosedSource
 from operators.sources.registry import SourceOptions, open_source
 from operators.sources.source import FrameSource, SourceDescription
 
@@ -154,6 +157,30 @@ def fitting_source(
     else:
         playback, more = _playback(model, description, None if run is None else run.fps, max_frames is not None)
     return source, scale, playback, [*notes, *more]
+
+
+def poses_of_run(source: FrameSource, run: EvaluatedRun | None) -> Path | None:
+    """Return the file with the poses that `reconstruct` estimated for its model; None if it estimated none."""
+    path = None if run is None else run.folder / POSES_FILE
+    return path if path is not None and path.is_file() and "pose" not in source.description.fields else None
+
+
+def with_poses_of_run(source: FrameSource, run: EvaluatedRun | None) -> FrameSource:
+    """Return the source with the poses that `reconstruct` estimated for its model; without such poses the source itself.
+
+    Raises:
+        RecordingInvalid: the run's file of poses is damaged.
+    """
+    path = poses_of_run(source, run)
+    if path is None:
+        return source
+    try:
+        count = len(np.load(path, mmap_mode="r"))
+    except (OSError, ValueError, TypeError) as error:
+        raise RecordingInvalid(f"{path} has no poses: {error}; make the run again") from error
+    poses = read_poses(path, count, Findings(strict=True))
+    assert poses is not None  # a strict reader raises
+    return PosedSource(source, lambda frame: poses[min(frame.seq, count - 1)])
 
 
 def _scale_of_model(made: Camera, seen: Camera, run_scale: float | None) -> float:

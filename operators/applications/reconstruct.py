@@ -20,7 +20,7 @@ from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.io.recordings import is_heldout
 from gsplat_core.io.recordings.calibration import POSES_FILE, write_poses
 from gsplat_core.models.model import Model
-from gsplat_core.poses.camera_path import MOVING_SHARE, camera_path_of, rigid_share
+from gsplat_core.poses.camera_path import MOVING_SHARE, CameraPath, camera_path_of, rigid_share
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training import validation
 from gsplat_core.training.budget import Budget, ObserveReport
@@ -150,7 +150,7 @@ def reconstruct(
             finish=[
                 lambda session: session.reached.add(fitted.steps),
                 saves_model(inside.out, model),
-                *([_saves_poses(source, inside.out)] if isinstance(source, PosedSource) else []),
+                *([_saves_poses(source, inside.out)] if fitted.path is not None else []),
                 measures_baselines(source),
             ],
             notes=notes,
@@ -174,6 +174,8 @@ class Fitted(NamedTuple):
     steps: ChosenSteps
     source: FrameSource
     """Source of the frames; with estimated poses if they were chosen."""
+    path: CameraPath | None
+    """Estimated path of the scope; None if its poses are given or not used."""
     settings: ReplaySettings
     """Settings with the inputs that were chosen."""
 
@@ -181,8 +183,8 @@ class Fitted(NamedTuple):
 class _Inputs:
     """Settings of a training with the frames that it gets."""
 
-    def __init__(self, source: FrameSource, settings: ReplaySettings) -> None:
-        self.settings, self.source = settings, source
+    def __init__(self, source: FrameSource, settings: ReplaySettings, path: CameraPath | None = None) -> None:
+        self.settings, self.source, self.path = settings, source, path
         learning = self.new()
         self.eyes = learning.eyes
         frames = self._frames()
@@ -261,7 +263,12 @@ class _Fitting:
         for doubt, count in sorted(learning.depth_doubts.items()):
             self._notes.append(f"{count} key frames were given no depth to learn from: {doubt}")
         return Fitted(
-            learning.with_depth_errors(learning.snapshot()), inputs.eyes, chosen, inputs.source, inputs.settings
+            learning.with_depth_errors(learning.snapshot()),
+            inputs.eyes,
+            chosen,
+            inputs.source,
+            inputs.path,
+            inputs.settings,
         )
 
     def _chosen(self, inputs: _Inputs) -> tuple[_Inputs, ChosenSteps]:
@@ -314,9 +321,9 @@ class _Fitting:
     def _trial(self, inputs: _Inputs) -> Train:
         """Return a function that trains without the validation frames."""
         kept = inputs.validating
-        if isinstance(inputs.source, PosedSource):
+        path = inputs.path
+        if path is not None:
             # Held-out frames have interpolated poses too.
-            path = inputs.source.path
             kept = [frame.with_fields(pose=path.interpolated(frame.time_s)) for frame in kept]
 
         def train(steps: int) -> Trained:
@@ -361,30 +368,30 @@ class _Fitting:
 def _posed(inputs: _Inputs) -> _Inputs:
     """Return inputs with poses estimated from the training frames. Raises InvalidInput as `camera_path_of`."""
     path = camera_path_of(inputs.given.frames, inputs.source.description.camera)
-    return _Inputs(PosedSource(inputs.source, path), inputs.settings)
+    return _Inputs(PosedSource(inputs.source, lambda frame: path.at(frame.time_s)), inputs.settings, path)
 
 
 def _without_depth(inputs: _Inputs) -> _Inputs | None:
     """Return inputs without depth; None if there is none."""
     if not inputs.have_depth or inputs.settings.depth == "none":
         return None
-    return _Inputs(inputs.source, replace(inputs.settings, depth="none"))
+    return _Inputs(inputs.source, replace(inputs.settings, depth="none"), inputs.path)
 
 
 def _left_eye(inputs: _Inputs) -> _Inputs | None:
     """Return inputs without the right eye; None if it is not used."""
     if inputs.settings.eyes != "both":
         return None
-    return _Inputs(inputs.source, replace(inputs.settings, eyes="left"))
+    return _Inputs(inputs.source, replace(inputs.settings, eyes="left"), inputs.path)
 
 
-def _saves_poses(source: PosedSource, out: Path) -> Callable[[Session], None]:
+def _saves_poses(source: FrameSource, out: Path) -> Callable[[Session], None]:
     """Return a step that saves the poses of all frames to `out/poses.npy`."""
 
     def save(session: Session) -> None:
         frames = FirstFrames(source, source.description.frame_count or 0)
         with storage_errors(out):
-            write_poses(out / POSES_FILE, np.stack([source.path.at(frame.time_s) for frame in frames]))
+            write_poses(out / POSES_FILE, np.stack([frame.pose for frame in frames if frame.pose is not None]))
         session.reached.output("poses", out / POSES_FILE)
 
     return save

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter, deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings.calibration import default_camera
 from gsplat_core.io.recordings.frame_files import resized_frame
-from gsplat_core.poses.camera_path import CameraPath
 from gsplat_core.scene.frames import Frame
 from operators.sources.address import StereoLayout
 from operators.sources.live import LiveSource
@@ -94,20 +93,20 @@ class ScaledSource(DerivedSource):
 
 
 class PosedSource(DerivedSource):
-    """`FrameSource` that gives the frames of another source the poses of a camera path."""
+    """`FrameSource` that gives the frames of another source poses."""
 
-    def __init__(self, source: FrameSource, path: CameraPath) -> None:
+    def __init__(self, source: FrameSource, pose_of: Callable[[Frame], NDArray[np.float64]]) -> None:
         """Create a source with the frames of `source`.
 
         Args:
             source: opened and closed together with this one. Its poses, if any, are replaced.
-            path: poses of the scope by time.
+            pose_of: returns the world-to-camera pose [4, 4] of a frame.
         """
         super().__init__(source, replace(source.description, fields=source.description.fields | {"pose"}))
-        self.path = path
+        self._pose_of = pose_of
 
     def _derived(self, frame: Frame) -> Frame:
-        return frame.with_fields(pose=self.path.at(frame.time_s))
+        return frame.with_fields(pose=self._pose_of(frame))
 
 
 MOST_KEPT = 8

@@ -8,9 +8,14 @@ import cv2
 import numpy as np
 import pytest
 
+from gsplat_core.errors import RecordingInvalid
+from gsplat_core.io.bundle import load_bundle
 from gsplat_core.io.recordings import synthesize
 from gsplat_core.training import validation
 from operators.applications import reconstruct as module
+from operators.applications.evaluate import EvaluationSettings, evaluate
+from operators.applications.evaluated import EvaluatedRun
+from operators.metrics import QualityResult
 from operators.pose import EstimatedPoses
 from services.reports.build import write_reports
 from tests.gsplat_core.geometry.moving_scope import SIDEWAYS, video
@@ -70,7 +75,20 @@ def test_poses_of_a_moving_scope_are_used_where_they_help(moving, tmp_path, monk
 
 @pytest.mark.slow
 def test_poses_that_are_asked_for_are_those_of_all_frames(moving, tmp_path):
-    settings = module.ReconstructSettings(recording=moving, out=tmp_path / "out", sinks=(), poses="estimated")
+    """Its evaluation uses them too."""
+    out = tmp_path / "out"
+    settings = module.ReconstructSettings(recording=moving, out=out, sinks=(), poses="estimated")
     outcome = module.reconstruct(settings, steps=1)
-    assert "poses" in outcome.outputs
     assert outcome.find(EstimatedPoses) is None, "poses were estimated again, frame by frame"
+    run = EvaluatedRun(out, "reconstruct", "basis", seed=0, steps_per_frame=None, scale=1.0, heldout=True)
+
+    def heldout_db():
+        wanted = EvaluationSettings(moving, ("heldout",))
+        found = evaluate(load_bundle(out / "model"), run, wanted, tmp_path).heldout
+        assert found is not None
+        return found.score.psnr_tissue_db
+
+    assert heldout_db() == pytest.approx(outcome.find(QualityResult).held_out.means()["psnr_tissue_db"], abs=0.05)
+    outcome.outputs["poses"].write_bytes(b"no poses")
+    with pytest.raises(RecordingInvalid, match="has no poses"):
+        heldout_db()
