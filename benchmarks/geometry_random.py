@@ -115,9 +115,9 @@ class Errors:
         self._medians.append(float(np.median(np.abs(factor * depth - z) / z)))
         self._believed.append(float(where.sum() / max((frame.mask > 0).sum() if frame.mask is not None else 1, 1)))
         if error is not None:
-            off = np.abs(found.depth - true)[where]
-            self._inside.append(float((off <= NINETY * error[where]).mean()))
-            self._unsure.append(float(np.median(error[where] / true[where])))
+            off = np.abs(factor * found.depth - true)[where]
+            self._inside.append(float((off <= NINETY * factor * error[where]).mean()))
+            self._unsure.append(float(np.median(factor * error[where] / true[where])))
 
     def figures(self) -> dict[str, Any]:
         """Return the figures of the recording; None without depth."""
@@ -164,7 +164,7 @@ def poses(seed: int, asked: argparse.Namespace) -> dict[str, Any]:
         if depth is None or confidence is None:
             errors.add(frame, None)
         else:
-            errors.add(frame, DepthMap(depth, confidence, kind, metric=False))
+            errors.add(frame, DepthMap(depth, confidence, kind, metric=False), kind.relative_error * depth)
     line: dict[str, Any] = {"parallax": errors.figures(), "doubts": dict(default.doubts)}
     tissue, errors = MovingTissue(blind, cameras), Errors(recording.camera)
     for frame in frames[::5]:
@@ -201,7 +201,8 @@ def fixed(seed: int, asked: argparse.Namespace) -> dict[str, Any]:
     estimator, errors = LightDepth(), Errors(recording.camera, scaled=True)
     given = Given()
     for frame in recording:
-        errors.add(frame, estimator.estimate(given(frame), recording.camera))
+        found = estimator.estimate(given(frame), recording.camera)
+        errors.add(frame, found, None if found is None else found.origin.relative_error * found.depth)
     line = errors.figures()
     return line | {"below_plane": line["depth"] is not None and line["depth"] < line["plane"]}
 
