@@ -1,4 +1,4 @@
-"""State of an offline reconstruction between its frames and beyond its ends."""
+"""State of a reconstruction between its frames and beyond its ends."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.offline import SPACING_INTERVALS
@@ -68,3 +69,48 @@ def test_motion_is_resolved_no_finer_than_the_frames(moved):
     # Columns are placed so that a whole number of them covers the recording.
     assert model.field.spacing_s == pytest.approx(max(SPACING_INTERVALS / fps, finest_s), rel=0.1)
     assert (model.field.spacing_s > 2 * finest_s) == (fps == 5)
+
+
+def irregular_frames(seed: int) -> list[Frame]:
+    """Frames with gaps of up to 12 frame intervals, noise, and depth that differs by 6 % from frame to frame."""
+    random = np.random.default_rng(seed)
+    numbers = np.concatenate([[0], np.cumsum(random.choice([1, 1, 1, 2, 5, 12], 7))])
+    images = pictures(int(numbers[-1]) + 1, float(random.uniform(-1.5, 1.5)), float(random.uniform(0, 6)))
+    frames = []
+    for seq, number in enumerate(numbers.tolist()):
+        depth = np.full((HEIGHT, WIDTH), 50 + 8 * np.sin(0.3 * number) + random.normal(0, 3), np.float32)
+        frame = Frame(
+            seq, round(number * 1e9 / 30), images[number], depth=depth, depth_origin=DEPTH_ORIGINS["measured"]
+        )
+        frames.append(frame)
+    return frames
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize(("field", "is_offline"), [("basis", True), ("basis", False), ("hexplane", True)])
+def test_at_no_time_is_the_scene_far_from_its_states_at_irregular_frames(field, is_offline, seed):
+    frames = irregular_frames(seed)
+    if is_offline:
+        config = replace(ReconstructorConfig.offline(field), gaussians=300, max_gaussians=400)
+        learning = Reconstructor(config, CAMERA)
+        learning.fit(frames, 80)
+    else:
+        config = ReconstructorConfig(
+            field=field, gaussians=300, max_gaussians=400, first_frame_steps=30, steps_per_frame=8
+        )
+        learning = Reconstructor(config, CAMERA)
+        for frame in frames:
+            learning.observe(frame)
+    model = learning.snapshot()
+    times_s = [frame.time_s for frame in frames]
+    between_s = np.concatenate(
+        [np.linspace(times_s[0] - 1, times_s[-1] + 1, 20), np.linspace(times_s[0], times_s[-1], 60)]
+    )
+    for value, margin in (("means", 3.0), ("log_scales", 0.1)):
+        seen, shown = (
+            torch.stack([getattr(model.at(float(at)), value) for at in each]) for each in (times_s, between_s)
+        )
+        low, high = seen.amin(0), seen.amax(0)
+        beyond = torch.maximum(shown - high, low - shown).amax(0)
+        assert (beyond <= 0.5 * (high - low) + margin).all()
