@@ -23,7 +23,8 @@ __device__ __forceinline__ Seen seen_by(const View& view, const float* p) {
 }
 
 // Sample the flow [height, width, 2] of an image at a pixel, bilinearly between cell centres, clamped to the edge.
-__device__ __forceinline__ float2 flow_at(const float* cells, int64_t height, int64_t width, const View& image, float px, float py) {
+__device__ __forceinline__ float2 flow_at(const float* cells, int64_t height, int64_t width, const View& image, float px,
+                                          float py) {
   const float x = fminf(fmaxf(px * (float(width) / image.width) - 0.5f, 0.0f), float(width - 1));
   const float y = fminf(fmaxf(py * (float(height) / image.height) - 0.5f, 0.0f), float(height - 1));
   const int64_t column = int64_t(x), row = int64_t(y);
@@ -48,7 +49,8 @@ __global__ void __launch_bounds__(kThreads)
     const Seen seen = seen_by(before, at), later = seen_by(after, at);
     if (seen.inside) {
       const float2 moved = flow_at(flows.cells + step * cells, flows.height, flows.width, after, seen.x, seen.y);
-      const float x = (seen.x + moved.x - later.x) * later.depth / after.fx, y = (seen.y + moved.y - later.y) * later.depth / after.fy;
+      const float x = (seen.x + moved.x - later.x) * later.depth / after.fx,
+                  y = (seen.y + moved.y - later.y) * later.depth / after.fy;
       for (int i = 0; i < 3; ++i) at[i] += x * after.rotation[i] + y * after.rotation[3 + i];
     }
     for (int i = 0; i < 3; ++i) positions[(point * flows.steps + step) * 3 + i] = at[i];

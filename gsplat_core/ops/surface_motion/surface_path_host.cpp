@@ -16,9 +16,8 @@ void follow(const Call& call, const Flows& flows, const float* points, float* po
 constexpr int64_t kGrain = 256;  // minimum points per task
 
 void follow(const Call&, const Flows& flows, const float* points, float* positions, int64_t count) {
-  torch::stable::parallel_for(0, count, kGrain, [&](int64_t begin, int64_t end) {
-    kernels().path(flows, points, positions, begin, end);
-  });
+  torch::stable::parallel_for(0, count, kGrain,
+                              [&](int64_t begin, int64_t end) { kernels().path(flows, points, positions, begin, end); });
 }
 
 #endif
