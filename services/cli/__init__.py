@@ -12,7 +12,7 @@ def main() -> None:
     import _signal  # type: ignore[import-not-found]
 
     _signal.signal(_signal.SIGINT, lambda number, frame: os._exit(130))
-    from services.cli.terminal import StandardStreams, end_on_interrupt
+    from services.cli.terminal import INTERRUPTED, StandardStreams, end_now, end_on_interrupt
 
     end_on_interrupt()
     streams = StandardStreams()
@@ -24,4 +24,7 @@ def main() -> None:
     os.environ["OPENBLAS_NUM_THREADS"] = "1"
     from services.cli.app import run
 
-    sys.exit(streams.code(run(sys.argv[1:])))
+    code = streams.code(run(sys.argv[1:]))
+    if code == INTERRUPTED:
+        end_now()
+    sys.exit(code)

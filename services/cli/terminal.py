@@ -228,10 +228,13 @@ def end_on_interrupt() -> None:
 
 def _end(number: int, frame: FrameType | None) -> None:
     _say("interrupted")
-    _end_now()
+    end_now()
 
 
-def _end_now() -> None:
+def end_now() -> None:
+    """End the process with exit code 130 at once, without unfinished files. Threads that still compute in compiled code would
+    abort an ordinary end.
+    """
     files = sys.modules.get("gsplat_core.io.files")
     if files is not None:
         files.remove_unfinished()
@@ -303,7 +306,7 @@ def _acknowledge(receiver: int) -> None:
 
 def _end_after(ended: threading.Event) -> None:
     if not ended.wait(GRACE_S):
-        _end_now()
+        end_now()
 
 
 def _say(text: str) -> None:

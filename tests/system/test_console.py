@@ -238,8 +238,10 @@ def test_health_shows_what_readyz_says(page, client):
     page.wait_for_selector("#health-checks tr")
     ready = client.ready()
     shown = page.inner_text("#health-checks")
+    # The free space changes between the two readings.
+    without_numbers = lambda text: re.sub(r"\d+", "0", text)
     for name, check in (ready.checks or {}).items():
-        assert name.replace("_", " ") in shown and check.detail in shown
+        assert name.replace("_", " ") in shown and without_numbers(check.detail) in without_numbers(shown)
     assert ready.status in page.inner_text("#health-status")
     assert client.about()["version"] in page.inner_text("#health-versions")
     assert "theatre-1" in page.inner_text("#health-streams")
