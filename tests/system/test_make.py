@@ -15,7 +15,7 @@ from tests.missing import missing
 ROOT = Path(__file__).resolve().parents[2]
 
 
-OF_MAKE = ("CUDACXX", "MAKEFLAGS", "MAKEOVERRIDES", "MAKELEVEL", "MARKED")
+OF_MAKE = ("CUDACXX", "MAKEFLAGS", "MAKEOVERRIDES", "MAKELEVEL", "MARKED", "AGAIN", "NICE")
 """Variables that a make above these tests sets."""
 
 
