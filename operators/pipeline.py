@@ -85,7 +85,7 @@ def analysis_operator(
 ) -> SideBySideOp:
     """Return the operator between source and reconstruction, with the input and output `frame`.
 
-    Tools, highlights and the other checks of the picture run in parallel.
+    Tools and highlights are detected in parallel to the other checks of the picture.
 
     Args:
         fragment: the graph.

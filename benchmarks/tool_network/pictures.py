@@ -29,7 +29,7 @@ def training_picture(rng: Generator, pool: TissuePool) -> tuple[NDArray[np.uint8
     image = hollow_organ(rng, height, width) if hollow else pool.draw(rng, height, width)
     light = falloff(rng, height, width)
     if hollow:
-        light = light ** np.float32(0.5)
+        light = np.sqrt(np.maximum(light, 0))
     mask = np.zeros((height, width), np.float32)
     inner_light = rng.random() < 0.5
     if not inner_light:
