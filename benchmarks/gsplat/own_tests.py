@@ -22,6 +22,7 @@ import subprocess
 import sys
 import tempfile
 import xml.etree.ElementTree as ElementTree
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,6 @@ import log
 
 ROOT = Path(__file__).resolve().parents[2]
 FILES = ("test_basic.py", "test_rasterization.py", "test_strategy.py", "test_2dgs.py", "test_compression.py")
-TIMEOUT_S = 3600
 EXCEPTIONS: dict[str, str] = {}
 """Reason for each test that cannot pass, with its proof in float64."""
 NERFACC = """
@@ -141,7 +141,7 @@ def prepared(source: Path, folder: Path, device: str, chosen: argparse.Namespace
     return f"synthetic, {chosen.points} points, 3 pictures of {chosen.width}x{chosen.height} px"
 
 
-def run(folder: Path, name: str, oracle: bool, further: list[str]) -> dict[str, dict[str, Any]]:
+def run(folder: Path, name: str, oracle: bool, timeout_s: float, further: list[str]) -> dict[str, dict[str, Any]]:
     """Run one file; return outcome and seconds of each test, with the first lines of its failure."""
     report = folder / f"{name}.xml"
     command = [sys.executable, "-m", "gsplat_core.as_gsplat", "--constants", "1.5.3" if oracle else "1.6"]
@@ -149,9 +149,9 @@ def run(folder: Path, name: str, oracle: bool, further: list[str]) -> dict[str, 
     command += [f"--junit-xml={report}", f"--rootdir={folder}", str(folder / "tests" / name), *further]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     try:
-        subprocess.run(command, cwd=folder, env=environment, check=False, timeout=TIMEOUT_S, stdout=subprocess.DEVNULL)
+        subprocess.run(command, cwd=folder, env=environment, check=False, timeout=timeout_s, stdout=subprocess.DEVNULL)
     except subprocess.TimeoutExpired:
-        return {name: {"outcome": "failed", "seconds": TIMEOUT_S, "why": "time limit"}}
+        return {name: {"outcome": "failed", "seconds": timeout_s, "why": "time limit"}}
     if not report.exists():
         return {name: {"outcome": "failed", "seconds": 0.0, "why": "pytest wrote no report"}}
     found: dict[str, dict[str, Any]] = {}
@@ -177,6 +177,10 @@ def main() -> None:
     parser.add_argument(
         "--select", nargs=2, action="append", default=[], metavar=("FILE", "EXPRESSION"), help="selection for one file"
     )
+    parser.add_argument("--together", type=int, default=1, help="files that are run at the same time")
+    parser.add_argument(
+        "--timeout", type=float, default=3600, help="seconds after which a file is ended and counts as failed"
+    )
     chosen = parser.parse_args()
     device = "cuda:0" if chosen.device == "cuda" else chosen.device
     tests: dict[str, dict[str, Any]] = {}
@@ -184,9 +188,14 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         scene = prepared(chosen.tests.resolve(), folder, device, chosen)
-        for file in chosen.only:
+
+        def results(file: str) -> dict[str, dict[str, Any]]:
             selection = dict(chosen.select).get(file, chosen.selection)
-            found = run(folder, file, chosen.oracle is not None, ["-k", selection] if selection else [])
+            return run(folder, file, chosen.oracle is not None, chosen.timeout, ["-k", selection] if selection else [])
+
+        with ThreadPoolExecutor(chosen.together) as pool:
+            results_of_files = pool.map(results, chosen.only)
+        for file, found in zip(chosen.only, results_of_files, strict=True):
             outcomes = [about["outcome"] for about in found.values()]
             files[file] = {outcome: outcomes.count(outcome) for outcome in ("passed", "failed", "skipped")}
             tests |= found
