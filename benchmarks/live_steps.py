@@ -29,7 +29,7 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.budget import Budget
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.metrics import psnr_tissue_db
+from gsplat_core.training.metrics import SETTLING_S, psnr_tissue_db
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.schedule import LiveTraining
 from operators.applications.live_settings import LiveSettings
@@ -43,8 +43,6 @@ from operators.sources.registry import SourceOptions, open_source
 
 FIRST_STEPS = {"cpu": 4, "cuda": 60}
 """Steps on the first frame, about as many as in a live run."""
-SETTLING_S = 1.0
-"""Seconds at the start that are not scored, as in `operators.metrics`."""
 
 
 class Shown:

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gsplat_core.training.metrics import SETTLING_S
 from operators.falling_behind import BehindGuard
 from operators.frame_clock import FrameClock
 from operators.graph import ConditionType, MessageOrTimeoutCondition, Operator, OperatorSpec
@@ -70,6 +71,10 @@ class LiveDisplayResult:
     """Number of new pictures; repetitions are not counted."""
     age: DurationSummary
     """Distribution of the age of each new picture at the time of display."""
+    settled_age: DurationSummary
+    """The same after the first `SETTLING_S` seconds of the stream."""
+    used_age: DurationSummary
+    """The same without pictures of withheld frames, which show the content of an earlier frame."""
     states: dict[str, int]
     """Number of transitions into each state, by name."""
     first_picture_ms: float | None
@@ -123,8 +128,9 @@ class DisplayOp(Operator):
         self.state: PictureState | None = None
         """State of the displayed picture; None before the first one."""
         self.states: dict[str, int] = {}
-        self._ages = Histogram()
+        self._ages, self._settled_ages, self._used_ages = Histogram(), Histogram(), Histogram()
         self._first_ms: float | None = None
+        self._first_s: float | None = None
         self._current: RenderedFrame | None = None
         self._sent_ns = 0
         self._is_behind = False
@@ -184,14 +190,19 @@ class DisplayOp(Operator):
         age_ns = max(0, shown_ns - _content_ns(rendered, shown_ns))
         self.pictures += 1
         self._ages.record(age_ns)
-        if self._first_ms is None:
-            self._first_ms = age_ns * 1e-6
+        if self._first_ms is None or self._first_s is None:
+            self._first_ms, self._first_s = age_ns * 1e-6, rendered.frame.time_s
+        if rendered.frame.time_s - self._first_s >= SETTLING_S:
+            self._settled_ages.record(age_ns)
+            if rendered.frame.unusable is None:
+                self._used_ages.record(age_ns)
         if rendered.published_ns is not None:
             self.clock.shown(rendered.published_ns, shown_ns)
 
     def contribute(self, outcome: OutcomeBuilder) -> None:
         """Add the statistics of the display to the outcome of the run."""
-        outcome.add(LiveDisplayResult(self.pictures, self._ages.summary(), dict(self.states), self._first_ms))
+        ages, settled, used = self._ages.summary(), self._settled_ages.summary(), self._used_ages.summary()
+        outcome.add(LiveDisplayResult(self.pictures, ages, settled, used, dict(self.states), self._first_ms))
 
 
 def _content_ns(rendered: RenderedFrame, now_ns: int) -> int:

@@ -18,7 +18,7 @@ import numpy as np
 
 from gsplat_core.memory import return_freed_memory
 from gsplat_core.scene.frames import Frame
-from gsplat_core.training.metrics import FrameQuality, QualityTracker, ScoredMean, psnr_tissue_db
+from gsplat_core.training.metrics import SETTLING_S, FrameQuality, QualityTracker, ScoredMean, psnr_tissue_db
 from operators.frame_log import FrameLog, LogLine, Value
 from operators.graph import ConditionType, MessageOrTimeoutCondition, Operator, OperatorSpec
 from operators.messages import Prediction, RenderedFrame, ShownPicture
@@ -130,10 +130,6 @@ TRIM_EVERY_S = 30.0
 """Period for returning free heap memory to the operating system, in seconds."""
 SIMILARITY_EVERY = 8
 """Compute SSIM for one in this many frames, because it is several times slower than PSNR."""
-SETTLING_S = 1.0
-"""Start-up time in seconds that is excluded from settled scores, because the model is being
-initialised.
-"""
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 from gsplat_core.evaluation.baselines import BaselineScore
 from gsplat_core.evaluation.scores import Record, Score, ScoreSums, finite, measures
-from gsplat_core.training.metrics import FrameQuality, ScoredMean
+from gsplat_core.training.metrics import SETTLING_S, FrameQuality, ScoredMean
 
 _FINEST_MS = 1e-3
 _RATIO = 1.01
@@ -69,8 +69,6 @@ class AgeHistogram:
 
 MOST_BEHIND = 8
 """Largest lateness in frames with its own counter. Later pictures are counted with it."""
-SETTLING_S = 1.0
-"""Start-up time in seconds, excluded from `settled` but included in `score`."""
 NOTHING_SHOWN = "nothing shown yet"
 _MAX_STATES = 16
 

@@ -26,6 +26,8 @@ ImageLike: TypeAlias = NDArray[np.generic] | Tensor
 
 PSNR_CAP_DB = 100.0
 """PSNR of equal images and highest reported value, corresponding to a mean squared error of 1e-10."""
+SETTLING_S = 1.0
+"""Start of a live stream in seconds that settled scores and ages exclude, because the model is being initialised."""
 
 
 _UNIT_OF_BYTE: NDArray[np.float32] = (torch.arange(256, dtype=torch.float32) / 255).numpy()

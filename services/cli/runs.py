@@ -271,6 +271,10 @@ def _summary(report: RunReport, facts: LiveFacts) -> str:
         f"age of what was shown: p50 {facts.age_p50_ms:.1f} ms, p99 {facts.age_p99_ms:.1f} ms, most {facts.age_max_ms:.1f} ms",
     ]
     # The first second, in which the model is initialised, is excluded from these figures.
+    if facts.settled_age_p99_ms is not None:
+        lines.append(f"age after the first second: p99 {facts.settled_age_p99_ms:.1f} ms")
+    if facts.used_age_p99_ms is not None and facts.withheld:
+        lines.append(f"without pictures of withheld frames: p99 {facts.used_age_p99_ms:.1f} ms")
     name = "displayed frame (training error)"
     lines += quality_line(name, facts.settled_psnr_tissue_db, facts.previous_frame_db)
     lines += quality_line(f"worst {name}", facts.worst_psnr_tissue_db, None)

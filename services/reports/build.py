@@ -18,6 +18,7 @@ from operators.checks import StageCounts
 from operators.display import LiveDisplayResult
 from operators.errors import NothingShown
 from operators.frame_log import LogLine
+from operators.graph.tracking import DurationSummary
 from operators.ingest import SourceResult
 from operators.metrics import NextFrameResult, OnScreenResult, QualityResult
 from operators.out_of_body import WITHHELD as OUT_OF_BODY
@@ -70,6 +71,8 @@ def live_facts(outcome: RunOutcome) -> LiveFacts | None:
         age_p95_ms=round(age.p95_ms, 2),
         age_p99_ms=round(age.p99_ms, 2),
         age_max_ms=round(age.max_ms, 2),
+        settled_age_p99_ms=_p99(screen.settled_age),
+        used_age_p99_ms=_p99(screen.used_age),
         first_picture_ms=_rounded(screen.first_picture_ms),
         states=screen.states,
         dropped=_passed_over(outcome, training),
@@ -93,6 +96,10 @@ def _passed_over(outcome: RunOutcome, training: TrainingCounts) -> dict[str, int
     if training.passed_over:
         counts["reconstruct"] = training.passed_over
     return counts
+
+
+def _p99(age: DurationSummary) -> float | None:
+    return round(age.p99_ms, 2) if age.count else None
 
 
 def _rounded(value: float | None) -> float | None:

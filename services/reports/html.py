@@ -538,6 +538,11 @@ def _mean(entries: list[FrameEntry], name: str) -> float | None:
 def _counts(live: LiveFacts) -> str:
     per_frame = live.steps / live.frames_trained if live.frames_trained else 0.0
     ages = f"p50 {live.age_p50_ms:,.1f}, p95 {live.age_p95_ms:,.1f}, p99 {live.age_p99_ms:,.1f}, max {live.age_max_ms:,.1f} ms"
+    later = {
+        "p99 after the first second": live.settled_age_p99_ms,
+        "p99 after it without withheld frames": live.used_age_p99_ms,
+    }
+    ages += "".join(f", {name} {value:,.1f} ms" for name, value in later.items() if value is not None)
     facts = {
         "Age when shown": f"{ages}, {live.pictures:,} pictures",
         "Frames trained on": f"{live.frames_trained:,}, {per_frame:.1f} steps each before they were shown",

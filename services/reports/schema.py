@@ -211,6 +211,10 @@ class LiveFacts(Part):
     age_p95_ms: float
     age_p99_ms: float
     age_max_ms: float
+    settled_age_p99_ms: float | None = None
+    """99th percentile of these ages after the first second, in milliseconds; None in older reports and shorter runs."""
+    used_age_p99_ms: float | None = None
+    """The same without pictures of withheld frames, which show the content of an earlier frame."""
     first_picture_ms: float | None
     states: dict[str, Count]
     """Number of transitions into each display state."""

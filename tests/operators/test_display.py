@@ -200,6 +200,20 @@ def test_the_outcome_counts_states_and_ages(screen, rendered, frame, fake_time, 
     assert result.age.max_ms == 40.0
 
 
+def test_ages_of_the_first_second_and_of_withheld_frames_are_told_apart(
+    screen, rendered, frame, fake_time, compute_queued
+):
+    for time_s, age_ms, withheld in [(3.0, 200.0, None), (3.99, 100.0, None), (4.0, 20.0, None), (4.5, 90.0, "blur")]:
+        of_frame = frame(0, pts_ns=round(time_s * 1e9), withheld=withheld, arrived_ns=fake_time.ns - round(age_ms * 1e6))
+        compute_queued(screen.operator, rendered=[rendered(0, frame=of_frame)])
+        fake_time.pass_ms(300)
+    outcome = OutcomeBuilder()
+    screen.operator.contribute(outcome)
+    result = outcome.find(LiveDisplayResult)
+    assert [ages.max_ms for ages in (result.age, result.settled_age, result.used_age)] == [200.0, 90.0, 20.0]
+    assert [ages.count for ages in (result.age, result.settled_age, result.used_age)] == [4, 2, 1]
+
+
 @pytest.mark.parametrize(
     ("interval_ms", "stale_ms", "frozen_ms"),
     [(33.3, 150.0, 1000.0), (100.0, 300.0, 1000.0), (200.0, 600.0, 1200.0), (1000.0, 3000.0, 6000.0)],

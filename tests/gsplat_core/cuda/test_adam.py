@@ -8,8 +8,6 @@ from gsplat_core.ops.adam.adam import adam_step, adam_step_at_
 from gsplat_core.reference.adam import adam_step as reference_adam_step
 from gsplat_core.training.steps.optimiser import FusedAdam
 
-pytestmark = pytest.mark.cuda
-
 
 @pytest.mark.parametrize("row_size", [1, 3, 48, 5000])
 @pytest.mark.parametrize("rows", [0, 1, 2003])

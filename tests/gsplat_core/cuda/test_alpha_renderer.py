@@ -11,8 +11,6 @@ from gsplat_core import Camera, Model, SnapshotSlots, new_renderer, render
 from gsplat_core.deformation import BasisField, new_field
 from gsplat_core.rendering import frame_renderer
 
-pytestmark = pytest.mark.cuda
-
 WIDTH_PX, HEIGHT_PX = 150, 101
 WINDOW_S = (0.0, 1.0)
 

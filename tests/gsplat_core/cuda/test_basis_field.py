@@ -15,8 +15,6 @@ from gsplat_core.ops.basis_field.basis_field import (
 )
 from gsplat_core.scene.gaussians import Gaussians
 
-pytestmark = pytest.mark.cuda
-
 RATES = (1e-2, 2e-3, 3e-3, 4e-3, 5e-4, 6e-4)
 
 

@@ -14,7 +14,6 @@ from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.schedule import LiveTraining
 from tests.gsplat_core.training.test_late_depth import CAMERA, found, frame_at
 
-pytestmark = pytest.mark.cuda
 FRAME = frame_at(2)
 
 

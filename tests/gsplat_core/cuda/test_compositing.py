@@ -15,7 +15,6 @@ from gsplat_core.ops.tiles.grid import TileGrid
 from gsplat_core.ops.tiles.tiles import bin_splats
 from gsplat_core.reference import compositing as reference
 
-pytestmark = pytest.mark.cuda
 Results = dict[str, Tensor]
 
 

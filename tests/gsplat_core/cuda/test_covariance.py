@@ -5,8 +5,6 @@ import torch
 
 from gsplat_core import InvalidInput, quat_scale_to_covar_preci, reference
 
-pytestmark = pytest.mark.cuda
-
 
 @pytest.mark.parametrize("triu", [True, False])
 @pytest.mark.parametrize("count", [0, 1, 1003])

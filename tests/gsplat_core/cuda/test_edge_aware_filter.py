@@ -8,8 +8,6 @@ import torch
 from gsplat_core.ops.edge_aware_filter.edge_aware_filter import smooth_within_edges
 from tests.gsplat_core.ops.test_edge_aware_filter import SHAPES, case, check_against_reference
 
-pytestmark = pytest.mark.cuda
-
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_values_are_those_of_the_reference(gpu, shape):

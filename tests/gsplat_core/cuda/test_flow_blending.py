@@ -9,8 +9,6 @@ from gsplat_core import Camera, reference
 from gsplat_core.ops.flow_blending.flow_blending import blend_flow, intrinsics_of
 from tests.gsplat_core.ops.flow_scenes import AFTER, BEFORE, FlowScene, flow_scene
 
-pytestmark = pytest.mark.cuda
-
 
 def evaluated(function, scene, dtype, device, before=BEFORE):
     given = scene.converted(dtype, device)

@@ -11,8 +11,6 @@ import torch
 from gsplat_core.ops.frame.frame import MAX_SEGMENT, STATUS_NEEDED, Frame, FrameMode
 from tests.gsplat_core.cuda.frame_checks import assert_near, check, plain, scene
 
-pytestmark = pytest.mark.cuda
-
 
 @pytest.mark.parametrize("model", ["pinhole", "ortho", "fisheye"])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])

@@ -22,8 +22,6 @@ from tests.gsplat_core.cuda.frame_scenes import (
     rendered,
 )
 
-pytestmark = pytest.mark.cuda
-
 
 class AdamState:
     """Gaussians that the fused step updates."""

@@ -11,8 +11,6 @@ from gsplat_core import InvalidInput
 from gsplat_core.ops.frame.frame import FrameMode, render_frame
 from tests.gsplat_core.cuda.frame_scenes import NAMES, backward, by_name, frame_scene, on_gpu, rendered
 
-pytestmark = pytest.mark.cuda
-
 
 @pytest.mark.parametrize("degree", [0, 2])
 def test_autograd_takes_the_same_way(degree: int) -> None:

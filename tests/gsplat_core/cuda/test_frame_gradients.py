@@ -24,7 +24,6 @@ from tests.gsplat_core.cuda.frame_scenes import (
     rendered,
 )
 
-pytestmark = pytest.mark.cuda
 MODELS = ("pinhole", "ortho", "fisheye")
 
 

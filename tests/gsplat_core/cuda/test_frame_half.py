@@ -23,7 +23,6 @@ from gsplat_core.rendering.settings import EPS2D
 from gsplat_core.scene.gaussians import COLOUR
 from tests.gsplat_core.cuda.frame_scenes import FrameScene, frame_scene
 
-pytestmark = pytest.mark.cuda
 STOP = 1e-4
 
 

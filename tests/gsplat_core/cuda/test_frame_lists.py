@@ -11,8 +11,6 @@ from gsplat_core import InvalidInput
 from gsplat_core.ops.frame.frame import STATUS_LONGEST, STATUS_NEEDED, STATUS_OVERFLOW, FrameMode
 from tests.gsplat_core.cuda.frame_checks import assert_near, check, check_lists, plain, scene
 
-pytestmark = pytest.mark.cuda
-
 
 @pytest.mark.parametrize("count", [2000, 2049, 5000, 100_000])
 def test_very_many_splats_in_one_tile(count: int) -> None:

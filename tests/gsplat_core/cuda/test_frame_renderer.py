@@ -12,8 +12,6 @@ from gsplat_core import Camera, Gaussians, InvalidInput, render
 from gsplat_core.deformation import BasisField
 from gsplat_core.rendering.frame_renderer import FrameRenderer
 
-pytestmark = pytest.mark.cuda
-
 WIDTH_PX, HEIGHT_PX = 150, 101
 
 

@@ -6,8 +6,6 @@ import torch
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.frame.frame import accumulate_status_
 
-pytestmark = pytest.mark.cuda
-
 
 def ints(*values):
     return torch.tensor(values, dtype=torch.int32, device="cuda")

@@ -13,8 +13,6 @@ from gsplat_core.training.steps.fused_step import FusedStep
 from gsplat_core.training.steps.optimiser import FusedAdam
 from gsplat_core.training.steps.photometric import LossWeights
 
-pytestmark = pytest.mark.cuda
-
 RATES = {"means": 1e-2, "quats": 2e-3, "log_scales": 5e-3, "logit_opacities": 2e-2, "sh": 1e-2}
 
 

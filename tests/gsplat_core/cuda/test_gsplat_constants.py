@@ -11,8 +11,6 @@ from gsplat_core import fully_fused_projection, reference
 from tests.gsplat_core.cuda.test_compositing import Scene, check, scene
 from tests.gsplat_core.cuda.test_projection import MODELS, project, to_gpu
 
-pytestmark = pytest.mark.cuda
-
 
 @pytest.mark.parametrize("absgrad", [True, False])
 @pytest.mark.parametrize("channels", [1, 2, 3, 4, 5, 9])

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from gsplat_core import rasterization, reference
 
-pytestmark = pytest.mark.cuda
 NAMES = ("means", "quats", "scales", "opacities", "sh", "viewmats")
 
 

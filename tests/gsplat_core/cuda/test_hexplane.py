@@ -10,8 +10,6 @@ from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.hexplane.hexplane import hexplane_decode, hexplane_features, hexplane_modulate, hexplane_space
 from gsplat_core.ops.hexplane_deltas.hexplane_deltas import hexplane_deltas, takes_layers
 
-pytestmark = pytest.mark.cuda
-
 AXES = ((0, 1), (0, 2), (1, 2), (0, 3), (1, 3), (2, 3))
 
 

@@ -9,8 +9,6 @@ from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.steps.optimiser import FusedAdam
 
-pytestmark = pytest.mark.cuda
-
 WINDOW = (2.0, 4.0)
 SIZES = {
     "small": {"channels": 32, "resolution": (6, 7, 5, 9), "levels": (1, 2), "width": 64, "depth": 3},

@@ -9,8 +9,6 @@ from gsplat_core.reference import plane_penalties
 from gsplat_core.reference.adam import adam_step
 from tests.gsplat_core.cuda.hexplane_cases import Case
 
-pytestmark = pytest.mark.cuda
-
 PENALTIES = {
     "none": Penalties(),
     "smoothness": Penalties(plane_smoothness=30.0),

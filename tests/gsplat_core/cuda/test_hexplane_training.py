@@ -13,8 +13,6 @@ from gsplat_core.ops.hexplane_training.hexplane_training import (
 )
 from tests.gsplat_core.cuda.hexplane_cases import Case
 
-pytestmark = pytest.mark.cuda
-
 
 def relative(actual, wanted):
     return float((actual.cpu().double() - wanted).norm() / wanted.norm().clamp(min=1e-12))

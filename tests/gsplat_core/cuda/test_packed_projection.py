@@ -9,8 +9,6 @@ from gsplat_core import fully_fused_projection, rasterization
 from gsplat_core.ops.packed_projection.packed_projection import values_of_rows, visible_harmonics
 from gsplat_core.ops.projection.arguments import Pairs
 
-pytestmark = pytest.mark.cuda
-
 LEAVES = ("means", "quats", "scales", "viewmats")
 OUTPUTS = ("means2d", "depths", "conics", "compensations")
 

@@ -21,8 +21,6 @@ from gsplat_core.ops.tiles.grid import TileGrid
 from gsplat_core.ops.tiles.tiles import bin_splats
 from gsplat_core.rendering.pipeline import camera_centers
 
-pytestmark = pytest.mark.cuda
-
 
 def place(scene, device="cuda", dtype=torch.float32):
     scene = scene.to(dtype)

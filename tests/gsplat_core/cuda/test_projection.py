@@ -7,7 +7,6 @@ import torch
 
 from gsplat_core import InvalidInput, fully_fused_projection, reference
 
-pytestmark = pytest.mark.cuda
 MODELS = ("pinhole", "ortho", "fisheye")
 
 

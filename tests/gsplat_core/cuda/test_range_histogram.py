@@ -9,8 +9,6 @@ from gsplat_core.ops.range_histogram.range_histogram import Bins
 from tests.gsplat_core.ops.range_scenes import BINS, TENSORS, assert_close, pixel_factors, run
 from tests.gsplat_core.ops.ray_scenes import ray_scene
 
-pytestmark = pytest.mark.cuda
-
 
 @pytest.mark.parametrize("factors", [False, True])
 @pytest.mark.parametrize("bins", [BINS, Bins(30.0, 0.05, 300), Bins(0.0, 200.0, 1)])

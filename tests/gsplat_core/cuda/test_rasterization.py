@@ -10,8 +10,6 @@ from torch import Tensor
 
 from gsplat_core import rasterization, reference
 
-pytestmark = pytest.mark.cuda
-
 
 def run(function, scene, device="cuda", **options) -> tuple[list[Tensor], dict]:
     """Image, alpha and the gradients of a random weighting of both, on the CPU; and the call's meta."""

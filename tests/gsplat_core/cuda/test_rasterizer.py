@@ -9,8 +9,6 @@ import torch
 from gsplat_core import Camera, Rasterizer
 from gsplat_core.rendering.frame_renderer import TileListCapacity
 
-pytestmark = pytest.mark.cuda
-
 CAMERA = Camera.from_focal(120.0, 150, 101)
 
 

@@ -10,8 +10,6 @@ import torch
 from gsplat_core.ops.ray_blending.ray_blending import MAX_CHANNELS, blend_rays, splat_contributions
 from tests.gsplat_core.ops.ray_scenes import INPUTS, assert_close, exact_contributions, ray_scene, with_bad_values
 
-pytestmark = pytest.mark.cuda
-
 
 @pytest.mark.parametrize("channels", [0, 1, 3, 4, 8, 9, MAX_CHANNELS])
 def test_random_scene_for_any_number_of_channels(gpu, channels):

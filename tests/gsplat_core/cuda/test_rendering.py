@@ -7,8 +7,6 @@ from gsplat_core.rendering import rasterization as rendering
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.cameras import Camera
 
-pytestmark = pytest.mark.cuda
-
 CAMERA = Camera.from_focal(70.0, 90, 70)
 
 

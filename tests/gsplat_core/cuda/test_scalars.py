@@ -8,8 +8,6 @@ import torch
 from gsplat_core import InvalidInput
 from gsplat_core.ops.scalars.scalars import MOST_SCALARS, store_scalars_
 
-pytestmark = pytest.mark.cuda
-
 
 @pytest.mark.parametrize("count", [0, 1, 26, MOST_SCALARS])
 def test_all_values_arrive(count):

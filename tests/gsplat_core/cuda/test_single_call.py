@@ -13,8 +13,6 @@ from gsplat_core.rendering import single_call
 from gsplat_core.rendering.rasterization import step_by_step
 from tests.gsplat_core.cuda.single_call_checks import assert_same, check_lists, inputs, run
 
-pytestmark = pytest.mark.cuda
-
 
 @pytest.fixture(autouse=True)
 def calls(monkeypatch) -> list[bool]:

@@ -11,8 +11,6 @@ from gsplat_core import rasterization
 from gsplat_core.rendering.rasterization import step_by_step
 from tests.gsplat_core.cuda.single_call_checks import assert_same, inputs, run
 
-pytestmark = pytest.mark.cuda
-
 
 @pytest.mark.parametrize("mode", ["RGB", "RGB+ED", "ED"])
 def test_gradient_of_the_background(make_scene, mode):

@@ -5,8 +5,6 @@ import torch
 
 from gsplat_core import reference, spherical_harmonics
 
-pytestmark = pytest.mark.cuda
-
 
 @pytest.mark.parametrize("degree", range(5))
 @pytest.mark.parametrize(("cameras", "count"), [(1, 0), (1, 1), (3, 1003)])

@@ -8,8 +8,6 @@ import torch
 from gsplat_core.ops.splat_rays.splat_rays import splat_rays
 from tests.gsplat_core.ops.ray_scenes import gaussians, intrinsics, splat_results
 
-pytestmark = pytest.mark.cuda
-
 
 @pytest.mark.parametrize("count", [0, 1, 7, 5000])
 def test_values_and_gradients_equal_the_reference(gpu, count):

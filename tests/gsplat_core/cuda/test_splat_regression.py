@@ -8,8 +8,6 @@ import torch
 from gsplat_core import reference
 from gsplat_core.ops.splat_regression.splat_regression import splat_regression
 
-pytestmark = pytest.mark.cuda
-
 
 def scene(points, splats, dims, channels, seed=1):
     g = torch.Generator().manual_seed(seed)

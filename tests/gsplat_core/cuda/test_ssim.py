@@ -8,8 +8,6 @@ import torch
 from gsplat_core import reference
 from gsplat_core.ops.ssim.ssim import ssim_map
 
-pytestmark = pytest.mark.cuda
-
 SHAPES = [
     (1, 1, 3),
     (1, 700, 3),

@@ -42,6 +42,6 @@ def test_features_and_gradients_are_those_of_the_processor():
         features = field(xyzt.to(device))
         (features * weights.to(device)).sum().backward()
         planes = [*field.spatial_planes(), *field.temporal_planes()]
-        found[device] = [features.detach().cpu(), *(plane.grad.cpu() for plane in planes)]
+        found[device] = [value.detach().cpu().clone() for value in (features, *(plane.grad for plane in planes))]
     for own, other in zip(found["cuda"], found["cpu"], strict=True):
         assert (own - other).abs().max() < 1e-4 * max(1, float(other.abs().max()))

@@ -8,8 +8,6 @@ import torch
 from gsplat_core.ops.stereo_matching.stereo_matching import match_disparities
 from tests.gsplat_core.ops.stereo_cases import every_case, pair
 
-pytestmark = pytest.mark.cuda
-
 
 def check_against_cpu(gpu, left, right, lowest, count):
     found = match_disparities(left.to(gpu), right.to(gpu), lowest, count)

@@ -22,7 +22,6 @@ from tests.gsplat_core.ops.stochastic_scenes import (
     z_scores,
 )
 
-pytestmark = pytest.mark.cuda
 MOMENTS = {"fragments": sample_moments, "points": point_moments}
 METHODS = pytest.mark.parametrize("method", ["fragments", "points"])
 

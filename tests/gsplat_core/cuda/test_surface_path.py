@@ -8,8 +8,6 @@ import torch
 from gsplat_core.ops.surface_motion.surface_motion import surface_path
 from tests.gsplat_core.ops.test_surface_motion import exact_path, path_scene
 
-pytestmark = pytest.mark.cuda
-
 
 @pytest.mark.parametrize(("steps", "count"), [(0, 5), (1, 0), (1, 1), (3, 257), (20, 3000)])
 @pytest.mark.parametrize("cells", [(1, 1), (12, 16)])

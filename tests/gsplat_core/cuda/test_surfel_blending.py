@@ -8,8 +8,6 @@ import torch
 from gsplat_core import rasterization_2dgs, rasterize_to_pixels_2dgs
 from tests.gsplat_core.ops.surfel_scenes import BLENDED, INPUTS, blend_scene, close, surfel_scene
 
-pytestmark = pytest.mark.cuda
-
 
 def assert_close(scene, gpu, *, absgrad=False):
     close(scene.run(device=gpu, absgrad=absgrad), scene.run(torch.float64, absgrad=absgrad), 1e-3)

@@ -9,8 +9,6 @@ import torch
 
 from tests.gsplat_core.ops.surfel_scenes import close, surfel_scene
 
-pytestmark = pytest.mark.cuda
-
 
 @pytest.mark.parametrize(
     ("count", "batch", "cameras"), [(0, (), 1), (1, (), 1), (300, (), 3), (300, (2,), 2), (5, (0,), 2)]

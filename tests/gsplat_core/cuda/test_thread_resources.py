@@ -5,14 +5,11 @@ import itertools
 import threading
 import time
 
-import pytest
 import torch
 
 from gsplat_core.ops.hexplane.plain_torch import PLANE_AXES
 from gsplat_core.ops.hexplane_training.hexplane_training import hexplane_train
 from gsplat_core.ops.native import CUDA_LIBRARY_PATH
-
-pytestmark = pytest.mark.cuda
 
 
 def resources() -> int:

@@ -14,7 +14,6 @@ from gsplat_core.ops.tiles.tiles import bin_splats, isect_offset_encode, isect_t
 from gsplat_core.reference import tiles as reference
 from gsplat_core.reference.rendering import bin_splats_within
 
-pytestmark = pytest.mark.cuda
 WIDTH, HEIGHT = 150, 100
 
 

@@ -11,8 +11,6 @@ from tests.gsplat_core.ops.test_unscented_kernels import CAMERAS, project, wide_
 from tests.gsplat_core.ops.test_unscented_projection import H, W
 from tests.gsplat_core.rendering import test_unscented as pictures
 
-pytestmark = pytest.mark.cuda
-
 
 def moved(values, device):
     return {name: value.to(device) if isinstance(value, torch.Tensor) else value for name, value in values.items()}

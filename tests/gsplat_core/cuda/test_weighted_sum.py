@@ -8,7 +8,6 @@ from gsplat_core.ops.tiles.grid import TileGrid
 from gsplat_core.ops.tiles.tiles import bin_splats
 from gsplat_core.ops.weighted_sum.weighted_sum import weighted_sums
 
-pytestmark = pytest.mark.cuda
 WIDTH, HEIGHT = 70, 45
 
 

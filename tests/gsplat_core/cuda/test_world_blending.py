@@ -9,8 +9,6 @@ import torch
 
 from tests.gsplat_core.ops.test_world_blending import blend, cast, gradients, two_pictures
 
-pytestmark = pytest.mark.cuda
-
 
 @pytest.mark.parametrize(("channels", "masked"), [(1, False), (3, True), (8, False), (11, False), (35, False)])
 def test_results_and_gradients_are_those_of_plain_torch(gpu, channels, masked):
