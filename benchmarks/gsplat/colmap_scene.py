@@ -82,8 +82,9 @@ def cameras(count: int, width_px: int, height_px: int) -> list[Camera]:
 def picture(gaussians: Gaussians, camera: Camera) -> NDArray[np.uint8]:
     """Render a picture [H, W, 3] at twice its size, and average each four pixels."""
     with torch.inference_mode():
-        large = render(gaussians, camera.scaled(2), torch.tensor([0.05, 0.06, 0.09]), depth=False).image
-    large = (large.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+        background = torch.tensor([0.05, 0.06, 0.09], device=gaussians.means.device)
+        large = render(gaussians, camera.scaled(2), background, depth=False).image
+    large = (large.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
     size_px = camera.width_px, camera.height_px
     return np.asarray(cv2.resize(large, size_px, interpolation=cv2.INTER_AREA), np.uint8)
 
@@ -98,6 +99,7 @@ def write_scene(
     noise: float = 0.01,
     per_unit: float = 70,
     seed: int = 0,
+    device: str = "cpu",
 ) -> None:
     """Write a scene: `images/` with PNG files, and `sparse/0`.
 
@@ -110,6 +112,7 @@ def write_scene(
         noise: standard error of their positions, in world units.
         per_unit: rendered Gaussians per unit of length of a surface.
         seed: seed of the points.
+        device: device that renders the pictures.
     """
     rng = np.random.default_rng(seed)
     positions, colours = surfaces(per_unit, rng)
@@ -120,7 +123,7 @@ def write_scene(
         torch.full((count, 3), math.log(0.55 / per_unit)),
         torch.full((count,), 3.0),
         torch.tensor((colours - 0.5) / SH_C0, dtype=torch.float32)[:, None],
-    )
+    ).to(device)
     (folder / "images").mkdir(parents=True)
     posed = [(f"view_{k:03d}.png", camera) for k, camera in enumerate(cameras(views, width_px, height_px))]
     for name, camera in posed:
