@@ -155,7 +155,10 @@ def test_a_live_row_is_met_only_if_every_run_is_above_the_previous_frame(tmp_pat
         )
 
     for runs, row in (
-        (((24.0, 0), (23.5, 0)), "| `r` | – | 23.8 (23.5) | 20.0 (20.0) | – | – | 0 (0) | – | – | – | – | – of – | blur 2 | met |"),
+        (
+            ((24.0, 0), (23.5, 0)),
+            "| `r` | – | 23.8 (23.5) | 20.0 (20.0) | – | – | 0 (0) | – | – | – | – | – of – | blur 2 | met |",
+        ),
         (((24.0, 0), (22.5, 0)), "missed"),
         (((24.0, 0), (23.5, 1)), "missed"),
     ):

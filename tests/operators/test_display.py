@@ -204,7 +204,9 @@ def test_ages_of_the_first_second_and_of_withheld_frames_are_told_apart(
     screen, rendered, frame, fake_time, compute_queued
 ):
     for time_s, age_ms, withheld in [(3.0, 200.0, None), (3.99, 100.0, None), (4.0, 20.0, None), (4.5, 90.0, "blur")]:
-        of_frame = frame(0, pts_ns=round(time_s * 1e9), withheld=withheld, arrived_ns=fake_time.ns - round(age_ms * 1e6))
+        of_frame = frame(
+            0, pts_ns=round(time_s * 1e9), withheld=withheld, arrived_ns=fake_time.ns - round(age_ms * 1e6)
+        )
         compute_queued(screen.operator, rendered=[rendered(0, frame=of_frame)])
         fake_time.pass_ms(300)
     outcome = OutcomeBuilder()

@@ -98,7 +98,12 @@ def test_a_replayed_session_says_that_its_frames_were_withheld_before():
 
 
 @pytest.mark.parametrize(
-    "parts", [(LiveDisplayResult(1, None, None, None, {}, None),), (DisplayResult(1),), (QualityResult(None, None, (), 1, "", 1),)]
+    "parts",
+    [
+        (LiveDisplayResult(1, None, None, None, {}, None),),
+        (DisplayResult(1),),
+        (QualityResult(None, None, (), 1, "", 1),),
+    ],
 )
 def test_a_run_that_showed_a_frame_is_left_alone(parts):
     require_shown(ended("live", source(5), withheld(blur=4), *parts))
