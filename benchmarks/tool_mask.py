@@ -52,8 +52,9 @@ def main() -> int:
     finder: MaskFinder = ToolFinder() if arguments.method == "classical" else NetworkToolFinder()
     if arguments.method.startswith("trained:"):
         trained = Path(arguments.method.removeprefix("trained:"))
-        height, width = json.loads((trained / "training.json").read_text())["input_px"]
-        finder = NetworkToolFinder(trained / "tool_network.onnx", (width, height))
+        training = json.loads((trained / "training.json").read_text())
+        height, width = training["input_px"]
+        finder = NetworkToolFinder(trained / "tool_network.onnx", (width, height), training.get("inputs", 5))
     if arguments.method.startswith("onnx:"):
         finder = OnnxToolFinder(Path(arguments.method.removeprefix("onnx:")))
     if arguments.annotations:

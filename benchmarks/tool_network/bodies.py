@@ -66,7 +66,7 @@ def material(rng: Generator, canvas: Canvas, kind: str | None = None) -> Materia
     if kind == "metal":
         albedo = rng.uniform(0.2, 0.75) * tint
         colour = shade[:, None] * albedo + gloss[:, None]
-        reflected = rng.uniform(0, 0.4)
+        reflected = rng.uniform(0, 0.3)
         edge = np.abs(v)[:, None] ** rng.uniform(1, 5)
         colour = colour + edge * reflected * (canvas.surround - colour)
     elif kind == "chrome":
@@ -77,7 +77,7 @@ def material(rng: Generator, canvas: Canvas, kind: str | None = None) -> Materia
         red = np.interp(
             v,
             [-1, rng.uniform(-0.9, 0.9), 1],
-            rng.uniform(0.4, 1.0, 3) if rng.random() < 0.3 else rng.uniform(0, 0.7, 3),
+            rng.uniform(0.4, 1.0, 3) if rng.random() < 0.15 else rng.uniform(0, 0.5, 3),
         )[:, None]
         colour = grey * (1 - red) + red * canvas.surround * np.interp(v, knots, level)[:, None] * 2
     elif kind == "black":

@@ -12,7 +12,7 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from benchmarks.tool_network.bodies import Canvas, Material, body, cap, curved, entry, material, rotated, straight
-from benchmarks.tool_network.tissue import Picture, Plane, colour_of, lit, noise, smooth, spots, vessels
+from benchmarks.tool_network.tissue import Picture, Plane, colour_of, detail, lit, noise, smooth, spots, vessels
 
 WALLS = np.array(
     [
@@ -76,6 +76,8 @@ def hollow_organ(rng: Generator, height: int, width: int) -> Picture:
         image = residue(rng, image)
     if rng.random() < 0.15:
         image = liquid(rng, image)
+    if rng.random() < 0.6:
+        image = detail(rng, image, 0.2)
     if rng.random() < 0.15:
         bubbles(rng, image)
     if rng.random() < 0.12:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from benchmarks.tool_network.bodies import Canvas, Points, body, cap, curved, entry, material, rotated, straight
 from benchmarks.tool_network.flexible import accessory
+from benchmarks.tool_network.recorded import RecordedTools
 from benchmarks.tool_network.tissue import Picture, Plane, noise, smooth
 
 
@@ -25,7 +26,7 @@ def instrument(rng: Generator, canvas: Canvas, accessories: float) -> None:
     reach = rng.beta(2.5, 1.6)
     tip = start + (target - start) * np.clip(reach * 1.3, 0.35, 1.25)
     direction = (tip - start) / max(1e-6, np.linalg.norm(tip - start))
-    half = height * float(np.exp(rng.uniform(np.log(0.025), np.log(0.26))))
+    half = height * float(np.exp(rng.uniform(np.log(0.035), np.log(0.3))))
     taper = rng.uniform(0.45, 1.0)
     tone = canvas.light * rng.uniform(0.6, 1.3)
     kinds = ["shaft", "wrist", "tube", "plate", "box", "needle", "blob"]
@@ -279,7 +280,13 @@ def box(rng: Generator, canvas: Canvas, start: NDArray, tip: NDArray, half: floa
         surface_fill(rng, canvas, inner + side * wide * rng.uniform(-0.2, 0.2), tone)
 
 
-def with_instruments(rng: Generator, image: Picture, count: int, accessories: float) -> tuple[Picture, Plane]:
+RECORDED = 0.15
+"""Share of recorded instruments."""
+
+
+def with_instruments(
+    rng: Generator, image: Picture, count: int, accessories: float, recorded: RecordedTools | None
+) -> tuple[Picture, Plane]:
     """Return the picture with instruments and their coverage [h, w], 0..1."""
     height, width = image.shape[:2]
     surround = image.reshape(-1, 3).mean(0)
@@ -290,7 +297,10 @@ def with_instruments(rng: Generator, image: Picture, count: int, accessories: fl
     total = np.zeros((height, width), np.float32)
     for _ in range(count):
         layer = Canvas(canvas.image.copy(), np.zeros((height, width), np.float32), canvas.surround, canvas.light)
-        instrument(rng, layer, accessories)
+        if recorded is not None and rng.random() < RECORDED:
+            recorded.draw(rng, layer)
+        else:
+            instrument(rng, layer, accessories)
         if rng.random() < 0.6:
             move = np.float32([[1, 0, rng.normal(0, 6)], [0, 1, rng.uniform(1, 12)]])
             cast = cv2.warpAffine(layer.mask, move, (width, height))

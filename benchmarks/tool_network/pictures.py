@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from benchmarks.tool_network.flexible import hollow_organ, narrow_band
 from benchmarks.tool_network.instruments import clips, with_instruments
+from benchmarks.tool_network.recorded import RecordedTools
 from benchmarks.tool_network.tissue import Picture, Plane, TissuePool, falloff, noise, smooth
 
 SIZE_PX = (128, 160)
@@ -22,7 +23,9 @@ ACCESSORIES = (0.08, 0.9)
 """Share of accessories of flexible endoscopes among the instruments, elsewhere and inside of hollow organs."""
 
 
-def training_picture(rng: Generator, pool: TissuePool) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+def training_picture(
+    rng: Generator, pool: TissuePool, recorded: RecordedTools | None = None
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     """Return a picture uint8 RGB [128, 160, 3] and the coverage by tools, uint8 [128, 160], 255 = tool."""
     height, width = DRAWN_PX
     hollow = rng.random() < HOLLOW
@@ -39,7 +42,7 @@ def training_picture(rng: Generator, pool: TissuePool) -> tuple[NDArray[np.uint8
     if rng.random() >= WITHOUT_TOOLS[hollow]:
         shares = [0.75, 0.2, 0.05, 0] if hollow else [0.4, 0.33, 0.17, 0.1]
         count = int(rng.choice([1, 2, 3, 4], p=shares))
-        image, mask = with_instruments(rng, np.asarray(image, np.float32), count, ACCESSORIES[hollow])
+        image, mask = with_instruments(rng, np.asarray(image, np.float32), count, ACCESSORIES[hollow], recorded)
     if inner_light:
         image = image * light[..., None]
     if rng.random() < 0.18:
@@ -92,7 +95,7 @@ def photographed(
     image = image * np.exp(rng.normal(0, 0.07, 3)).astype(np.float32)
     grey = image.mean(-1, keepdims=True)
     image = grey + (image - grey) * np.float32(np.exp(rng.normal(0.15, 0.17)))
-    blur = float(rng.choice([0, 0.5, 1, 2], p=[0.35, 0.3, 0.22, 0.13]))
+    blur = float(rng.choice([0, 0.5, 1, 2], p=[0.45, 0.28, 0.17, 0.1]))
     if blur:
         image = np.asarray(cv2.GaussianBlur(image, (0, 0), blur), np.float32)
     if rng.random() < 0.1:
@@ -108,8 +111,8 @@ def photographed(
     small_height, small_width = SIZE_PX
     image = np.asarray(cv2.resize(image, (small_width, small_height), interpolation=cv2.INTER_AREA), np.float32)
     mask = np.asarray(cv2.resize(mask, (small_width, small_height), interpolation=cv2.INTER_AREA), np.float32)
-    if rng.random() < 0.4:
-        image = image + rng.uniform(0.3, 1.5) * (image - cv2.GaussianBlur(image, (0, 0), rng.uniform(0.7, 1.5)))
+    if rng.random() < 0.5:
+        image = image + rng.uniform(0.3, 1.8) * (image - cv2.GaussianBlur(image, (0, 0), rng.uniform(0.7, 1.5)))
     if rng.random() < 0.6:
         image = image + rng.normal(0, 1, image.shape).astype(np.float32) * np.float32(rng.uniform(0, 0.035))
     out = (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)

@@ -41,6 +41,9 @@ PALETTES = np.array(
 LIKELY = np.array([1.5, 1.5, 0.8, 1.2, 1.0, 1.0, 0.8, 0.6, 0.35, 1.5, 0.15, 0.12])
 """Relative frequency of the palettes."""
 LIKELY /= LIKELY.sum()
+COLOURED = LIKELY * (PALETTES[:, 0].max(1) > 1.3 * PALETTES[:, 0].min(1))
+COLOURED /= COLOURED.sum()
+"""Frequency of the palettes for round shapes from the border, which would look like tools in a grey one."""
 
 
 def noise(rng: Generator, height: int, width: int, coarse: int, octaves: int, gain: float = 0.55) -> Plane:
@@ -63,9 +66,9 @@ def smooth(plane: Plane, low: float, high: float) -> Plane:
     return t * t * (3 - 2 * t)
 
 
-def colour_of(rng: Generator, height: int, width: int) -> tuple[Picture, Plane]:
-    """Return the colour of one kind of tissue and its relief [h, w]."""
-    base, second, deep = PALETTES[rng.choice(len(PALETTES), p=LIKELY)] * rng.uniform(0.85, 1.15, (3, 1)).astype(
+def colour_of(rng: Generator, height: int, width: int, likely: NDArray[np.float64] = LIKELY) -> tuple[Picture, Plane]:
+    """Return the colour of one kind of tissue and its relief [h, w]. `likely` are the frequencies of the palettes."""
+    base, second, deep = PALETTES[rng.choice(len(PALETTES), p=likely)] * rng.uniform(0.85, 1.15, (3, 1)).astype(
         np.float32
     )
     base = base + rng.normal(0, 0.025, 3).astype(np.float32)
@@ -83,6 +86,45 @@ def colour_of(rng: Generator, height: int, width: int) -> tuple[Picture, Plane]:
     if rng.random() < 0.6:
         vessels(rng, image, int(rng.integers(1, 9)))
     return np.asarray(image, np.float32), np.asarray(relief, np.float32)
+
+
+def detail(rng: Generator, image: Picture, most: float) -> Picture:
+    """Return the picture with structure down to single pixels, which real tissue has: grain, fibres and mottled colour.
+
+    Args:
+        most: largest standard deviation of the logarithm of brightness.
+    """
+    height, width = image.shape[:2]
+    strength = most * rng.uniform(0.1, 1) ** 1.5
+    fine = noise(rng, height, width, int(height * rng.uniform(0.12, 0.45)), 2, 0.7)
+    if rng.random() < 0.5:
+        fine = rng.uniform(0.2, 1) * fine + rng.uniform(0.1, 0.8) * fibres(rng, height, width)
+    where = smooth(noise(rng, height, width, int(rng.integers(2, 7)), 3), rng.uniform(-3, 0), rng.uniform(0.5, 2))
+    mottled = noise(rng, height, width, int(height * rng.uniform(0.08, 0.3)), 2, 0.7) * where
+    hue = rng.normal(0, 1, 3).astype(np.float32) * np.array([0.3, 1, 1], np.float32)
+    logs = np.float32(strength) * ((where * fine)[..., None] + rng.uniform(0, 0.8) * mottled[..., None] * hue)
+    return np.asarray(image * np.exp(logs.clip(-0.8, 0.7)), np.float32)
+
+
+def fibres(rng: Generator, height: int, width: int) -> Plane:
+    """Return noise [h, w] that is stretched along curved lines; standard deviation near 1."""
+    long, thin = rng.uniform(6, 30), rng.uniform(1.2, 4)
+    side = int(1.5 * max(height, width))
+    small = rng.standard_normal((int(side / thin) + 2, int(side / long) + 2), np.float32)
+    angle = rng.uniform(0, np.pi)
+    c, s = float(np.cos(angle)), float(np.sin(angle))
+    y, x = np.mgrid[0:height, 0:width].astype(np.float32)
+    y = y - height / 2 + rng.uniform(2, 14) * noise(rng, height, width, 2, 3)
+    x = x - width / 2
+    along, across = x * c + y * s + side / 2, y * c - x * s + side / 2
+    bent = cv2.remap(
+        small,
+        np.asarray(along / np.float32(long), np.float32),
+        np.asarray(across / np.float32(thin), np.float32),
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REFLECT_101,
+    )
+    return np.asarray(bent / max(1e-6, float(bent.std())), np.float32)
 
 
 def lobules(rng: Generator, height: int, width: int) -> Plane:
@@ -136,6 +178,9 @@ def lit(rng: Generator, image: Picture, relief: Plane) -> Picture:
     """Return the tissue lit from near the scope: diffuse light by the relief, and wet highlights."""
     height, width = relief.shape
     relief = np.asarray(relief, np.float32)
+    if rng.random() < 0.6:
+        rough = noise(rng, height, width, int(height * rng.uniform(0.08, 0.3)), 2, 0.6)
+        relief = relief + rough * rng.uniform(0, 0.12) * smooth(noise(rng, height, width, 3, 2), -1, 1.5)
     depth = rng.uniform(2, 14)
     dx = np.asarray(cv2.Sobel(relief, cv2.CV_32F, 1, 0, scale=depth / 8))
     dy = np.asarray(cv2.Sobel(relief, cv2.CV_32F, 0, 1, scale=depth / 8))
@@ -144,7 +189,7 @@ def lit(rng: Generator, image: Picture, relief: Plane) -> Picture:
     facing = (1 - light[0] * dx - light[1] * dy) / length / np.float32(np.sqrt(1 + light @ light))
     out = image * (0.35 + 0.65 * np.clip(facing, 0, 1))[..., None]
     if rng.random() < 0.85:
-        fine = noise(rng, height, width, int(rng.integers(6, 30)), 3, 0.7)
+        fine = noise(rng, height, width, int(rng.integers(6, 50)), 3, 0.7)
         fx, fy = cv2.Sobel(fine, cv2.CV_32F, 1, 0, scale=0.1), cv2.Sobel(fine, cv2.CV_32F, 0, 1, scale=0.1)
         nx, ny = dx * 0.6 + fx * rng.uniform(0.2, 2), dy * 0.6 + fy * rng.uniform(0.2, 2)
         away = (nx - rng.normal(0, 0.4)) ** 2 + (ny - rng.normal(0, 0.4)) ** 2
@@ -199,9 +244,11 @@ def organs(rng: Generator, height: int, width: int) -> Picture:
 def loop(rng: Generator, image: Picture) -> Picture:
     """Return a picture with a rounded loop of bowel or fold of tissue over it, which may enter from the border."""
     height, width = image.shape[:2]
-    other, relief = colour_of(rng, height, width)
+    other, relief = colour_of(rng, height, width, COLOURED)
     if rng.random() < 0.6:
         vessels(rng, other, int(rng.integers(2, 10)))
+    if rng.random() < 0.7:
+        other = detail(rng, other, 0.3)
     angle = rng.uniform(0, np.pi)
     y, x = np.mgrid[0:height, 0:width].astype(np.float32)
     y, x = y - height * rng.uniform(0, 1), x - width * rng.uniform(0, 1)
@@ -311,7 +358,7 @@ class Photographs:
     def draw(self, rng: Generator, height: int, width: int) -> Picture:
         """Return a warped, recoloured crop."""
         picture = self.pictures[rng.integers(len(self.pictures))]
-        if rng.random() < 0.3:
+        if rng.random() < 0.5:
             picture = self.pictures[-1 - rng.integers(min(2, len(self.pictures)))]
         h, w = picture.shape[:2]
         scale = max(width / w, height / h) * rng.uniform(1.0, 2.5)
@@ -335,7 +382,7 @@ def _reduced(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def tissue(
-    rng: Generator, height: int, width: int, photographs: Photographs | None = None, photographed: float = 0.18
+    rng: Generator, height: int, width: int, photographs: Photographs | None = None, photographed: float = 0.3
 ) -> Picture:
     """Return a random picture of tissue, float32 RGB [h, w, 3], about 0..1, not clipped.
 
@@ -345,10 +392,17 @@ def tissue(
     kind = rng.random()
     if photographs is not None and kind < photographed:
         image = photographs.draw(rng, height, width)
-    elif kind < 0.36:
+        if rng.random() < 0.3:
+            # Photographed and drawn tissue in one picture.
+            border = noise(rng, height, width, int(rng.integers(1, 4)), 4, 0.5) + rng.normal(0, 0.7)
+            drawn = detail(rng, organs(rng, height, width), 0.35)
+            image = image + smooth(border, 0, rng.uniform(0.03, 0.5))[..., None] * (drawn - image)
+    elif kind < 0.44:
         image = lumen(rng, height, width)
     else:
         image = organs(rng, height, width)
+    if rng.random() < 0.8:
+        image = detail(rng, np.asarray(image, np.float32), 0.35)
     if rng.random() < 0.4:
         for _ in range(int(rng.integers(1, 4))):
             image = loop(rng, image)
@@ -366,7 +420,7 @@ class TissuePool:
     """Pictures of tissue that are used several times, mirrored and recoloured, because drawing them takes most of the time."""
 
     def __init__(
-        self, photographs: Photographs | None = None, size: int = 500, new: float = 0.3, photographed: float = 0.18
+        self, photographs: Photographs | None = None, size: int = 500, new: float = 0.3, photographed: float = 0.3
     ) -> None:
         self.photographs, self.photographed = photographs, photographed
         self.size, self.new = size, new

@@ -6,9 +6,9 @@ is over. Backgrounds are drawn or come from recordings whose terms allow it: `co
 
 The weights are the mean over checkpoints, since long training on the same pictures finds less in real ones. How many of the last checkpoints are
 averaged is decided by validation pictures. They are drawn from other seeds, half of them over photographs that training does not see
-(`hamlyn_pair`, `out_of_body/0001`). No annotated recording is read.
+(`hamlyn_pair`). No annotated recording is read.
 
-Usage: python -m benchmarks.tool_network.train FOLDER [--recordings DIR] [--device cuda] [--workers 16] [--minutes 8] [--seed 0]
+Usage: python -m benchmarks.tool_network.train FOLDER [--recordings DIR] [--device cuda] [--workers 16] [--minutes 8] [--seed 0] [--plain]
     python -m benchmarks.tool_network.train FOLDER --export
 FOLDER receives `tool_network.onnx`, `checkpoint.pt` (from half the time on) and `training.json` (options, speed, validation).
 The second form writes `tool_network.onnx` from `checkpoint.pt`. Only torch, numpy and OpenCV are needed.
@@ -38,12 +38,13 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, binary_cross_entropy_with_logits
 
-from benchmarks.tool_network.network import ToolNetwork, features, fused
+from benchmarks.tool_network.network import INPUTS, ToolNetwork, features, fused
 from benchmarks.tool_network.pictures import SIZE_PX, training_picture
+from benchmarks.tool_network.recorded import RecordedTools
 from benchmarks.tool_network.tissue import Photographs, TissuePool
 
-INPUT_PX = (96, 112)
-"""Height and width of the network's input, multiples of 16."""
+INPUT_PX = (96, 128)
+"""Height and width of the network's input, multiples of 32."""
 LEARNING_RATE = 3e-3
 WEIGHT_DECAY = 0.01
 CHECKPOINTS = 24
@@ -54,6 +55,14 @@ AVERAGED = 0.998
 """Share of the weights' running mean that a step keeps."""
 PASTED = 0.4
 """Share of pictures that get the tools of another one."""
+TEXTURED = 0.1
+"""Share of pictures whose tools get colours and texture of another picture, so that only shape and shading tell them."""
+FILTERED = 0.4
+"""Share of pictures that a random filter changes, whose fine structure then tells less."""
+MIXED = 0.4
+"""Share of pictures whose features get the style of another picture's."""
+COARSE = 0.3
+"""Weight of the loss of the coarse output."""
 SENT_AT_ONCE = 8
 """Pictures that a worker sends in one message."""
 FIRST_PICTURES = 100
@@ -61,15 +70,15 @@ FIRST_PICTURES = 100
 VALIDATION_SHARE = 0.1
 """Share of the time above which checkpoints are not validated."""
 VALIDATION_SEED = 1_000_000
-HELD_OUT = ("hamlyn_pair", "out_of_body/0001")
+HELD_OUT = ("hamlyn_pair",)
 """Photographs that only validation pictures are drawn over."""
 
 Pictures = NDArray[np.uint8]
 """RGB and coverage by tools, uint8 [N, h, w, 4]."""
 
 
-def four_channels(rng: np.random.Generator, pool: TissuePool) -> Pictures:
-    image, mask = training_picture(rng, pool)
+def four_channels(rng: np.random.Generator, pool: TissuePool, recorded: RecordedTools | None) -> Pictures:
+    image, mask = training_picture(rng, pool, recorded)
     return np.concatenate([image, mask[..., None]], axis=2)
 
 
@@ -83,11 +92,12 @@ def draw(
         # Each has its own seed, so that the set does not depend on the number of workers.
         chosen = held_out if index % 2 else None
         pool = TissuePool(chosen, new=1.0, photographed=1.0 if chosen else 0.0)
-        to.put((True, four_channels(np.random.default_rng(VALIDATION_SEED + index), pool)[None]))
+        to.put((True, four_channels(np.random.default_rng(VALIDATION_SEED + index), pool, None)[None]))
     rng = np.random.default_rng([seed, worker])
     pool = TissuePool(Photographs(recordings, without=HELD_OUT) if recordings is not None else None)
+    recorded = RecordedTools(recordings) if recordings is not None else None
     while True:
-        to.put((False, np.stack([four_channels(rng, pool) for _ in range(SENT_AT_ONCE)])))
+        to.put((False, np.stack([four_channels(rng, pool, recorded) for _ in range(SENT_AT_ONCE)])))
 
 
 class Store:
@@ -102,11 +112,14 @@ class Store:
         self.pictures[at] = torch.from_numpy(pictures).to(self.pictures.device)
         self.count += len(pictures)
 
-    def batch(self, size: int, chance: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Return altered pictures [N, 3, h, w] in 0..1, of `INPUT_PX`, and their coverage by tools [N, 1, h / 2, w / 2]."""
+    def batch(self, size: int, chance: torch.Generator, plain: bool = False) -> tuple[Tensor, Tensor]:
+        """Return altered pictures [N, 3, h, w] in 0..1, of `INPUT_PX`, and their coverage by tools [N, 1, h / 2, w / 2].
+
+        `plain` leaves out the changes of texture.
+        """
         there = min(self.count, len(self.pictures))
         at = torch.randint(0, there, (size,), generator=chance, device=self.pictures.device)
-        return altered(reduced(self.pictures[at]), chance)
+        return altered(reduced(self.pictures[at]), chance, plain)
 
 
 def reduced(pictures: Tensor) -> Tensor:
@@ -115,8 +128,10 @@ def reduced(pictures: Tensor) -> Tensor:
     return nn.functional.interpolate(planes, INPUT_PX, mode="bilinear", antialias=True)
 
 
-def altered(both: Tensor, chance: torch.Generator) -> tuple[Tensor, Tensor]:
+def altered(both: Tensor, chance: torch.Generator, plain: bool = False) -> tuple[Tensor, Tensor]:
     """Return mirrored, turned, scaled, recoloured and blurred pictures, a share of them with the tools of another one.
+
+    Unless `plain`, other shares have tools with foreign texture, and a random filter.
 
     Drawing takes longer than training, so the pictures would be learned by heart otherwise.
     """
@@ -124,6 +139,8 @@ def altered(both: Tensor, chance: torch.Generator) -> tuple[Tensor, Tensor]:
     uniform = lambda *shape: torch.rand((count, *shape, 1, 1), generator=chance, device=device)
     normal = lambda *shape: torch.randn((count, *shape), generator=chance, device=device)
     pictures, cover = recoloured(both[:, :3], chance), both[:, 3:]
+    if not plain:
+        pictures = textured(pictures, cover, chance)
     others = torch.randperm(count, generator=chance, device=device)
     layer = cover[others] * (uniform(1) < PASTED)
     pictures = pictures + layer * (pictures[others] - pictures)
@@ -148,10 +165,41 @@ def altered(both: Tensor, chance: torch.Generator) -> tuple[Tensor, Tensor]:
         torch.cat([pictures, cover], 1), grid, padding_mode="reflection", align_corners=False
     )
     pictures = recoloured(moved[:, :3], chance)
+    if not plain:
+        pictures = filtered(pictures, chance)
+    light = nn.functional.interpolate(normal(1, 3, 4), INPUT_PX, mode="bicubic")
+    pictures = pictures * torch.exp((uniform(1) < 0.4) * 0.3 * uniform(1) * light)
     soft = avg_pool2d(nn.functional.pad(pictures, (1, 1, 1, 1), mode="replicate"), 3, 1)
-    pictures = pictures + (uniform(1) < 0.25) * uniform(1) * (soft - pictures)
+    kind = uniform(1)
+    pictures = pictures + (kind < 0.25) * uniform(1) * (soft - pictures)
+    pictures = pictures + (kind > 0.75) * 1.5 * uniform(1) * (pictures - soft)
     pictures = pictures + (uniform(1) < 0.3) * 0.03 * uniform(1) * normal(3, *INPUT_PX)
     return pictures.clamp(0, 1), avg_pool2d(moved[:, 3:], 2)
+
+
+def textured(pictures: Tensor, cover: Tensor, chance: torch.Generator) -> Tensor:
+    """Return pictures of which a share has tools with colours and texture of another picture and their own shading."""
+    count, device = len(pictures), pictures.device
+    others = torch.randperm(count, generator=chance, device=device)
+    grey = pictures.mean(1, keepdim=True)
+    level = (grey * cover).sum((2, 3), keepdim=True) / (cover.sum((2, 3), keepdim=True) + 1e-3) + 0.02
+    gain = torch.exp(0.35 * torch.randn((count, 1, 1, 1), generator=chance, device=device))
+    foreign = recoloured(pictures[others], chance).flip(3) * gain * (0.4 + 0.6 * grey / level).clamp(0.2, 2.5)
+    chosen = torch.rand((count, 1, 1, 1), generator=chance, device=device) < TEXTURED
+    return pictures + chosen * cover * (foreign.clamp(0, 1) - pictures)
+
+
+def filtered(pictures: Tensor, chance: torch.Generator) -> Tensor:
+    """Return pictures of which a share is changed by random filters with the sum 1, after Xu et al., "RandConv", 2021."""
+    count, device = len(pictures), pictures.device
+    side = 3 if torch.rand((), generator=chance, device=device) < 0.5 else 5
+    kernels = torch.randn((count, 1, side, side), generator=chance, device=device) / side
+    kernels = kernels - kernels.mean((2, 3), keepdim=True)
+    strength = torch.rand((count, 1, 1, 1), generator=chance, device=device)
+    strength = strength * (torch.rand((count, 1, 1, 1), generator=chance, device=device) < FILTERED)
+    padded = nn.functional.pad(pictures, (side // 2,) * 4, mode="reflect").transpose(0, 1)
+    change = nn.functional.conv2d(padded, kernels, groups=count).transpose(0, 1)
+    return (pictures + strength * change).clamp(0, 1)
 
 
 def recoloured(pictures: Tensor, chance: torch.Generator) -> Tensor:
@@ -161,9 +209,9 @@ def recoloured(pictures: Tensor, chance: torch.Generator) -> Tensor:
         shape = (len(pictures), channels, 1, 1)
         return torch.exp(spread * torch.randn(shape, generator=chance, device=pictures.device))
 
-    pictures = (pictures * factor(0.06, 3) * factor(0.12, 1)).clamp(1e-4, 1) ** factor(0.15, 1)
+    pictures = (pictures * factor(0.08, 3) * factor(0.15, 1)).clamp(1e-4, 1) ** factor(0.17, 1)
     grey = pictures.mean(1, keepdim=True)
-    return (grey + (pictures - grey) * factor(0.12, 1)).clamp(0, 1)
+    return (grey + (pictures - grey) * factor(0.17, 1)).clamp(0, 1)
 
 
 def loss_of(logits: Tensor, cover: Tensor) -> Tensor:
@@ -228,7 +276,7 @@ def export(network: nn.Module, path: Path) -> None:
         warnings.simplefilter("ignore", DeprecationWarning)
         torch.onnx.export(
             fused(network),
-            (torch.zeros(1, 5, *INPUT_PX),),
+            (torch.zeros(1, INPUTS, *INPUT_PX),),
             str(path),
             input_names=["features"],
             output_names=["tool"],
@@ -264,6 +312,7 @@ def main() -> int:
     parser.add_argument("--validation", type=int, default=800, help="number of validation pictures")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--rate", type=float, default=LEARNING_RATE)
+    parser.add_argument("--plain", action="store_true", help="without foreign texture, random filters and mixed styles")
     parser.add_argument("--export", action="store_true", help="only write the ONNX file of checkpoint.pt")
     arguments = parser.parse_args()
     folder: Path = arguments.folder
@@ -310,7 +359,7 @@ def train(
                 store.add(pictures)
     held_out = torch.cat(validation).to(device)
     # The order in which workers finished decides nothing: figures are means over all pictures.
-    network = ToolNetwork().to(device).to(memory_format=torch.channels_last)
+    network = ToolNetwork(0.0 if arguments.plain else MIXED).to(device).to(memory_format=torch.channels_last)
     averaged = torch.optim.swa_utils.AveragedModel(
         network, multi_avg_fn=torch.optim.swa_utils.get_ema_multi_avg_fn(AVERAGED)
     )
@@ -330,8 +379,9 @@ def train(
         if step % 8 == 0:
             for _, pictures in received(to, workers):
                 store.add(pictures)
-        batch_pictures, cover = store.batch(batch, chance)
-        loss = loss_of(network(features(batch_pictures).contiguous(memory_format=torch.channels_last)), cover)
+        batch_pictures, cover = store.batch(batch, chance, arguments.plain)
+        logits, coarse = network(features(batch_pictures).contiguous(memory_format=torch.channels_last))
+        loss = loss_of(logits, cover) + COARSE * loss_of(coarse, avg_pool2d(cover, 8))
         optimiser.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(network.parameters(), 2.0)
@@ -367,6 +417,7 @@ def train(
         "options": options | {"with_photographs": arguments.recordings is not None},
         "torch": torch.__version__,
         "input_px": INPUT_PX,
+        "inputs": INPUTS,
         "parameters": sum(part.numel() for part in network.parameters()),
         "steps": step,
         "pictures": store.count,

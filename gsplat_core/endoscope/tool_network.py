@@ -19,6 +19,8 @@ INPUT_PX = (96, 80)
 """Width and height of the network's input; pictures of any aspect are resized to it."""
 LOGARITHMS = np.log(np.arange(256, dtype=np.float32) / 255 + np.float32(0.06))
 """Logarithm of a byte in 0..1, with an offset because ratios are noise where it is dark. As in training."""
+SURROUND = 16
+"""Largest channel below which a pixel counts as surround of the field of view. As in training."""
 CERTAIN = 2.0
 """Logit to which larger ones are reduced before they are smoothed along edges."""
 EDGE_RADIUS_PX, EDGE_CONTRAST = 3, 0.01
@@ -28,15 +30,17 @@ EDGE_RADIUS_PX, EDGE_CONTRAST = 3, 0.01
 class NetworkToolFinder:
     """Tool segmentation of single pictures on the CPU. Deterministic, without state between pictures."""
 
-    def __init__(self, network: Path | None = None, input_px: tuple[int, int] = INPUT_PX) -> None:
+    def __init__(self, network: Path | None = None, input_px: tuple[int, int] = INPUT_PX, inputs: int = 5) -> None:
         """Load the network. Raises cv2.error if OpenCV cannot.
 
         Args:
             network: file written by `benchmarks/tool_network/train.py`; None for the one of this package.
             input_px: width and height of its input.
+            inputs: number of planes of its input, 5 or 8.
         """
         self._network = cv2.dnn.readNetFromONNX(str(network or NETWORK))
         self._input_px = input_px
+        self._inputs = inputs
 
     def reset(self) -> None:
         """Do nothing, since no state is kept between pictures."""
@@ -52,7 +56,7 @@ class NetworkToolFinder:
         if min(height, width) < SMALLEST_PX:
             return tissue
         small = averaged(image, self._input_px)
-        planes = features(small)
+        planes = features(small, self._inputs)
         self._network.setInput(planes)
         smoothed = along_edges(self._network.forward()[0, 0], planes[0])
         levels = (smoothed * np.float32(127 / CERTAIN) + 128).clip(0, 255).astype(np.uint8)
@@ -78,14 +82,22 @@ def along_edges(logits: NDArray[np.float32], planes: NDArray[np.float32]) -> NDA
     return np.asarray(cv2.ximgproc.guidedFilter(guide, coarse, EDGE_RADIUS_PX, EDGE_CONTRAST), np.float32)
 
 
-def features(small: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Return the network's input [1, 5, h, w] for a picture RGB uint8 [h, w, 3].
+def features(small: NDArray[np.uint8], inputs: int = 5) -> NDArray[np.float32]:
+    """Return the network's input [1, inputs, h, w] for a picture RGB uint8 [h, w, 3].
 
-    The channels are red, green and blue in -1..1, and the logarithms of red over green and of green over blue.
+    The planes are red, green and blue in -1..1, the logarithms of red over green and of green over blue, and, of eight, those and the
+    logarithm of green relative to their means over the field of view.
     """
-    logs = LOGARITHMS[small]
-    planes = np.empty((1, 5, *small.shape[:2]), np.float32)
-    planes[0, :3] = small.transpose(2, 0, 1) * np.float32(2 / 255) - 1
-    planes[0, 3] = logs[..., 0] - logs[..., 1]
-    planes[0, 4] = logs[..., 1] - logs[..., 2]
+    logs = cv2.split(cv2.LUT(small, LOGARITHMS))
+    planes = np.empty((1, inputs, *small.shape[:2]), np.float32)
+    for channel, plane in enumerate(cv2.split(small)):
+        np.multiply(plane, np.float32(2 / 255), out=planes[0, channel])
+    planes[0, :3] -= 1
+    cv2.subtract(logs[0], logs[1], dst=planes[0, 3])
+    cv2.subtract(logs[1], logs[2], dst=planes[0, 4])
+    if inputs > 5:
+        inside = cv2.threshold(lowest_and_highest(small)[1], SURROUND - 1, 255, cv2.THRESH_BINARY)[1]
+        for index, plane in enumerate((planes[0, 3], planes[0, 4], logs[1]), start=5):
+            mean = cv2.mean(plane, inside)[0]
+            np.subtract(plane, np.float32(mean), out=planes[0, index])
     return planes

@@ -8,8 +8,9 @@ import torch
 
 from benchmarks.tool_network.bodies import Canvas
 from benchmarks.tool_network.flexible import accessory, hollow_organ, narrow_band
-from benchmarks.tool_network.network import ToolNetwork, features
+from benchmarks.tool_network.network import INPUTS, ToolNetwork, features
 from benchmarks.tool_network.train import INPUT_PX, Store, altered, export, reduced
+from gsplat_core.endoscope import tool_network
 
 
 def test_accessories_change_a_hollow_organ_only_under_their_mask():
@@ -47,6 +48,14 @@ def test_mirrored_and_turned_masks_follow_their_pictures():
     bright = torch.nn.functional.avg_pool2d(pictures.mean(1, keepdim=True), 2)
     assert bright[cover > 0.99].min() > 0.4
     assert bright[cover == 0].max() < 0.4
+
+
+def test_the_product_computes_the_planes_of_training():
+    """Also of a picture with a black surround, which the means leave out."""
+    picture = np.random.default_rng(0).integers(0, 256, (*INPUT_PX, 3)).astype(np.uint8)
+    picture[:, :40] = 3
+    planes = torch.from_numpy(picture.transpose(2, 0, 1)[None].astype(np.float32) / 255)
+    np.testing.assert_allclose(tool_network.features(picture, INPUTS), features(planes).numpy(), atol=1e-5)
 
 
 def test_opencv_computes_what_the_network_computes(tmp_path):
