@@ -8,7 +8,7 @@ FOLDER holds the files `test_*.py` of gsplat 1.5.3's source distribution. They a
 
 The tests compare functions with gsplat's own functions in plain torch. With `--oracle`, the folder `gsplat` of an unpacked
 wheel of 1.5.3, these are gsplat's (`cuda/_torch_impl.py`, `cuda/_torch_impl_2dgs.py`, `_rasterization`), and the constants
-are those of 1.5.3. `_rasterize_to_pixels_2dgs` stays this package's: gsplat's needs more than 10 GB for its test. Two functions of nerfacc that they call are part of this script. Without it they are this package's
+are those of 1.5.3. On the CPU `_rasterize_to_pixels_2dgs` stays this package's: gsplat's needs more than 10 GB for its test. Two functions of nerfacc that they call are part of this script. Without it they are this package's
 reference, and the tests compare the compiled functions with that.
 """
 
@@ -84,7 +84,8 @@ def loaded(name, path):
 gsplat.cuda._torch_impl = loaded("gsplat.cuda._torch_impl", "cuda/_torch_impl.py")
 blended = gsplat.cuda._torch_impl_2dgs._rasterize_to_pixels_2dgs
 gsplat.cuda._torch_impl_2dgs = loaded("gsplat.cuda._torch_impl_2dgs", "cuda/_torch_impl_2dgs.py")
-gsplat.cuda._torch_impl_2dgs._rasterize_to_pixels_2dgs = blended
+if {small!r}:
+    gsplat.cuda._torch_impl_2dgs._rasterize_to_pixels_2dgs = blended
 gsplat.rendering._rasterization = loaded("gsplat._own_rendering", "rendering.py")._rasterization
 """
 """conftest.py that puts gsplat's functions in plain torch in the place of this package's."""
@@ -130,7 +131,9 @@ def prepared(source: Path, folder: Path, device: str, chosen: argparse.Namespace
     (folder / "compressed").mkdir()
     if chosen.oracle is not None:
         (tests / "nerfacc.py").write_text(NERFACC, encoding="utf-8")
-        (tests / "conftest.py").write_text(CONFTEST.format(folder=str(chosen.oracle.resolve())), encoding="utf-8")
+        (tests / "conftest.py").write_text(
+            CONFTEST.format(folder=str(chosen.oracle.resolve()), small=device == "cpu"), encoding="utf-8"
+        )
     scene = folder / "assets" / "test_garden.npz"
     given = source.parent / "assets" / "test_garden.npz"
     if given.exists():
@@ -141,13 +144,22 @@ def prepared(source: Path, folder: Path, device: str, chosen: argparse.Namespace
     return f"synthetic, {chosen.points} points, 3 pictures of {chosen.width}x{chosen.height} px"
 
 
-def run(folder: Path, name: str, oracle: bool, timeout_s: float, further: list[str]) -> dict[str, dict[str, Any]]:
-    """Run one file; return outcome and seconds of each test, with the first lines of its failure."""
-    report = folder / f"{name}.xml"
-    command = [sys.executable, "-m", "gsplat_core.as_gsplat", "--constants", "1.5.3" if oracle else "1.6"]
+def run(
+    folder: Path, name: str, oracle: bool, timeout_s: float, further: list[str], peer: Path | None = None
+) -> dict[str, dict[str, Any]]:
+    """Run one file with this package, or with the gsplat in the folder `peer`.
+
+    Returns the outcome and the seconds of each test, with the first lines of its failure.
+    """
+    report = folder / f"{name}{'' if peer is None else '-peer'}.xml"
+    command = [sys.executable]
+    if peer is None:
+        command += ["-m", "gsplat_core.as_gsplat", "--constants", "1.5.3" if oracle else "1.6"]
+    else:
+        further = [*further, "--noconftest"]
     command += ["-m", "pytest", "-q", "-p", "no:cacheprovider"]
     command += [f"--junit-xml={report}", f"--rootdir={folder}", str(folder / "tests" / name), *further]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(peer or ROOT), os.environ.get("PYTHONPATH", "")])}
     try:
         subprocess.run(command, cwd=folder, env=environment, check=False, timeout=timeout_s, stdout=subprocess.DEVNULL)
     except subprocess.TimeoutExpired:
@@ -169,6 +181,7 @@ def main() -> None:
     parser = log.options(__doc__.splitlines()[0])
     parser.add_argument("--tests", type=Path, required=True, help="folder of gsplat's tests")
     parser.add_argument("--oracle", type=Path, help="folder gsplat of an unpacked wheel of 1.5.3")
+    parser.add_argument("--peer", type=Path, help="folder with a compiled gsplat 1.5.3, which runs the same tests")
     parser.add_argument("--only", nargs="+", default=FILES, help="files to run")
     parser.add_argument("--points", type=int, default=20_000, help="points of the synthetic scene")
     parser.add_argument("--width", type=int, default=320, help="width of its pictures")
@@ -193,13 +206,20 @@ def main() -> None:
             selection = dict(chosen.select).get(file, chosen.selection)
             return run(folder, file, chosen.oracle is not None, chosen.timeout, ["-k", selection] if selection else [])
 
+        def results_of_peer(file: str) -> dict[str, dict[str, Any]]:
+            return run(folder, file, False, chosen.timeout, [], chosen.peer.resolve())
+
         with ThreadPoolExecutor(chosen.together) as pool:
+            results_with_peer = pool.map(results_of_peer, chosen.only if chosen.peer else ())
             results_of_files = pool.map(results, chosen.only)
         for file, found in zip(chosen.only, results_of_files, strict=True):
             outcomes = [about["outcome"] for about in found.values()]
             files[file] = {outcome: outcomes.count(outcome) for outcome in ("passed", "failed", "skipped")}
             tests |= found
             print(file, files[file], flush=True)
+        failed_with_peer = [
+            test for found in results_with_peer for test, about in found.items() if about["outcome"] == "failed"
+        ]
     failed = {name: about.get("why", "") for name, about in tests.items() if about["outcome"] == "failed"}
     for test, why in failed.items():
         print(f"FAILED {test}: {why}")
@@ -212,8 +232,13 @@ def main() -> None:
         "files": files,
         "exceptions": exceptions,
         "tests": tests,
+        "failed_with_gsplat": failed_with_peer if chosen.peer else None,
     }
-    places = {str(chosen.tests): "TESTS", str(chosen.oracle): "GSPLAT"}
+    for test in failed_with_peer:
+        print(f"FAILED with gsplat itself: {test}")
+    for test in sorted(set(failed) & set(failed_with_peer)):
+        exceptions[test] = "the compiled gsplat fails this test on this machine, too"
+    places = {str(chosen.tests): "TESTS", str(chosen.oracle): "GSPLAT", str(chosen.peer): "PEER"}
     sys.argv[1:] = [places.get(word, word) for word in sys.argv[1:]]
     log.write("own_tests", chosen, figures, "gsplat")
 

@@ -37,6 +37,11 @@ def own_tests(logs: Logs) -> str:
         for name, counts in log["files"].items():
             rows.append([name, device, counts["passed"], counts["failed"], counts["skipped"]])
         scenes.append(f"{device}: compared with {log['compared_with']}; scene of test_basic: {log['scene']}.")
+        if log.get("failed_with_gsplat") is not None:
+            names = ", ".join(f"`{test}`" for test in log["failed_with_gsplat"])
+            scenes.append(
+                f"{device}: the same files with gsplat itself: {names + ' failed' if names else 'no test failed'}."
+            )
     notes = [f"- `{test}`: {why}" for log in logs.values() for test, why in log.get("exceptions", {}).items()]
     text = "\n\n".join([table(("file", "device", "passed", "failed", "skipped"), rows), *scenes])
     return text + ("\n\nNamed exceptions:\n\n" + "\n".join(dict.fromkeys(notes)) if notes else "")
