@@ -75,11 +75,12 @@ class RecordedTools:
                 np.uint8
             )
             small = np.asarray(cv2.inpaint(small, rim, 3, cv2.INPAINT_TELEA), np.uint8)
-            shade, cover = (plane.astype(np.float32) / 255 for plane in (small, cover))
-            if left > 2:
-                shade, cover = np.ascontiguousarray(shade[:, ::-1]), np.ascontiguousarray(cover[:, ::-1])
-            rows = np.flatnonzero(cover[:, 1] > 0.5)
-            self.layers.append(Layer(shade, cover, np.array([0.0, rows.mean()])))
+            turned = slice(None, None, -1 if left > 2 else 1)
+            brightness, coverage = (
+                np.ascontiguousarray(plane[:, turned], np.float32) / np.float32(255) for plane in (small, cover)
+            )
+            rows = np.flatnonzero(coverage[:, 1] > 0.5)
+            self.layers.append(Layer(brightness, coverage, np.array([0.0, rows.mean()])))
 
     def draw(self, rng: Generator, canvas: Canvas) -> None:
         """Draw an instrument with another size, direction, brightness and colour, which enters from any side."""
