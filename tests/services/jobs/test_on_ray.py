@@ -14,14 +14,13 @@ from services.jobs.results import RUNNING, Results
 
 pytestmark = pytest.mark.slow
 
-pytest.importorskip("ray", reason="Ray is not installed (extra `ray`)")
 WITHIN_S = 300.0
 
 
 @pytest.fixture
 def on_ray():
     """A local Ray. It gives itself 30 s to start, and a very busy machine takes longer: then it is started again."""
-    import ray
+    ray = pytest.importorskip("ray", reason="Ray is not installed (extra `ray`)")  # takes seconds
 
     from services.jobs.runners import OnRay
 
