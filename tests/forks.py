@@ -32,6 +32,7 @@ OPTIONS = [
 def import_libraries() -> None:
     """Import the large libraries once. Forks of this process do not import them again."""
     os.environ.update({name: "1" for name in SINGLE})
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as in the Makefile: idle threads of OpenMP do not spin
     sys.dont_write_bytecode = True
     for name in LIBRARIES:
         with suppress(ImportError):

@@ -111,17 +111,18 @@ class Mutant:
 
 
 @cache
-def changeable(path: Path) -> tuple[ast.Module, tuple[tuple[int, int], ...]]:
-    """Return the tree of a module, and the node index and change number of each of its mutants."""
+def changeable(path: Path) -> tuple[ast.Module, tuple[ast.AST, ...], tuple[tuple[int, int], ...]]:
+    """Return the tree of a module, its nodes, and the node index and change number of each of its mutants."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     unused = set() if torch.cuda.is_available() else {id(node) for each in tree.body for node in _of_graph(each)}
+    nodes = tuple(ast.walk(tree))
     places = (
         (index, number)
-        for index, node in enumerate(ast.walk(tree))
+        for index, node in enumerate(nodes)
         if id(node) not in unused
         for number in range(len(_changes(node)))
     )
-    return tree, tuple(places)
+    return tree, nodes, tuple(places)
 
 
 def _of_graph(statement: ast.stmt) -> list[ast.AST]:
@@ -130,28 +131,31 @@ def _of_graph(statement: ast.stmt) -> list[ast.AST]:
     return nodes if any(isinstance(node, ast.Name) and node.id == "GraphMemory" for node in nodes) else []
 
 
+def change_at(path: Path, index: int, number: int) -> str | None:
+    """Return the expression before and after a change, or None where the change leaves the text as it is."""
+    node = changeable(path)[1][index]
+    before = ast.unparse(node)
+    changed = copy.deepcopy(node)
+    _changes(changed)[number][1]()
+    after = ast.unparse(changed)
+    return None if after == before else f"{before}  =>  {after}"
+
+
 def mutant_at(path: Path, index: int, number: int) -> Mutant | None:
     """Return one mutant of a module, or None where the change leaves the text as it is."""
+    change = change_at(path, index, number)
+    if change is None:
+        return None
     tree = copy.deepcopy(changeable(path)[0])
     node = next(each for place, each in enumerate(ast.walk(tree)) if place == index)
-    before = ast.unparse(node)
     kind, apply = _changes(node)[number]
     apply()
-    after = ast.unparse(node)
-    if after == before:
-        return None
     ast.fix_missing_locations(tree)
     line = getattr(node, "lineno", 0)
     inside = any(
         each.body[0].lineno <= line <= (each.end_lineno or 0) for each in ast.walk(tree) if isinstance(each, FUNCTIONS)
     )
-    change = f"{before}  =>  {after}"
     return Mutant(str(path.relative_to(ROOT)), line, kind, change, tree, inside)
-
-
-def mutants_of(path: Path) -> Iterator[Mutant]:
-    """Return every mutant of a module."""
-    return filter(None, (mutant_at(path, *place) for place in changeable(path)[1]))
 
 
 def _changes(node: ast.AST) -> list[tuple[str, Callable[[], None]]]:
@@ -464,7 +468,7 @@ def chosen_mutants(only: list[str] | None, count: int, seed: int) -> list[Mutant
             if share == 0:
                 break
             file = rng.choices(files, weights)[0]
-            places = changeable(file)[1]
+            places = changeable(file)[2]
             mutant = mutant_at(file, *rng.choice(places)) if places else None
             if mutant is not None and (mutant.path, mutant.change) not in seen:
                 seen.add((mutant.path, mutant.change))
@@ -482,12 +486,14 @@ def lines_of(log: Path) -> list[dict[str, Any]]:
 def survivors_of(log: Path) -> list[Mutant]:
     """Return the survivors of an earlier run whose expressions still exist."""
     wanted = {(line["path"], line["change"]) for line in lines_of(log) if line["killed_by"] is None}
-    return [
-        each
-        for path in sorted({path for path, _ in wanted})
-        for each in mutants_of(ROOT / path)
-        if (path, each.change) in wanted
+    files = [ROOT / path for path in sorted({path for path, _ in wanted}) if (ROOT / path).exists()]
+    places = [
+        (file, place)
+        for file in files
+        for place in changeable(file)[2]
+        if (str(file.relative_to(ROOT)), change_at(file, *place)) in wanted
     ]
+    return [mutant for file, place in places if (mutant := mutant_at(file, *place)) is not None]
 
 
 def main() -> int:
