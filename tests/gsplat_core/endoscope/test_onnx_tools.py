@@ -278,6 +278,7 @@ def test_a_network_is_opened_again_only_for_more_threads(tmp_path, monkeypatch, 
 
     def session(data, options, *arguments, **named):
         made.append(options.intra_op_num_threads)
+        assert options.get_session_config_entry("session.intra_op.allow_spinning") == "0"
         return real(data, options, *arguments, **named)
 
     monkeypatch.setattr(onnxruntime, "InferenceSession", session)

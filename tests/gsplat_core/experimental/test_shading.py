@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import pytest
 
 from gsplat_core.experimental.shading import SmallPicture, shading_in
 from gsplat_core.scene.frames import Frame
@@ -22,3 +23,23 @@ def test_glints_are_counted_where_they_are_and_nowhere_else() -> None:
     assert right.max() == 0
     assert 0.7 < left.sum() * 64 / np.count_nonzero(dots) < 1.3, "cells are 8 pixels wide"
     assert (found.wet_share > 0.9).all()
+
+
+def recorded(light: np.ndarray) -> np.ndarray:
+    """Return the levels of a camera that compresses highlights, and stores sRGB."""
+    linear = (1 - np.exp(-0.8 * light)) / 0.8
+    return (255 * np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)).round()
+
+
+@pytest.mark.parametrize(("excess", "share"), [(0.25, 0.0), (0.5, 1.0), (2.0, 1.0)])
+def test_a_glint_adds_white_of_a_third_of_the_surrounding_light(excess: float, share: float) -> None:
+    """The lamp's reflection adds as much to each channel."""
+    tissue = np.array([0.35, 0.08, 0.05])
+    image, dots = np.zeros((256, 320, 3), np.uint8), np.zeros((256, 320), np.uint8)
+    image[:] = recorded(tissue)
+    for x in range(20, 310, 24):
+        for y in range(20, 240, 24):
+            cv2.circle(dots, (x, y), 2, 1, -1)
+    image[dots > 0] = recorded(tissue + excess * tissue[0])
+    found = shading_in(SmallPicture.of(Frame(0, 0, image)))
+    assert found.glints.sum() * 64 / np.count_nonzero(dots) == pytest.approx(share, abs=0.15)

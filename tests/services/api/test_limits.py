@@ -23,11 +23,12 @@ def test_a_bucket_fills_with_its_rate():
     assert [buckets.wait_s("a") for _ in range(5)] == [0, 0, 0, 0, 0.5], "it never holds more than its size"
 
 
-def test_buckets_are_bounded():
-    buckets = TokenBuckets(1.0, 1.0)
-    for number in range(MOST_BUCKETS + 10):
-        buckets.wait_s(str(number))
-    assert len(buckets._buckets) == MOST_BUCKETS
+def test_a_caller_is_forgotten_after_twenty_thousand_others():
+    buckets = TokenBuckets(1.0, 1.0, clock=lambda: 0.0)
+    for number in range(20_010):
+        assert buckets.wait_s(str(number)) == 0
+    assert buckets.wait_s("10") > 0
+    assert buckets.wait_s("9") == 0
 
 
 def test_the_bucket_that_leaves_is_of_whom_nothing_was_heard_for_longest():
