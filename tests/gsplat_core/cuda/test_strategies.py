@@ -91,12 +91,12 @@ def test_selective_adam_and_ssim_equal_those_of_the_cpu(gpu):
     images = torch.rand(2, 2, 3, 20, 24, generator=random)
     ends = []
     for device in ("cpu", gpu):
-        parameter = start.to(device).requires_grad_()
+        parameter = start.clone().to(device).requires_grad_()
         optimizer = SelectiveAdam([{"params": parameter, "lr": 0.1}], eps=1e-15, betas=(0.9, 0.999))
         for _ in range(3):
             parameter.grad = gradient.to(device)
             optimizer.step(visible.to(device))
-        first = images[0].to(device).requires_grad_()
+        first = images[0].clone().to(device).requires_grad_()
         score = fused_ssim(first, images[1].to(device), padding="valid")
         score.backward()
         ends.append([parameter.detach().cpu(), score.detach().cpu(), first.grad.cpu()])
