@@ -16,7 +16,8 @@ ROOT = Path(__file__).resolve().parents[2]
 
 def shell(command: str, folder: Path, **environment: str) -> subprocess.CompletedProcess[bytes]:
     """Run a line of bash in `folder`; $I is the command."""
-    environment |= {"I": f"{sys.executable} -m services.cli", "PYTHONPATH": str(ROOT)}
+    search = os.pathsep.join(filter(None, [os.environ.get("PYTHONPATH"), str(ROOT)]))
+    environment |= {"I": f"{sys.executable} -m services.cli", "PYTHONPATH": search}
     return subprocess.run(
         ["bash", "-o", "pipefail", "-c", command],
         cwd=folder,

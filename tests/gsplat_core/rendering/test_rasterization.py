@@ -89,7 +89,8 @@ def test_other_instruction_sets_give_the_image(tmp_path, make_scene, assert_near
         "sum((t * torch.rand(t.shape, generator=g, dtype=torch.float64).float()).sum() for t in (image, alpha)).backward()\n"
         "torch.save([image.detach(), alpha.detach(), [l.grad for l in leaves], instruction_set()], sys.argv[1] + '/out.pt')\n"
     )
-    environment = os.environ | {"INTRASPLAT_ISA": instructions, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    search = os.pathsep.join(filter(None, [os.environ.get("PYTHONPATH"), str(ROOT)]))
+    environment = os.environ | {"INTRASPLAT_ISA": instructions, "PYTHONPATH": search, "OMP_NUM_THREADS": "1"}
     subprocess.run([sys.executable, "-c", program, str(tmp_path)], env=environment, check=True)
     out = torch.load(tmp_path / "out.pt")
     assert out[3] == instructions or instruction_set() == "baseline"

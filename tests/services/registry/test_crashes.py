@@ -113,7 +113,7 @@ def test_kills_at_random_while_versions_are_swapped(tmp_path, files):
             before = activations(reader)
             swapping = subprocess.Popen(
                 [sys.executable, dying.__file__, tmp_path, "", "-", "swap"],
-                env=os.environ | {"PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE,
+                env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, [os.environ.get("PYTHONPATH"), str(ROOT)]))}, stdout=subprocess.PIPE,
             )  # fmt: skip
             with swapping:
                 said = len(swapping.stdout.read(1))
