@@ -209,6 +209,20 @@ def test_every_fifteenth_frame_is_a_view_of_its_scene_and_four_are_kept(monkeypa
     assert (detector._views.maxlen, detector._earlier.maxlen, detector._rate._recent.maxlen) == (4, 8, 15)
 
 
+def test_colours_agree_by_the_share_of_pixels_of_equal_hue():
+    """Half of each picture is red, the other half green or blue."""
+    red, green, blue = (220, 60, 60), (60, 220, 60), (60, 60, 220)
+
+    def view(left, right):
+        image = np.zeros((96, 128, 3), np.uint8)
+        image[:, :64], image[:, 64:] = left, right
+        return cuts.View(image)
+
+    assert cuts.colours(view(red, green), view(red, green)) == pytest.approx(1)
+    assert cuts.colours(view(red, green), view(green, red)) == pytest.approx(1)
+    assert cuts.colours(view(red, green), view(red, blue)) == pytest.approx(0.5)
+
+
 def test_structure_is_that_of_the_blocks_up_to_a_shift_of_eight_pixels():
     """Blocks of a shifted picture are found again, those of other tissue are not, and a flat picture has none."""
     image = texture(1, 1, 200, 160)[0]

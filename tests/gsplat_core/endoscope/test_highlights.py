@@ -129,7 +129,7 @@ def test_a_highlight_is_bright_nearly_white_and_brighter_than_its_surroundings(c
     assert (without_highlights(spotted(colour, tissue)) is not None) == found
 
 
-@pytest.mark.parametrize(("size", "grown"), [((64, 80), 1), ((512, 640), 2)])
+@pytest.mark.parametrize(("size", "grown"), [((64, 80), 1), ((512, 640), 2), ((64, 640), 2), ((640, 64), 2)])
 def test_highlights_grow_by_a_pixel_at_least_and_by_two_of_640(size, grown):
     kept = without_highlights(spotted(255, (180, 90, 90), size))
     rows, columns = np.nonzero(kept == 0)

@@ -99,6 +99,20 @@ def test_lengths_have_the_unit_of_the_depth_of_the_frames(rigid, kept):
     assert not unmeasured.is_measured
 
 
+def test_the_first_points_have_the_depth_of_their_pixels_and_its_median_in_holes(rigid):
+    first = next(iter(rigid))
+    depth = first.depth.copy()
+    depth[:, : rigid.camera.width_px // 2] = 0
+    odometry = LiveOdometry(rigid.camera)
+    odometry.place(blind([first])[0].with_fields(depth=depth, depth_origin=first.depth_origin))
+    points = odometry.map.points(odometry.map.keys[0].numbers).numpy()
+    column, row = (points[:, :2] / points[:, 2:] @ rigid.camera.K[:2, :2].T + rigid.camera.K[:2, 2]).astype(int).T
+    known = depth[row, column] > 0
+    assert 20 < known.sum() < len(known) - 20
+    np.testing.assert_allclose(points[known, 2], depth[row, column][known], rtol=0.03)
+    np.testing.assert_allclose(points[~known, 2], np.median(points[known, 2]), rtol=0.01)
+
+
 def test_a_frame_that_tells_nothing_stands_where_the_one_before_stood(rigid):
     frames = blind(rigid)
     frames[8] = frames[8].with_fields(image=np.full_like(frames[8].image, 90))
@@ -120,6 +134,16 @@ def test_a_stream_that_begins_with_nothing_waits(rigid):
     poses = placed([frame.with_fields(image=grey) for frame in frames[:3]] + frames[3:8], odometry)
     assert np.array_equal(poses[3], np.eye(4)) and not np.array_equal(poses[7], np.eye(4))
     assert (odometry.not_placed, odometry.begun) == (3, 1)
+
+
+def test_fifteen_frames_without_points_are_waited_for(rigid):
+    """A new map begins where a frame has points again after more of them."""
+    first = blind([next(iter(rigid))])[0]
+    grey, other = (first.with_fields(image=each) for each in (np.full_like(first.image, 120), first.image[::-1].copy()))
+    for waited, begun in ((14, 1), (15, 2)):
+        odometry = LiveOdometry(rigid.camera)
+        placed([first, *waited * [grey], other], odometry)
+        assert odometry.begun == begun
 
 
 def test_another_scene_is_begun_anew_after_a_while(rigid, monkeypatch):

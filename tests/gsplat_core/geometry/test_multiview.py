@@ -9,7 +9,14 @@ import pytest
 from numpy.typing import NDArray
 
 from gsplat_core.depth.maps import DepthMap
-from gsplat_core.depth.multiview import MOST_VIEWS, chosen_views, depth_of_view, view_of
+from gsplat_core.depth.multiview import (
+    MOST_VIEWS,
+    Parallax,
+    chosen_views,
+    depth_of_view,
+    explained_by_poses,
+    view_of,
+)
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_origin import BELIEVED, DEPTH_ORIGINS
 from gsplat_core.scene.frames import Frame
@@ -160,6 +167,16 @@ def test_nothing_that_can_be_followed() -> None:
     for blind in ({"mask": nothing}, {"loss_mask": nothing}, {"image": np.full((HEIGHT, WIDTH, 3), 90, np.uint8)}):
         found = found_in([frame.with_fields(**blind) for frame in frames], cameras)
         assert found.doubt == "too few points of the tissue can be tracked"
+
+
+@pytest.mark.parametrize(("height_px", "are_tracked"), [(8, False), (14, True)])
+def test_strips_of_tissue_are_tracked_from_four_pixels_within_their_edges_on(height_px: int, are_tracked: bool) -> None:
+    frames, cameras = video(3, SIDEWAYS)
+    tissue = np.zeros((HEIGHT, WIDTH), np.uint8)
+    for top in range(6, HEIGHT - 20, 20):
+        tissue[top : top + height_px] = 255
+    views = [view_of(frame.with_fields(mask=tissue), camera) for frame, camera in zip(frames, cameras, strict=True)]
+    assert isinstance(explained_by_poses(views[0], views[1:]), Parallax) is are_tracked
 
 
 def test_views_are_spread_over_the_baselines() -> None:

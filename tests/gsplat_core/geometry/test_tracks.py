@@ -45,6 +45,9 @@ def test_points_keep_their_numbers_and_are_where_the_picture_moved():
     seen = tracks.observations(2)
     assert len(seen.point) == 2 * len(both) and seen.point.max() == len(both) - 1
     assert len(tracks.observations(3).point) == 0 and len(tracks.observations(1).point) > 2 * len(both)
+    assert len(tracks.observations().point) == 0
+    tracks.follow(moved, None)
+    assert len(tracks.observations().point) >= 3 * 0.9 * len(both)
 
 
 def test_fifteen_pictures_of_something_else_are_left_out_and_the_next_is_another_scene():

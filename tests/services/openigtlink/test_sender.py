@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import socket
 import threading
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -119,6 +121,19 @@ def test_a_stream_that_says_nothing_is_said(runtime):
     stop.set()
     thread.join()
     server.close()
+
+
+def test_silence_is_said_once_in_a_second_of_it(runtime, monkeypatch):
+    """Each look at the stream takes a tenth of a second of the test's clock."""
+    looks = itertools.count()
+    monkeypatch.setattr("services.openigtlink.LOOK_MS", 1)
+    monkeypatch.setattr(
+        "services.openigtlink.time", SimpleNamespace(monotonic=lambda: next(looks) / 10, time=time.time)
+    )
+    sent = []
+    server = SimpleNamespace(clients=1, send=lambda message: sent.append(next(looks)))
+    send(runtime.stream("silent").pictures("engine"), StreamMessages("silent"), server, lambda: len(sent) == 3)
+    assert sent == [12, 23, 34]
 
 
 def until(what) -> None:

@@ -6,6 +6,7 @@ import json
 import os
 
 import pytest
+from pydantic import ValidationError
 
 from services.settings import ServiceSettings, SettingsInvalid, load_settings
 from services.settings.sections import masked_address
@@ -135,6 +136,57 @@ def test_the_schema_names_every_key():
     for section in schema["$defs"].values():
         for key, value in section["properties"].items():
             assert "description" in value or section["title"] in ("LogSettings",), key
+
+
+MIB = 2**20
+NUMBERS = {
+    "server.port": (8000, (0, 65_535), (-1, 65_536)),
+    "server.probe_port": (None, (0, 65_535), (-1, 65_536)),
+    "server.drain_s": (10, (0, 600), (-0.1, 600.1)),
+    "server.takeover_s": (0, (0, 3600), (-0.1, 3600.1)),
+    "auth.ticket_s": (30, (0.1, 300), (0, 300.1)),
+    "audit.segment_bytes": (16 * MIB, (65_536,), (65_535,)),
+    "audit.keep_segments": (None, (1,), (0,)),
+    "audit.keep_days": (None, (0.1,), (0,)),
+    "limits.body_bytes": (MIB, (1024,), (1023,)),
+    "limits.model_bytes": (2048 * MIB, (MIB,), (MIB - 1,)),
+    "limits.recording_bytes": (16_384 * MIB, (MIB,), (MIB - 1,)),
+    "limits.uploads": (8, (1, 64), (0, 65)),
+    "limits.uploads_per_key": (2, (1, 64), (0, 65)),
+    "limits.stall_s": (10, (0.1,), (0,)),
+    "limits.slowest_bytes_per_s": (4096, (0,), (-1,)),
+    "limits.head_s": (10, (0.1,), (0,)),
+    "limits.requests_per_s": (100, (0.1,), (0,)),
+    "limits.address_requests_per_s": (300, (0.1,), (0,)),
+    "limits.burst_s": (2, (0.1, 60), (0.09, 60.1)),
+    "limits.connections": (512, (8,), (7,)),
+    "limits.connections_per_address": (128, (0,), (-1,)),
+    "limits.streams": (16, (1, 1000), (0, 1001)),
+    "limits.viewers": (100, (1,), (0,)),
+    "limits.viewer_stall_s": (15, (0.1,), (0,)),
+    "uploaded_recordings.unpacked_bytes": (65_536 * MIB, (MIB,), (MIB - 1,)),
+    "uploaded_recordings.keep_days": (None, (0.1,), (0,)),
+    "uploaded_recordings.keep_bytes": (None, (MIB,), (MIB - 1,)),
+    "jobs.workers": (1, (1, 256), (0, 257)),
+    "jobs.threads": (None, (1, 256), (0, 257)),
+    "jobs.attempts": (5, (1, 100), (0, 101)),
+    "jobs.lease_s": (15, (2, 3600), (1.9, 3600.1)),
+    "jobs.keep_days": (None, (0.1,), (0,)),
+    "jobs.keep_results": (None, (1,), (0,)),
+}
+"""Default, accepted and refused numbers of each setting."""
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_numbers_have_their_defaults_and_are_refused_beyond_their_bounds(name):
+    usual, accepted, refused = NUMBERS[name]
+    section, key = name.split(".")
+    assert getattr(getattr(ServiceSettings(), section), key) == usual
+    for value in accepted:
+        assert getattr(getattr(ServiceSettings(**{section: {key: value}}), section), key) == value
+    for value in refused:
+        with pytest.raises(ValidationError, match=key):
+            ServiceSettings(**{section: {key: value}})
 
 
 def test_the_folder_of_recordings_that_tests_read_is_no_setting(monkeypatch):
