@@ -8,7 +8,7 @@ The weights are the mean over checkpoints, since long training on the same pictu
 averaged is decided by validation pictures. They are drawn from other seeds, half of them over photographs that training does not see
 (`hamlyn_pair`). No annotated recording is read.
 
-Usage: python -m benchmarks.tool_network.train FOLDER [--recordings DIR] [--device cuda] [--workers 16] [--minutes 8] [--seed 0] [--plain]
+Usage: python -m benchmarks.tool_network.train FOLDER [--recordings DIR] [--device cuda] [--workers 16] [--minutes 8] [--seed 0] [--plain] [--start FOLDER]
     python -m benchmarks.tool_network.train FOLDER --export
 FOLDER receives `tool_network.onnx`, `checkpoint.pt` (from half the time on) and `training.json` (options, speed, validation).
 The second form writes `tool_network.onnx` from `checkpoint.pt`. Only torch, numpy and OpenCV are needed.
@@ -313,6 +313,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--rate", type=float, default=LEARNING_RATE)
     parser.add_argument("--plain", action="store_true", help="without foreign texture, random filters and mixed styles")
+    parser.add_argument("--start", type=Path, help="folder of an earlier training, whose weights are trained further")
     parser.add_argument("--export", action="store_true", help="only write the ONNX file of checkpoint.pt")
     arguments = parser.parse_args()
     folder: Path = arguments.folder
@@ -359,7 +360,10 @@ def train(
                 store.add(pictures)
     held_out = torch.cat(validation).to(device)
     # The order in which workers finished decides nothing: figures are means over all pictures.
-    network = ToolNetwork(0.0 if arguments.plain else MIXED).to(device).to(memory_format=torch.channels_last)
+    network = ToolNetwork(0.0 if arguments.plain else MIXED)
+    if arguments.start is not None:
+        network.load_state_dict(torch.load(arguments.start / "checkpoint.pt", map_location="cpu"))
+    network = network.to(device).to(memory_format=torch.channels_last)
     averaged = torch.optim.swa_utils.AveragedModel(
         network, multi_avg_fn=torch.optim.swa_utils.get_ema_multi_avg_fn(AVERAGED)
     )
@@ -412,7 +416,11 @@ def train(
     figures = {count: validated(candidate, held_out) for count, candidate in candidates.items()}
     best = max(figures, key=lambda count: figures[count]["score"])
     torch.save(candidates[best].state_dict(), folder / "checkpoint.pt")
-    options = {name: value for name, value in vars(arguments).items() if name not in ("folder", "recordings", "export")}
+    options = {
+        name: value
+        for name, value in vars(arguments).items()
+        if name not in ("folder", "recordings", "export", "start")
+    }
     summary = {
         "options": options | {"with_photographs": arguments.recordings is not None},
         "torch": torch.__version__,
@@ -427,6 +435,8 @@ def train(
         "mean_of_last": figures,
         "chosen": best,
     }
+    if arguments.start is not None:
+        summary["earlier"] = json.loads((arguments.start / "training.json").read_text(encoding="utf-8"))
     (folder / "training.json").write_text(json.dumps(summary, indent=1) + "\n")
     print(f"chosen: mean of the last {best} checkpoints, {json.dumps(figures[best])}", flush=True)
     export(candidates[best], folder / "tool_network.onnx")
