@@ -15,8 +15,8 @@ functions needs a session of its own. No file of the checkout is changed.
 Only tests that execute the changed line run, for a minute at most; `tests/executed.py` records them.
 A mutant on a line that no test executes survives. A run ends at the first failure. A test that also
 fails without the mutant is flaky: it is listed and excluded, and the remaining tests decide. Mutants
-are drawn at random with a seed, in equal parts from each folder. Without a GPU, classes that capture
-CUDA graphs are left out.
+are drawn at random with a seed, in equal parts from each folder. Without a GPU, what runs on one only is
+left out.
 
 The boundary of a comparison (`<` to `<=`) is shifted only where an integer is compared, by its text. Of 63
 boundaries drawn from all folders, the rule leaves out 44. 34 of them compare measured numbers or clock times,
@@ -114,7 +114,7 @@ class Mutant:
 def changeable(path: Path) -> tuple[ast.Module, tuple[ast.AST, ...], tuple[tuple[int, int], ...]]:
     """Return the tree of a module, its nodes, and the node index and change number of each of its mutants."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
-    unused = set() if torch.cuda.is_available() else {id(node) for each in tree.body for node in _of_graph(each)}
+    unused = set() if torch.cuda.is_available() else {id(node) for each in _on_gpu(tree) for node in ast.walk(each)}
     nodes = tuple(ast.walk(tree))
     places = (
         (index, number)
@@ -125,10 +125,58 @@ def changeable(path: Path) -> tuple[ast.Module, tuple[ast.AST, ...], tuple[tuple
     return tree, nodes, tuple(places)
 
 
-def _of_graph(statement: ast.stmt) -> list[ast.AST]:
-    """Return the nodes of a class that captures CUDA graphs, which runs on a GPU only."""
-    nodes = list(ast.walk(statement)) if isinstance(statement, ast.ClassDef) else []
-    return nodes if any(isinstance(node, ast.Name) and node.id == "GraphMemory" for node in nodes) else []
+def _on_gpu(tree: ast.Module) -> Iterator[ast.AST]:
+    """Return the parts of a module that run on a GPU only.
+
+    These are classes that capture CUDA graphs, classes that only these use, and what `device.type == "cuda"` guards: the
+    body of an `if`, operands of the same `and`, and statements after an early return.
+    """
+    of_graphs = [each for each in tree.body if isinstance(each, ast.ClassDef) and "GraphMemory" in _names(each)]
+    used = set().union(*map(_names, of_graphs))
+    used -= set().union(*(_names(each) for each in tree.body if each not in of_graphs))
+    yield from of_graphs
+    yield from (each for each in tree.body if isinstance(each, ast.ClassDef) and each.name in used)
+    guards = {
+        node.targets[0].id for node in ast.walk(tree)
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name) and _asks_for_gpu(node.value, set())
+    }  # fmt: skip
+    for node in ast.walk(tree):
+        if isinstance(node, ast.BoolOp) and _asks_for_gpu(node, guards):
+            yield from (each for each in node.values if not _asks_for_gpu(each, guards))
+        if isinstance(node, ast.If | ast.IfExp) and _asks_for_gpu(node.test, guards):
+            yield from node.body if isinstance(node.body, list) else [node.body]
+        for block in (getattr(node, "body", None), getattr(node, "orelse", None)):
+            for place, each in enumerate(block if isinstance(block, list) else ()):
+                if isinstance(each, ast.If) and _excludes_gpu(each.test) and isinstance(each.body[-1], ast.Return):
+                    yield from block[place + 1 :]
+
+
+def _names(tree: ast.AST) -> set[str]:
+    return {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
+
+
+def _asks_for_gpu(test: ast.expr, guards: set[str]) -> bool:
+    """Return True if an expression is true on a GPU only; `guards` are names with such values."""
+    if isinstance(test, ast.BoolOp):
+        return isinstance(test.op, ast.And) and any(_asks_for_gpu(each, guards) for each in test.values)
+    return (isinstance(test, ast.Name) and test.id in guards) or _compares_with_gpu(test, ast.Eq)
+
+
+def _excludes_gpu(test: ast.expr) -> bool:
+    if isinstance(test, ast.BoolOp):
+        return isinstance(test.op, ast.Or) and any(map(_excludes_gpu, test.values))
+    return _compares_with_gpu(test, ast.NotEq)
+
+
+def _compares_with_gpu(test: ast.expr, kind: type[ast.cmpop]) -> bool:
+    return (
+        isinstance(test, ast.Compare)
+        and isinstance(test.ops[0], kind)
+        and isinstance(test.left, ast.Attribute)  # a setting of that value is tested without a GPU, too
+        and test.left.attr == "type"
+        and isinstance(test.comparators[0], ast.Constant)
+        and test.comparators[0].value == "cuda"
+    )
 
 
 def change_at(path: Path, index: int, number: int) -> str | None:
@@ -242,6 +290,7 @@ def replace_code(mutant: Mutant) -> bool:
     path = str(ROOT / mutant.path)
     before = dict(_codes(compile(changeable(ROOT / mutant.path)[0], path, "exec", dont_inherit=True)))
     after = dict(_codes(compile(mutant.tree, path, "exec", dont_inherit=True)))
+    gc.unfreeze()  # `get_objects` does not return frozen objects
     changed = {key: new for key, new in after.items() if before.get(key) != new}
     found = [each for each in gc.get_objects() if type(each) is FunctionType and each.__code__.co_filename == path]
     if not found:

@@ -8,8 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from tests import executed
+from tests.mutants import changeable
 
 MODULE = """
 LIMIT = 3
@@ -26,6 +28,36 @@ class Scale:
         for _ in range(2):
             value = value * LIMIT
         return value
+"""
+
+
+GPU_MODULE = """
+class Buffers:
+    size = 3
+
+
+class Captured:
+    def __init__(self, device):
+        self.memory, self.buffers = GraphMemory(device), Buffers()
+
+
+def quick(device, count, memory=None):
+    captures = device.type == "cuda" and count > 4
+    if captures and count < 8:
+        return 2 * count
+    if device.type == "cuda":
+        return 3 * count
+    if count > 16:
+        return count
+    if count > 32 or device.type != "cuda":
+        return memory
+    if count > 64:
+        return 3 * count
+    return 5
+
+
+def chosen(device, count):
+    return min(count, 64) if device == "cuda" else 0
 """
 
 
@@ -49,6 +81,14 @@ def test_marks_are_the_statements_of_functions_that_ran(tmp_path: Path, call: st
     path.write_text(MODULE, encoding="utf-8")
 
     assert executed_lines(path, call) == lines
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="mutants of what runs on a GPU are drawn as well")
+def test_without_a_gpu_what_runs_on_one_only_is_not_changed(tmp_path: Path) -> None:
+    path = tmp_path / "sample.py"
+    path.write_text(GPU_MODULE, encoding="utf-8")
+    _, nodes, places = changeable(path)
+    assert sorted({getattr(nodes[index], "lineno", 0) for index, _ in places}) == [12, 13, 15, 17, 19, 27]
 
 
 def test_a_statement_keeps_its_key_when_other_functions_change_and_the_module_moves(tmp_path: Path) -> None:
