@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import re
 from pathlib import Path
 
@@ -16,10 +15,8 @@ def rows() -> dict[str, list[str]]:
     return {cells[0]: cells[1:] for cells in ([cell.strip() for cell in line.strip("|").split("|")] for line in lines)}
 
 
-def functions_of(file: Path) -> set[str]:
-    return {
-        node.name for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))) if isinstance(node, ast.FunctionDef)
-    }
+def functions_of(file: Path) -> list[str]:
+    return re.findall(r"^\s*(?:async )?def (\w+)", file.read_text(encoding="utf-8"), re.MULTILINE)
 
 
 def test_hazards_are_numbered_and_each_has_a_control_and_a_test():

@@ -220,6 +220,7 @@ def test_without_the_schedule_the_pictures_are_others(session):
     assert without.find(ShownComparison) is None
 
 
+@pytest.mark.slow
 def test_another_call_gives_other_pictures(session):
     """The comparison can fail: one step more in one call, and it does."""
     logs = sorted((session / "session/segments").glob("*/log.jsonl"))
