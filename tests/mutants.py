@@ -30,13 +30,15 @@ import ast
 import copy
 import gc
 import json
+import math
 import os
 import random
 import shutil
+import signal
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Container, Iterator
+from collections.abc import Callable, Container, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -54,7 +56,7 @@ PARTS = ("training", "geometry", "depth", "poses", "endoscope", "experimental")
 MOST_S = 60.0
 """Seconds of tests, as recorded, that run for a mutant."""
 SLOWER, LEAST_LIMIT_S = 5.0, 30.0
-"""A mutant hangs, which counts as killed, after this multiple of the recorded time and these seconds."""
+"""A test hangs, which counts as killed, after this multiple of its recorded time and these seconds."""
 FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 APART = "apart"
 """Name in place of a failed test's where the loaded functions cannot be replaced."""
@@ -319,10 +321,11 @@ class Chosen:
     Args:
         tests: ids of the tests, or files of which all tests run.
         result: file for the id of the failed test; empty if all pass.
+        seconds: recorded time of each test. A test that takes much longer ends the process by SIGALRM.
     """
 
-    def __init__(self, tests: Container[str], result: Path) -> None:
-        self.tests, self.result = tests, result
+    def __init__(self, tests: Container[str], result: Path, seconds: Mapping[str, float]) -> None:
+        self.tests, self.result, self.seconds = tests, result, seconds
         self.failed: list[str] = []
 
     def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
@@ -348,7 +351,9 @@ class Chosen:
         for item, following in zip(items, [*items[1:], None], strict=True):
             if self.failed:
                 break
+            signal.alarm(math.ceil(LEAST_LIMIT_S + SLOWER * self.seconds.get(item.nodeid, MOST_S)))
             item.config.hook.pytest_runtest_protocol(item=item, nextitem=following)
+        signal.alarm(0)
         self.pytest_sessionfinish()
 
 
@@ -407,7 +412,13 @@ def _failed(fork: Fork, folder: Path) -> str:
     result = folder / "failed"
     if fork.code == RAISED:
         sys.exit(f"the session failed:\n{fork.output.read_text(encoding='utf-8', errors='replace')[-4000:]}")
-    name = "time" if fork.timed_out else result.read_text(encoding="utf-8") if result.exists() else "pytest itself"
+    name = (
+        "time"
+        if fork.timed_out or fork.code == -signal.SIGALRM
+        else result.read_text(encoding="utf-8")
+        if result.exists()
+        else "pytest itself"
+    )
     result.unlink(missing_ok=True)
     return name
 
@@ -448,7 +459,7 @@ class Collected:
                     if not replace_code(mutant):
                         (folder / "failed").write_text(APART, encoding="utf-8")
                         return 0
-                chosen = Chosen((), folder / "failed")
+                chosen = Chosen((), folder / "failed", run.tests)
                 session.config.pluginmanager.register(chosen)
                 chosen.run([items[name] for name in tests])
                 return 0
@@ -466,7 +477,7 @@ def judge_apart(runs: list[Run], jobs: int, folder: Path, ended: Callable[[Run],
         files = list(dict.fromkeys(test.split("::")[0] for test in tests))
         hook = "" if mutant is None else hook_of(mutant, folder)
         return pytest_fork(
-            files, folder, Chosen(frozenset(tests), folder / "failed"), hook, limit_of(run) + LEAST_LIMIT_S
+            files, folder, Chosen(frozenset(tests), folder / "failed", run.tests), hook, limit_of(run) + LEAST_LIMIT_S
         )
 
     judge_all(runs, jobs, folder, start, ended)
