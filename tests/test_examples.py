@@ -18,7 +18,13 @@ from tests.system.servers import serving
 ROOT = Path(__file__).resolve().parent.parent
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 
-SLOW = ("02_fit_an_image.py", "05_bundle_and_ply.py", "06_service_life_cycle.py")
+SLOW = (
+    "02_fit_an_image.py",
+    "03_online_reconstruction.py",
+    "04_operator_graph.py",
+    "05_bundle_and_ply.py",
+    "06_service_life_cycle.py",
+)
 RUNS = {
     "01_render.py": (["--out", "sphere.png"], r"600 Gaussians, 600 in view", ["sphere.png"]),
     "02_fit_an_image.py": (["--steps", "40"], r"(\d+\.\d) dB before, (\d+\.\d) dB after", []),

@@ -26,7 +26,7 @@ from tests.gsplat_core.geometry.moving_scope import SIDEWAYS, video
 )
 def test_depth_and_the_right_eye_are_left_out_where_they_hurt(tmp_path, monkeypatch, gain_db, dropped):
     """The scores of the validation frames are the test's; each input that is left out gains the same."""
-    folder = synthesize(tmp_path / "take", frames=12, width_px=48, height_px=40)
+    folder = synthesize(tmp_path / "take", frames=8, width_px=40, height_px=32)
     monkeypatch.setattr(validation, "FIRST_STEPS", 1)
     monkeypatch.setattr(validation, "MOST_STEPS", 1)
 

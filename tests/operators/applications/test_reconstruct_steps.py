@@ -18,7 +18,7 @@ def settings(tmp_path):
 
     folder = tmp_path / "take"
     folder.mkdir()
-    for number, frame in enumerate(video(24, SIDEWAYS)[0]):
+    for number, frame in enumerate(video(16, SIDEWAYS)[0]):
         cv2.imwrite(str(folder / f"{number:03}.png"), cv2.resize(frame.image[..., ::-1], (64, 48)))
     return ReconstructSettings(recording=folder, out=tmp_path / "out", sinks=(), minutes=1.0)
 

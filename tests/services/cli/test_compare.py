@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import struct
+from functools import cache
 
 import numpy as np
 import pytest
@@ -18,8 +19,11 @@ from gsplat_core.scene.depth_source import DepthSource
 from services.cli.app import run
 from services.cli.exit_codes import BAD_INPUT, OK
 
+METRIC = DepthSource(DEPTH_ORIGINS["measured"], metric=True)
 
-def bumpy(source: DepthSource | None) -> Model:
+
+@cache
+def bumpy(source: DepthSource | None = METRIC) -> Model:
     x, y = torch.meshgrid(torch.arange(-30.0, 31), torch.arange(-25.0, 26), indexing="xy")
     x, y = x.ravel(), y.ravel()
     z = 45 + 4 * torch.sin(x / 6) * torch.cos(y / 7) + 0.1 * x
@@ -29,6 +33,11 @@ def bumpy(source: DepthSource | None) -> Model:
         torch.full((count, 3), -0.7), torch.full((count,), 6.0), torch.zeros(count, 1, 3),
     )  # fmt: skip
     return Model(1, gaussians, None, Camera.from_focal(50.0, 48, 40), (0.0, 1.0), depth_source=source)
+
+
+@cache
+def surface() -> Mesh:
+    return mesh_of(bumpy(), 0.0)
 
 
 def write(mesh: Mesh, path) -> None:
@@ -47,9 +56,9 @@ def write(mesh: Mesh, path) -> None:
 
 @pytest.mark.parametrize("suffix", [".ply", ".stl", ".obj"])
 def test_a_model_lies_on_its_own_moved_surface(suffix, tmp_path, capsys):
-    model = bumpy(DepthSource(DEPTH_ORIGINS["measured"], metric=True))
+    model = bumpy()
     save_bundle(model, tmp_path / "model")
-    mesh = mesh_of(model, 0.0)
+    mesh = surface()
     angle = math.radians(3)
     turn = np.array([[math.cos(angle), -math.sin(angle), 0], [math.sin(angle), math.cos(angle), 0], [0, 0, 1]])
     moved = Mesh(
@@ -65,7 +74,7 @@ def test_a_model_lies_on_its_own_moved_surface(suffix, tmp_path, capsys):
 def test_a_model_without_a_unit_takes_its_scale_from_pairs(tmp_path, capsys):
     model = bumpy(None)
     save_bundle(model, tmp_path / "model")
-    mesh = mesh_of(model, 0.0)
+    mesh = surface()
     write(Mesh(2 * mesh.vertices, mesh.normals, mesh.colours, mesh.triangles), tmp_path / "ct.stl")
     arguments = ["compare", str(tmp_path / "model"), str(tmp_path / "ct.stl")]
     assert run(arguments) == BAD_INPUT
@@ -95,7 +104,7 @@ def test_a_model_without_a_unit_takes_its_scale_from_pairs(tmp_path, capsys):
     ],
 )
 def test_files_that_are_no_meshes_are_refused(name, content, said, tmp_path, capsys):
-    save_bundle(bumpy(DepthSource(DEPTH_ORIGINS["measured"], metric=True)), tmp_path / "model")
+    save_bundle(bumpy(), tmp_path / "model")
     (tmp_path / name).write_bytes(content)
     assert run(["compare", str(tmp_path / "model"), str(tmp_path / name)]) == BAD_INPUT
     assert said in capsys.readouterr().err
@@ -103,9 +112,9 @@ def test_files_that_are_no_meshes_are_refused(name, content, said, tmp_path, cap
 
 @pytest.fixture
 def metric_model(tmp_path):
-    model = bumpy(DepthSource(DEPTH_ORIGINS["measured"], metric=True))
+    model = bumpy()
     save_bundle(model, tmp_path / "model")
-    return tmp_path / "model", mesh_of(model, 0.0)
+    return tmp_path / "model", surface()
 
 
 @pytest.mark.parametrize("factor", [1e-30, 1e-12, 1e-7, 1e-3, 0.0254, 39.37, 1e3, 1e7, 1e30])
