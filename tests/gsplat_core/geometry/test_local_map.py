@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
+from gsplat_core.poses import local_map
 from gsplat_core.poses.local_map import KeyFrame, LocalMap, position_of, scaled, unprojected
+from gsplat_core.scene.cameras import Camera
 
 
 def key(x, numbers=(), y=0.0):
@@ -130,3 +133,16 @@ def test_one_key_frame_alone_is_not_adjusted():
     made.keys = [key(0.0, range(20))]
     made.adjust()
     assert torch.equal(made.keys[0].pose, torch.eye(4, dtype=torch.float64))
+
+
+@pytest.mark.parametrize(("points", "rounds"), [(20, 5), (200, 2), (900, 1)])
+def test_an_adjustment_of_many_sightings_has_fewer_rounds(points, rounds, monkeypatch):
+    """Each of three key frames sees all points. 1,500 sightings are adjusted once, and no adjustment has more than five rounds."""
+    asked = []
+    monkeypatch.setattr(local_map, "adjusted", lambda bundle, fixed, rounds: asked.append(rounds) or bundle)
+    made = known([[0.1 * n, 0, 50.0] for n in range(points)])
+    for x in range(3):
+        seen = key(float(x), range(points))
+        made.add_key(replace(seen, picture=SimpleNamespace(camera=Camera.from_focal(100.0, 64, 48))))
+    made.adjust()
+    assert asked == [rounds]

@@ -13,7 +13,7 @@ from gsplat_core.errors import InvalidSetting
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.losses.flow import FlowLoss
 from gsplat_core.training.losses.loss import LossContext
-from gsplat_core.training.losses.triangulation import TriangulationLoss, triangulate
+from gsplat_core.training.losses.triangulation import TriangulationLoss, triangulate, triangulated
 from gsplat_core.training.motion.image_motion import consistent_flow
 from gsplat_core.training.observations import Observation
 
@@ -133,6 +133,17 @@ def test_triangulation_returns_exact_points_and_refuses_contradictions():
     pixels[10:20, 2:] = np.nan  # matched in one other view only
     _, reliable = triangulate(pixels, cameras)
     assert reliable[:10].all() and not reliable[10:].any()
+
+
+def test_points_of_pictures_are_on_the_surface_and_project_to_the_centres_of_their_pixels():
+    frames = [seen(textured_wall(), seq, camera) for seq, camera in enumerate(around())]
+    found = triangulated(frames[0], frames[1:])
+    assert found is not None and len(found.pixels) > 20
+    x, y, z = found.points.T
+    assert float((z - 40 - 1.5 * torch.sin(x / 5) * torch.cos(y / 6)).abs().median()) < 0.5
+    placed = torch.stack([x, y], 1) / z[:, None] * 110 + torch.tensor(CAMERA.K[:2, 2], dtype=torch.float32)
+    torch.testing.assert_close(placed, found.pixels, rtol=0, atol=1.0)
+    assert (found.pixels % 1 == 0.5).all() and (found.pixels < torch.tensor([96, 80])).all()
 
 
 def test_a_displaced_surface_is_moved_back():

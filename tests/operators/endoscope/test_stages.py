@@ -157,7 +157,7 @@ def test_good_video_keeps_everything_but_masks_of_the_loss(recordings_dir, name,
 
 
 @pytest.mark.recordings
-@pytest.mark.parametrize("name", PLACES)
+@pytest.mark.parametrize("name", sorted(PLACES.keys() - {"cutting", "heart"}))
 def test_no_recording_has_withheld_frames_or_new_scenes(recordings_dir, name):
     for frame in run_all(frames(clip(recordings_dir, name))):
         assert (frame.withheld, frame.new_scene) == (None, None)

@@ -88,6 +88,20 @@ def test_a_direct_start_is_a_session_of_its_own_and_says_how_it_ended(runtime):
     assert not is_of_no_use(how) and is_of_no_use("exit code 2")
 
 
+def test_a_launcher_that_was_never_opened_can_be_closed_twice(runtime):
+    async def run() -> list[str]:
+        start = ByLauncher(runtime)
+        for stop in (False, True):
+            await start.close(stop=stop)
+        start.open()
+        await start.close(stop=True)
+        await asyncio.sleep(0)
+        return [task.get_name() for task in asyncio.all_tasks() if task is not asyncio.current_task()]
+
+    assert asyncio.run(run()) == []
+    assert recorded_launcher(runtime) is None
+
+
 def test_without_a_launcher_processes_are_started_directly(runtime):
     async def run() -> str | None:
         start = ByLauncher(runtime)
