@@ -43,3 +43,14 @@ def test_a_glint_adds_white_of_a_third_of_the_surrounding_light(excess: float, s
     image[dots > 0] = recorded(tissue + excess * tissue[0])
     found = shading_in(SmallPicture.of(Frame(0, 0, image)))
     assert found.glints.sum() * 64 / np.count_nonzero(dots) == pytest.approx(share, abs=0.15)
+
+
+@pytest.mark.parametrize("dimmer", [2.0, 5.0])
+def test_diffuse_brightness_is_the_logarithm_of_the_light_that_the_camera_recorded(dimmer: float) -> None:
+    tissue = np.array([0.6, 0.25, 0.2])
+    image = np.zeros((256, 320, 3), np.uint8)
+    image[:, :160], image[:, 160:] = recorded(tissue), recorded(tissue / dimmer)
+    found = shading_in(SmallPicture.of(Frame(0, 0, image))).diffuse
+    assert found is not None
+    seen = found.brightness[:, :18].mean() - found.brightness[:, 22:].mean()
+    assert seen == pytest.approx(np.log(dimmer), abs=0.02)

@@ -136,7 +136,7 @@ def test_triangulation_returns_exact_points_and_refuses_contradictions():
 
 
 def test_points_of_pictures_are_on_the_surface_and_project_to_the_centres_of_their_pixels():
-    frames = [seen(textured_wall(), seq, camera) for seq, camera in enumerate(around())]
+    frames = [seen(textured_wall(), seq, camera) for seq, camera in enumerate(around()[:4])]
     found = triangulated(frames[0], frames[1:])
     assert found is not None and len(found.pixels) > 20
     x, y, z = found.points.T

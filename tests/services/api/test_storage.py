@@ -142,4 +142,5 @@ def test_a_store_whose_disk_refuses_is_no_bug(plane, monkeypatch, caplog, store,
         monkeypatch.setattr(plane.parts.streams, "create", refuse)
         answer = plane.ask("POST", "/v1/streams", json={"name": "x", "source": "synthetic:"})
     assert answer.status_code == status and os.strerror(number) in answer.json()["detail"]
+    assert ("free space" in answer.json()["detail"]) == (status == 507)
     assert "/secret" not in answer.text and "Traceback" not in caplog.text
