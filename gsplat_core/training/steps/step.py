@@ -435,9 +435,9 @@ class TrainingStep:
         self._adam.restart(count)
         if self._captured is not None:
             self._captured.restart()
-        if self._pictures is not None:
-            self._pictures.restart(mm_per_px(gaussians, camera) * float(camera.K[0, 0]))
         self._mm_per_px, self._scaled_for = mm_per_px(gaussians, camera), None
+        if self._pictures is not None:
+            self._pictures.restart(self.distance(camera))
         return True
 
     @property
