@@ -461,6 +461,8 @@ KIND = FieldKind(
         "spacing_s": NumberIn(1e-6, 1e6),
     },
     rates=BasisLearningRates(),
+    # Bumps that move towards trained times leave the times between without one.
+    offline_rates=BasisLearningRates(timing=0.0),
     training=BasisTraining,
     captured_training=CapturedBasisTraining,
     training_bytes=training_bytes,

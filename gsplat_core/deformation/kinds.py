@@ -180,6 +180,8 @@ class FieldKind(Generic[Field]):
     """Factory of the trainer for CUDA graphs, called for fields with `Capabilities.frame_deltas`.
     None trains as on the CPU.
     """
+    offline_rates: FieldRates | None = None
+    """Learning rates for training on a complete recording; None for `rates`."""
     offline_spacing_s: float = 0.05
     """`NewField.spacing_s` for training on a complete recording."""
     training_bytes: Callable[[int, float], int] = lambda gaussians, spacings: OTHER_FIELD_BYTES

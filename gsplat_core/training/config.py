@@ -172,6 +172,7 @@ class ReconstructorConfig:
             motion_spacing_s=FIELDS[field].offline_spacing_s,
             squared_error=True,
             depth_of_recording="parallax",
+            rates=LearningRates(field=FIELDS[field].offline_rates),
         )
 
     def starting_from(self, frame: Frame, all_known: bool) -> ReconstructorConfig:

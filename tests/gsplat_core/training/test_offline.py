@@ -76,6 +76,14 @@ def test_every_frame_is_trained_on_equally_often(tissue_video, camera, monkeypat
     assert seen == dict.fromkeys(range(5), 3)
 
 
+def test_bumps_keep_their_timing_offline(tissue_video, camera):
+    config = dataclasses.replace(ReconstructorConfig.offline("basis"), gaussians=100, max_gaussians=100)
+    field = fitted(camera, tissue_video(4), 6, config)[0].snapshot().field
+    assert field.weights.abs().max() > 0
+    assert torch.equal(field.centers, torch.arange(field.centers.shape[1]).expand_as(field.centers).float())
+    assert field.log_widths.abs().max() == 0
+
+
 def test_smoothing_brings_neighbours_in_time_together(tissue_video, camera):
     def roughness(smoothing):
         learning, _ = fitted(camera, tissue_video(12), 60, DENSIFY_ROUNDS=0, SMOOTHING=smoothing)
