@@ -35,7 +35,10 @@ def own_tests(logs: Logs) -> str:
     scenes: list[str] = []
     for device, log in logs.items():
         for name, counts in log["files"].items():
-            rows.append([name, device, counts["passed"], counts["failed"], counts["skipped"]])
+            # A file that did not end has one entry of its own name.
+            ended = log["tests"].get(name)
+            failed = counts["failed"] if ended is None else f"{ended['why']} ({ended['seconds']:.0f} s)"
+            rows.append([name, device, counts["passed"], failed, counts["skipped"]])
         scenes.append(f"{device}: compared with {log['compared_with']}; scene of test_basic: {log['scene']}.")
         if log.get("failed_with_gsplat") is not None:
             names = ", ".join(f"`{test}`" for test in log["failed_with_gsplat"])
