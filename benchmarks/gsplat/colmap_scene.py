@@ -142,24 +142,25 @@ def write_sparse(
     data = struct.pack("<QiiQQ", 1, 1, BINARY_PINHOLE, first.width_px, first.height_px)
     (folder / "cameras.bin").write_bytes(data + struct.pack("<4d", K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
     tracks: list[list[tuple[int, int]]] = [[] for _ in positions]
-    data = struct.pack("<Q", len(posed))
+    images = [struct.pack("<Q", len(posed))]
     for number, (name, camera) in enumerate(posed, 1):
         pose = camera.world_to_camera
         moved = positions @ pose[:3, :3].T + pose[:3, 3]
         pixels = moved[:, :2] / moved[:, 2:] * [K[0, 0], K[1, 1]] + [K[0, 2], K[1, 2]]
         inside = (pixels >= 0).all(1) & (pixels < [camera.width_px, camera.height_px]).all(1) & (moved[:, 2] > 0)
         seen = np.flatnonzero(inside)
-        data += struct.pack("<i7di", number, *_quaternion(pose[:3, :3]), *pose[:3, 3], 1) + name.encode() + b"\0"
-        data += struct.pack("<Q", len(seen))
+        images.append(struct.pack("<i7di", number, *_quaternion(pose[:3, :3]), *pose[:3, 3], 1) + name.encode() + b"\0")
+        observed = np.empty(len(seen), [("pixel", "<f8", 2), ("point", "<i8")])
+        observed["pixel"], observed["point"] = pixels[seen], seen + 1
+        images += [struct.pack("<Q", len(seen)), observed.tobytes()]
         for at, point in enumerate(seen):
-            data += struct.pack("<ddq", *pixels[point], point + 1)
             tracks[point].append((number, at))
-    (folder / "images.bin").write_bytes(data)
-    data = struct.pack("<Q", len(positions))
+    (folder / "images.bin").write_bytes(b"".join(images))
+    points = [struct.pack("<Q", len(positions))]
     for point, track in enumerate(tracks):
-        data += struct.pack("<Q3d3Bd", point + 1, *positions[point], *(int(c) for c in colours[point]), 0.5)
-        data += struct.pack("<Q", len(track)) + b"".join(struct.pack("<ii", *each) for each in track)
-    (folder / "points3D.bin").write_bytes(data)
+        points.append(struct.pack("<Q3d3Bd", point + 1, *positions[point], *(int(c) for c in colours[point]), 0.5))
+        points += [struct.pack("<Q", len(track)), np.array(track, "<i4").tobytes()]
+    (folder / "points3D.bin").write_bytes(b"".join(points))
 
 
 def _quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
