@@ -63,6 +63,13 @@ def test_without_rounds_the_gaussians_stay(tissue_video, camera):
     assert set(counts) == {counts[0]}
 
 
+def test_progress_is_stated_after_each_step_with_its_loss(tissue_video, camera):
+    done = []
+    report = Reconstructor(CONFIG, camera).fit(tissue_video(2), 4, progress=lambda *step: done.append(step))
+    assert [number for number, _ in done] == [1, 2, 3, 4]
+    assert report.loss == done[-1][1]
+
+
 def test_every_frame_is_trained_on_equally_often(tissue_video, camera, monkeypatch):
     seen = Counter()
     take = TrainingStep.__call__
