@@ -5,7 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsplat_core.experimental.periodic_motion import PeriodicMotion, fitted, found_in, in_cameras, off_px, waves
+from gsplat_core.experimental.periodic_motion import (
+    PeriodicMotion,
+    fitted,
+    found_in,
+    in_cameras,
+    off_px,
+    splines,
+    waves,
+)
 from gsplat_core.geometry.grid_tracks import GridTracks
 from tests.gsplat_core.geometry.breathing_points import BREATHING_HZ, HEART_HZ, places, swaying, tracks_of
 
@@ -76,6 +84,22 @@ def test_distances_that_cannot_be_told_are_said_to_be_uncertain(length_s: float,
     found = found_in(tracks)
     error = np.hypot(np.median(fitted(tracks, found.hz or TRUE).error), found.error)
     assert error > 0.04
+
+
+def of_order(order: int, number: int, x: float) -> float:
+    """Value of a B-spline with knots at the integers, by Cox and de Boor's recursion."""
+    if order == 1:
+        return float(number <= x < number + 1)
+    below, above = of_order(order - 1, number, x), of_order(order - 1, number + 1, x)
+    return ((x - number) * below + (number + order - x) * above) / (order - 1)
+
+
+@pytest.mark.parametrize("count", [4, 7])
+def test_splines_are_those_of_coxs_and_de_boors_recursion(count: int) -> None:
+    share = np.array([-0.3, 0.0, 0.1, 0.37, 0.5, 0.8, 0.99])
+    places = share.clip(0, 1) * (count - 3) + 3
+    np.testing.assert_allclose(splines(share, count), [[of_order(4, n, x) for n in range(count)] for x in places])
+    np.testing.assert_allclose(splines(np.array([1.0, 2.0]), count)[:, -3:], [[1 / 6, 4 / 6, 1 / 6]] * 2)
 
 
 def test_waves_begin_with_what_rests() -> None:

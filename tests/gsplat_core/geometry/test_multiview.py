@@ -169,12 +169,16 @@ def test_nothing_that_can_be_followed() -> None:
         assert found.doubt == "too few points of the tissue can be tracked"
 
 
-@pytest.mark.parametrize(("height_px", "are_tracked"), [(8, False), (14, True)])
-def test_strips_of_tissue_are_tracked_from_four_pixels_within_their_edges_on(height_px: int, are_tracked: bool) -> None:
+@pytest.mark.parametrize("upright", [False, True])
+@pytest.mark.parametrize(("width_px", "are_tracked"), [(8, False), (14, True)])
+def test_strips_of_tissue_are_tracked_from_four_pixels_within_their_edges_on(
+    width_px: int, are_tracked: bool, upright: bool
+) -> None:
     frames, cameras = video(3, SIDEWAYS)
     tissue = np.zeros((HEIGHT, WIDTH), np.uint8)
-    for top in range(6, HEIGHT - 20, 20):
-        tissue[top : top + height_px] = 255
+    across = tissue.T if upright else tissue
+    for start in range(6, len(across) - 20, 20):
+        across[start : start + width_px] = 255
     views = [view_of(frame.with_fields(mask=tissue), camera) for frame, camera in zip(frames, cameras, strict=True)]
     assert isinstance(explained_by_poses(views[0], views[1:]), Parallax) is are_tracked
 
