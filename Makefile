@@ -55,7 +55,7 @@ $(GROUPS:%=test-of-%): export OMP_NUM_THREADS ?= 1
 $(GROUPS:%=test-of-%): export OPENBLAS_NUM_THREADS ?= 1
 $(GROUPS:%=test-of-%): export OPENCV_FOR_THREADS_NUM ?= 1
 # Numeric tests use what the others leave, because processes of the service run with a lower priority than the tests that wait for them.
-$(NUMERIC:%=test-of-%): NICE := nice -n 10
+$(NUMERIC:%=test-of-%): NICE := nice -n 3
 # Child processes load compiled modules instead of compiling them again.
 $(GROUPS:%=test-of-%): export PYTHONDONTWRITEBYTECODE :=
 # Each group keeps its exit code and its failed tests in build/tests, for `test-again`.
