@@ -24,20 +24,24 @@ demo: native
 # Run the fast tests (`test`), or also those marked as slow (`test-all`), in groups of which JOBS run at a time. There are more of them than
 # cores, because many tests wait for processes. The output of a group is printed when it has ended.
 JOBS ?= $(shell expr $$(nproc) + 2)
-SYSTEM_TESTS := tests/system $(addprefix tests/services/,registry jobs exports audit supervisor recordings)
+SYSTEM_TESTS := tests/system
 PROGRAM_TESTS := tests/attacks tests/test_examples.py tests/recipes tests/deploy
+REGISTRY_TESTS := $(addprefix tests/services/,registry jobs exports audit supervisor recordings)
 TRAINING_TESTS := tests/gsplat_core/training tests/gsplat_core/experimental tests/gsplat_core/evaluation
-OP_TESTS := $(addprefix tests/gsplat_core/,ops rendering deformation geometry)
-NUMERIC := training rest ops
-GROUPS := system programs training rest services ops operators
+OP_TESTS := tests/gsplat_core/ops tests/gsplat_core/rendering tests/gsplat_core/deformation
+GEOMETRY_TESTS := tests/gsplat_core/geometry
+NUMERIC := training rest ops geometry
+GROUPS := system programs training registry rest operators services ops geometry
 ignoring = $(patsubst %,--ignore=%,$1)
 test-of-system: TESTS = $(SYSTEM_TESTS)
 test-of-programs: TESTS = $(PROGRAM_TESTS)
-test-of-services: TESTS = tests/services $(call ignoring,$(SYSTEM_TESTS))
+test-of-registry: TESTS = $(REGISTRY_TESTS)
+test-of-services: TESTS = tests/services $(call ignoring,$(REGISTRY_TESTS))
 test-of-operators: TESTS = tests/operators
 test-of-training: TESTS = $(TRAINING_TESTS)
 test-of-ops: TESTS = $(OP_TESTS)
-test-of-rest: TESTS = $(call ignoring,$(SYSTEM_TESTS) $(PROGRAM_TESTS) tests/services tests/operators $(TRAINING_TESTS) $(OP_TESTS))
+test-of-geometry: TESTS = $(GEOMETRY_TESTS)
+test-of-rest: TESTS = $(call ignoring,$(SYSTEM_TESTS) $(PROGRAM_TESTS) tests/services tests/operators $(TRAINING_TESTS) $(OP_TESTS) $(GEOMETRY_TESTS))
 .PHONY: $(GROUPS:%=test-of-%)
 BESIDE = --no-print-directory --jobs=$(JOBS) --output-sync=target --keep-going
 test: native .venv/.development
@@ -55,7 +59,7 @@ $(GROUPS:%=test-of-%): export OMP_NUM_THREADS ?= 1
 $(GROUPS:%=test-of-%): export OPENBLAS_NUM_THREADS ?= 1
 $(GROUPS:%=test-of-%): export OPENCV_FOR_THREADS_NUM ?= 1
 # Numeric tests use what the others leave, because processes of the service run with a lower priority than the tests that wait for them.
-$(NUMERIC:%=test-of-%): NICE := nice -n 3
+$(NUMERIC:%=test-of-%): NICE := nice -n 10
 # Child processes load compiled modules instead of compiling them again.
 $(GROUPS:%=test-of-%): export PYTHONDONTWRITEBYTECODE :=
 # Each group keeps its exit code and its failed tests in build/tests, for `test-again`.
