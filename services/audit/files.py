@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, BinaryIO, Literal
 
 from gsplat_core.io.files import open_regular, read_regular
 
@@ -106,24 +106,23 @@ def _canonical(values: dict[str, Any]) -> bytes:
 BLOCK_BYTES = 1 << 16
 
 
-def whole_lines_bytes(path: Path, size: int) -> int:
-    """Return the number of bytes up to the end of the last complete line."""
-    with open_regular(path) as file:
-        end = size
-        while end:
-            start = max(0, end - BLOCK_BYTES)
-            file.seek(start)
-            found = file.read(end - start).rfind(b"\n")
-            if found >= 0:
-                return start + found + 1
-            end = start
+def whole_lines_bytes(file: BinaryIO, size: int) -> int:
+    """Return the number of bytes of an open file up to the end of the last complete line below `size`."""
+    end = size
+    while end:
+        start = max(0, end - BLOCK_BYTES)
+        file.seek(start)
+        found = file.read(end - start).rfind(b"\n")
+        if found >= 0:
+            return start + found + 1
+        end = start
     return 0
 
 
 def lines_backwards(path: Path, size: int | None = None) -> Iterator[bytes]:
     """Yield the complete lines of a file, last one first."""
     with open_regular(path) as file:
-        end = whole_lines_bytes(path, os.fstat(file.fileno()).st_size) if size is None else size
+        end = whole_lines_bytes(file, os.fstat(file.fileno()).st_size) if size is None else size
         rest = b""
         while end:
             start = max(0, end - BLOCK_BYTES)

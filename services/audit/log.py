@@ -18,6 +18,7 @@ from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 
+from gsplat_core.io.files import open_regular
 from services.audit.files import (
     MOST_LINE_BYTES,
     Detail,
@@ -226,7 +227,8 @@ class AuditLog:
 
     def _recover(self) -> None:
         size = os.fstat(self._descriptor).st_size
-        whole = whole_lines_bytes(self.path, size)
+        with open_regular(self.path) as file:
+            whole = whole_lines_bytes(file, size)
         try:
             kept = read_head(self.path) or Head()
             self._head = self._checked_end(whole)

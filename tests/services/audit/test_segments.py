@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from services.audit import AuditLog, Keeping, verify
+from services.audit import AuditLog, Keeping, files, verify
 from services.audit.files import anchor_path, closed_segments, parse_line, read_anchor, segment_path, write_anchor
 
 SMALL = Keeping(segment_bytes=1000)
@@ -190,6 +190,21 @@ def test_kill_at_any_moment_leaves_a_log_that_fits(tmp_path):
 
 
 @pytest.mark.slow
+def test_a_file_that_is_replaced_after_it_was_opened_is_read_to_its_end(tmp_path, monkeypatch):
+    log = tmp_path / "audit.jsonl"
+    log.write_bytes(b"first line\nsecond line\nunfinished")
+    opened = files.open_regular
+
+    def open_and_replace(path):
+        file = opened(path)
+        log.rename(tmp_path / "closed.jsonl")
+        log.write_bytes(b"new\n")
+        return file
+
+    monkeypatch.setattr(files, "open_regular", open_and_replace)
+    assert list(files.lines_backwards(log)) == [b"second line", b"first line"]
+
+
 def test_a_log_is_read_and_verified_while_it_is_written(tmp_path):
     log = AuditLog(tmp_path / "audit.jsonl", Keeping(segment_bytes=600, segments=3))
     ended = threading.Event()
