@@ -36,7 +36,7 @@ def intersection_over_union(shown: np.ndarray, wanted: np.ndarray) -> float:
 @pytest.mark.slow
 @pytest.mark.parametrize("field", ["basis", "hexplane"])
 def test_labels_on_some_frames_classify_the_others(field, tmp_path):
-    config = replace(ReconstructorConfig.offline(), losses=("semantics",), gaussians=800, field=field)
+    config = replace(ReconstructorConfig.offline(field), losses=("semantics",), gaussians=800)
     reconstructor = Reconstructor(config, CAMERA, seed=0)
     reconstructor.fit(frames(10, 5), 60)
     model = reconstructor.snapshot()
