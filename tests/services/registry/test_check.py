@@ -221,7 +221,9 @@ def test_closing_the_registry_ends_its_checks(tmp_path, files):
 def test_credentials_do_not_reach_the_check(tmp_path, monkeypatch):
     monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "secret")
     program = says("import json, os; print(json.dumps({'stage': 'rejected', 'reason': ' '.join(os.environ)}))")
-    names = run_check(tmp_path, program=program).reason.split()
+    monkeypatch.setenv("INTRASPLAT_KEY_FILE", "key")
+    # The instruction set of the machine is no credential, and the check follows it.
+    names = set(run_check(tmp_path, program=program).reason.split()) - {"INTRASPLAT_ISA"}
     assert "PATH" in names and not any("AWS" in name or "INTRASPLAT_" in name for name in names)
 
 
