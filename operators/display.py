@@ -72,9 +72,9 @@ class LiveDisplayResult:
     age: DurationSummary
     """Distribution of the age of each new picture at the time of display."""
     settled_age: DurationSummary
-    """The same after the first `SETTLING_S` seconds of the stream."""
+    """Distribution of these ages after the first `SETTLING_S` seconds of the stream."""
     used_age: DurationSummary
-    """The same without pictures of withheld frames, which show the content of an earlier frame."""
+    """Distribution of `settled_age` without pictures of withheld frames, which show the content of an earlier frame."""
     states: dict[str, int]
     """Number of transitions into each state, by name."""
     first_picture_ms: float | None
