@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import pytest
 import torch
-
-
-def pytest_ignore_collect() -> bool | None:
-    """Leave the folder out without a GPU, unless tests must fail then (`FAIL_WITHOUT_CUDA=1`)."""
-    return None if torch.cuda.is_available() or os.environ.get("FAIL_WITHOUT_CUDA") == "1" else True
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
