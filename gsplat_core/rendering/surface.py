@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.argument_checks import require_shape
+from gsplat_core.ops.frame.view import View
 from gsplat_core.ops.projection.arguments import DenseProjection
 from gsplat_core.ops.projection.projection import fully_fused_projection
 from gsplat_core.ops.tiles.grid import TileGrid
@@ -77,39 +78,69 @@ def render_rays(gaussians: Gaussians, camera: Camera, values: Tensor | None = No
         camera: camera of the result.
         values: further values [N, D] to blend.
     """
+    return blend_view_rays(gaussians, view_of(camera, gaussians.device, gaussians.dtype), values)[0]
+
+
+def view_of(camera: Camera, device: torch.device, dtype: torch.dtype | None = None) -> View:
+    """Return a camera with its matrices on a device."""
+    viewmat, intrinsics = camera.matrices(device, dtype)
+    return View(viewmat, intrinsics, camera.width_px, camera.height_px, camera_model=camera.model)
+
+
+def blend_view_rays(
+    gaussians: Gaussians, view: View, values: Tensor | None = None, capacity: int | None = None
+) -> tuple[BlendedRays, Tensor | None]:
+    """Do the work of `render_rays` for a camera on the device.
+
+    Args:
+        gaussians: Gaussians at one time, float32.
+        view: camera of the result; its matrices are read on the device.
+        values: further values [N, D] to blend.
+        capacity: length of the tile lists, with which a CUDA graph can capture the call; see `bin_splats`. None makes
+            them as long as needed.
+
+    Returns:
+        The rays, and the required capacity, int64 [1]; None without `capacity`.
+    """
     # The compiled ops are loaded when they are first needed, so that pictures alone do not depend on them.
     from gsplat_core.ops.ray_blending.ray_blending import MAX_CHANNELS, blend_rays
     from gsplat_core.ops.splat_rays.splat_rays import splat_rays
 
-    viewmat, intrinsics = camera.matrices(gaussians.device, gaussians.dtype)
     scales, opacities = gaussians.scales, gaussians.opacities
-    means2d, conics, *lists = _projected(gaussians, scales, opacities, camera)
-    rays, normals = splat_rays(gaussians.means, gaussians.quats, scales, viewmat, intrinsics, camera.model)
+    means2d, conics, *lists, needed = _projected(gaussians, scales, opacities, view, capacity)
+    rays, normals = splat_rays(gaussians.means, gaussians.quats, scales, view.viewmat, view.K, view.camera_model)
     values = normals if values is None else torch.cat([normals, values], 1)
-    size = camera.width_px, camera.height_px
     parts = [
-        blend_rays(means2d, conics, opacities, rays, part, *size, *lists) for part in values.split(MAX_CHANNELS, 1)
+        blend_rays(means2d, conics, opacities, rays, part, view.width, view.height, *lists)
+        for part in values.split(MAX_CHANNELS, 1)
     ]
-    return parts[0] if len(parts) == 1 else parts[0]._replace(values=torch.cat([part.values for part in parts], -1))
+    if len(parts) == 1:
+        return parts[0], needed
+    return parts[0]._replace(values=torch.cat([part.values for part in parts], -1)), needed
 
 
 def _projected(
-    gaussians: Gaussians, scales: Tensor, opacities: Tensor, camera: Camera
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return means [N, 2] and conics [N, 3] of the splats, and starts and ids of the tile lists."""
-    viewmat, intrinsics = camera.matrices(gaussians.device, gaussians.dtype)
+    gaussians: Gaussians, scales: Tensor, opacities: Tensor, view: View, capacity: int | None = None
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor | None]:
+    """Return means [N, 2] and conics [N, 3] of the splats, starts and ids of the tile lists, and their required
+    length if `capacity` is given.
+    """
     projected = fully_fused_projection(
-        gaussians.means, None, gaussians.quats, scales, viewmat[None], intrinsics[None], camera.width_px,
-        camera.height_px, camera_model=camera.model, opacities=opacities,
+        gaussians.means, None, gaussians.quats, scales, view.viewmat[None], view.K[None], view.width, view.height,
+        camera_model=view.camera_model, opacities=opacities,
     )  # fmt: skip
     assert isinstance(projected, DenseProjection)
-    grid = TileGrid(TILE_SIZE, -(-camera.width_px // TILE_SIZE), -(-camera.height_px // TILE_SIZE))
+    grid = TileGrid(TILE_SIZE, -(-view.width // TILE_SIZE), -(-view.height // TILE_SIZE))
+    splats, conics = (projected.means2d, projected.radii, projected.depths), projected.conics
+    needed = None
     with torch.no_grad():
-        _, ids, starts = bin_splats(
-            projected.means2d, projected.radii, projected.depths, grid, conics=projected.conics,
-            opacities=opacities[None],
-        )  # fmt: skip
-    return projected.means2d[0], projected.conics[0], starts[0], ids
+        if capacity is None:
+            _, ids, starts = bin_splats(*splats, grid, conics=conics, opacities=opacities[None])
+        else:
+            _, ids, starts, needed = bin_splats(
+                *splats, grid, conics=conics, opacities=opacities[None], capacity=capacity
+            )
+    return projected.means2d[0], conics[0], starts[0], ids, needed
 
 
 @torch.no_grad()
@@ -120,9 +151,11 @@ def contribution(gaussians: Gaussians, cameras: Iterable[Camera]) -> Tensor:
     scales, opacities = gaussians.scales, gaussians.opacities
     most = torch.zeros_like(opacities)
     for camera in cameras:
-        means2d, conics, *lists = _projected(gaussians, scales, opacities, camera)
-        size = camera.width_px, camera.height_px
-        most = torch.maximum(most, splat_contributions(means2d, conics, opacities, *size, *lists))
+        view = view_of(camera, gaussians.device, gaussians.dtype)
+        means2d, conics, starts, ids, _ = _projected(gaussians, scales, opacities, view)
+        most = torch.maximum(
+            most, splat_contributions(means2d, conics, opacities, view.width, view.height, starts, ids)
+        )
     return most
 
 
@@ -142,14 +175,18 @@ def depth_normals(depth: Tensor, camera: Camera) -> Tensor:
     where a difference reaches across unknown depth (0), the picture's border or a jump of more than `LARGEST_JUMP`, and
     everywhere for a fisheye camera. Differences at 2 px are left out where only they do.
     """
+    return normals_of_depth(depth, camera.matrices(depth.device, depth.dtype)[1], camera.model)
+
+
+def normals_of_depth(depth: Tensor, K: Tensor, camera_model: str) -> Tensor:
+    """Do the work of `depth_normals` with an intrinsic matrix [3, 3] on the device of the depth."""
     height, width = depth.shape
-    if camera.model == "fisheye" or min(height, width) < 3:
+    if camera_model == "fisheye" or min(height, width) < 3:
         return depth.new_zeros(height, width, 3)
-    K = camera.K
     across, right, right_known = _central_differences(depth, 1)
     down, below, down_known = _central_differences(depth, 0)
     known = right_known & down_known
-    if camera.model == "ortho":
+    if camera_model == "ortho":
         p, q, toward = K[0, 0] * across, K[1, 1] * down, torch.ones_like(depth)
     else:
         # The cross product of the derivatives of depth * (x, y, 1), divided by a positive number.

@@ -103,7 +103,7 @@ class ReconstructorConfig:
     """Change of the Gaussians between offline training steps: a name in `STRATEGIES`."""
     losses: tuple[str, ...] = ()
     """Losses added to those of colours and depth: names in `LOSSES`, each optionally followed by a colon and its
-    weight. On a GPU, a step with further losses is not captured as a CUDA graph and therefore slower.
+    weight. On a GPU, a step with losses other than `RayLoss` is not captured as a CUDA graph and therefore slower.
     """
     default_depth_mm: float = RELATIVE_DISTANCE
     """Distance of the plane on which a scene without depth starts, in millimetres."""

@@ -11,7 +11,7 @@ from torch import Tensor
 from gsplat_core.argument_checks import require_float32, require_shape
 from gsplat_core.errors import InvalidInput
 from gsplat_core.rendering.settings import EPS2D, FAR_PLANE, NEAR_PLANE
-from gsplat_core.scene.cameras import CAMERA_MODELS
+from gsplat_core.scene.cameras import CAMERA_MODELS, CameraModel
 from gsplat_core.scene.gaussians import MAX_SH_DEGREE, RAW_COLUMNS
 
 GAUSSIAN_TENSORS = ("means", "quats", "log_scales", "logit_opacities", "sh")
@@ -29,7 +29,7 @@ class View(NamedTuple):
     height: int
     background: Tensor | None = None
     """Background colour [3]; None for black."""
-    camera_model: str = "pinhole"
+    camera_model: CameraModel = "pinhole"
     eps2d: float = EPS2D
     near_plane: float = NEAR_PLANE
     far_plane: float = FAR_PLANE

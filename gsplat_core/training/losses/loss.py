@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import ClassVar, Protocol, runtime_checkable
 
 from torch import Tensor
 
 from gsplat_core.scene.gaussians import Gaussians
+from gsplat_core.training.losses.rendered_rays import RenderedRays
 from gsplat_core.training.observations import Observation
 
 
@@ -20,8 +21,6 @@ class LossContext:
     """Observations available for training in temporal order, including the current one."""
     at: Callable[[float], Gaussians]
     """Function that returns the scene at another time in seconds, without gradients."""
-    shared: dict[str, object] = field(default_factory=dict)
-    """Results that several losses of one evaluation use, by name."""
 
 
 class Loss(Protocol):
@@ -47,6 +46,33 @@ class Loss(Protocol):
 
 
 @runtime_checkable
+class RayLoss(Protocol):
+    """Loss term of the rendered surface, without state. A CUDA graph captures the training step with its other parts.
+
+    The rays are rendered once for all such losses, in one of `EVERY` steps. The weighted loss of that step is
+    multiplied by `EVERY`.
+    """
+
+    name: ClassVar[str]
+    """Name in `LOSSES`."""
+    default_weight: ClassVar[float]
+    """Factor of the term if the user gives none."""
+    needs_depth: ClassVar[bool]
+    """True if only observations with depth are compared."""
+
+    def compare(self, rays: RenderedRays) -> Tensor:
+        """Compare the rays of one observation by operations on the device.
+
+        Args:
+            rays: rendered rays, differentiable in the scene, and values of the observation. Unknown depth is 0.
+
+        Returns:
+            Differentiable scalar on the scene's device, 0 if there is nothing to compare. The host may not read a value
+            of the device or copy one to it.
+        """
+
+
+@runtime_checkable
 class ExtendingLoss(Protocol):
     """Loss that trains tensors of its own in `Gaussians.extra`."""
 
@@ -63,5 +89,5 @@ class LossKind(Protocol):
     name: ClassVar[str]
     default_weight: ClassVar[float]
 
-    def __call__(self) -> Loss:
+    def __call__(self) -> Loss | RayLoss:
         """Create the loss for a new scene."""

@@ -10,7 +10,8 @@ from torch import Tensor
 from gsplat_core.choices import LOSSES
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.training.losses.loss import ExtendingLoss, LossContext
+from gsplat_core.training.losses.loss import ExtendingLoss, Loss, LossContext, RayLoss
+from gsplat_core.training.losses.rendered_rays import EVERY, RenderedRays, rays_of
 from gsplat_core.training.observations import Observation
 
 __all__ = ["LOSSES", "WeightedLosses", "loss_weights"]
@@ -65,10 +66,20 @@ class WeightedLosses:
 
     def __init__(self, weights: dict[str, float]) -> None:
         """Create the losses with these weights by name, the result of `loss_weights`."""
-        self._terms = [(LOSSES[name](), weight) for name, weight in weights.items()]
+        made = [(LOSSES[name](), weight) for name, weight in weights.items()]
+        self._of_rays = [(loss, weight) for loss, weight in made if isinstance(loss, RayLoss)]
+        self._terms: list[tuple[Loss, float]] = [
+            (loss, weight) for loss, weight in made if not isinstance(loss, RayLoss)
+        ]
+        self._steps = 0
 
     def __bool__(self) -> bool:
-        return bool(self._terms)
+        return bool(self._terms or self._of_rays)
+
+    @property
+    def can_be_captured(self) -> bool:
+        """True if a CUDA graph can capture all losses, by `compare`."""
+        return not self._terms
 
     def extended(self, gaussians: Gaussians) -> Gaussians:
         """Return the Gaussians with the tensors that the losses train."""
@@ -85,9 +96,26 @@ class WeightedLosses:
 
     def __call__(self, scene: Gaussians, observation: Observation, context: LossContext) -> Tensor | None:
         """Return the weighted sum, see `Loss.__call__`; None if no loss has anything to compare."""
-        total: Tensor | None = None
+        total = self.compare(rays_of(scene, observation)) if self.are_rays_due(observation) else None
         for loss, weight in self._terms:
             value = loss(scene, observation, context)
             if value is not None:
                 total = weight * value if total is None else total + weight * value
         return total
+
+    def are_rays_due(self, observation: Observation) -> bool:
+        """Return True if this step compares the rays of the observation. Called once per step."""
+        self._steps += 1
+        has_depth = observation.depth is not None
+        compared = any(has_depth or not loss.needs_depth for loss, _ in self._of_rays)
+        return compared and (self._steps - 1) % EVERY == 0
+
+    def compare(self, rays: RenderedRays) -> Tensor:
+        """Return the weighted sum of the losses of rays for a step that compares them.
+
+        Args:
+            rays: rays for which `are_rays_due` returned True.
+        """
+        has_depth = rays.known_depth is not None
+        terms = [weight * loss.compare(rays) for loss, weight in self._of_rays if has_depth or not loss.needs_depth]
+        return EVERY * sum(terms[1:], start=terms[0])

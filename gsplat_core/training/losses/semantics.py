@@ -42,10 +42,10 @@ class Semantics:
         """Return the mean cross-entropy over the observation's labelled pixels; None without labels."""
         if observation.labels is None:
             return None
-        geometry = replace(scene.detach(), extra={SEMANTICS: scene.extra[SEMANTICS]})
-        rays = rays_of(geometry, observation, LossContext(context.frames, context.at))
+        geometry = replace(scene.detach(), extra={})
+        rays = rays_of(geometry, observation, scene.extra[SEMANTICS])
         labels = rays.sampled(observation.labels).long()
         known = labels < CLASSES
         target = torch.where(known, labels, 0)
-        off = torch.nn.functional.cross_entropy(rays.logits.permute(2, 0, 1)[None], target[None], reduction="none")[0]
+        off = torch.nn.functional.cross_entropy(rays.values.permute(2, 0, 1)[None], target[None], reduction="none")[0]
         return torch.where(known, off, 0).sum() / known.sum().clamp(min=1)

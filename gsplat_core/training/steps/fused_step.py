@@ -1,18 +1,28 @@
 """Training step on an NVIDIA GPU as one CUDA graph without host synchronisation.
 
 The graph contains deformation, rendering, loss, backward pass and update. Its inputs are held at fixed addresses.
+Steps that compare rays have a graph of their own, which also renders the rays and backpropagates their losses.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from gsplat_core.deformation.kinds import CapturedTraining
 from gsplat_core.ops.adam.adam import adam_step_at_
-from gsplat_core.ops.frame.frame import GAUSSIAN_TENSORS, FrameMode, View, accumulate_status_, render_frame
+from gsplat_core.ops.frame.frame import (
+    GAUSSIAN_TENSORS,
+    STATUS_NEEDED,
+    STATUS_OVERFLOW,
+    FrameMode,
+    View,
+    accumulate_status_,
+    render_frame,
+)
 from gsplat_core.ops.frame_gradients.frame_gradients import GaussianAdam, render_frame_backward_adam_
 from gsplat_core.ops.image_loss.frame_loss import frame_loss
 from gsplat_core.rendering.frame_renderer import (
@@ -23,22 +33,54 @@ from gsplat_core.rendering.frame_renderer import (
     capacity_for,
 )
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.gaussians import COLOUR, Gaussians
+from gsplat_core.scene.gaussians import COLOUR, LOG_SCALE, OPACITY, POSITION, RAW_COLUMNS, ROTATION, Gaussians
+from gsplat_core.training.losses.registry import WeightedLosses
+from gsplat_core.training.losses.rendered_rays import compared_rays
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.steps.colour_correction import ResidualTarget
 from gsplat_core.training.steps.optimiser import FusedAdam
 from gsplat_core.training.steps.photometric import LEFT, RIGHT, LossWeights
 from gsplat_core.transfers import copy_each
 
+GEOMETRY: Mapping[str, slice | int] = {
+    "means": POSITION,
+    "quats": ROTATION,
+    "log_scales": LOG_SCALE,
+    "logit_opacities": OPACITY.start,
+}
+"""Columns of the raw gradient of the tensors that can be updated after the backward pass, in the order of
+`GAUSSIAN_TENSORS`.
+"""
+
+
+class StepKind(NamedTuple):
+    """Properties that distinguish the graphs of a step."""
+
+    corrects: bool
+    """Colours are corrected instead of trained."""
+    of_right: bool
+    """The right eye is trained."""
+    compares_rays: bool
+    """The losses of rays are evaluated."""
+
 
 class StepInputs:
     """Picture, mask and depth buffers for one camera size and device."""
 
-    def __init__(self, camera: Camera, device: torch.device, *, with_depth: bool) -> None:
+    def __init__(self, camera: Camera, device: torch.device, *, with_depth: bool, ray_depth: bool = False) -> None:
+        """Create the buffers.
+
+        Args:
+            camera: size of the pictures.
+            device: device of the buffers.
+            with_depth: hold depth for the loss of a picture.
+            ray_depth: hold depth also for steps that correct colours, which compare it along rays only.
+        """
         shape = (camera.height_px, camera.width_px)
         self.image = torch.zeros(*shape, 3, dtype=torch.uint8, device=device)
         self.mask = torch.ones(shape, dtype=torch.uint8, device=device)
-        self.depth = torch.zeros(shape, device=device) if with_depth else None
+        self.depth = torch.zeros(shape, device=device) if with_depth or ray_depth else None
+        self._ray_depth = ray_depth
         self.target: ResidualTarget | None = None
         """Buffers of the target picture for colour corrections, created when colours are first corrected."""
         self._taken: Observation | None = None
@@ -56,7 +98,7 @@ class StepInputs:
         copy_each([self.image, self.mask], [observation.image, observation.mask])
         if corrects and self.target is not None:
             self.target.take(self.image, self.mask)
-        elif self.depth is not None:
+        if self.depth is not None and (self._ray_depth or not corrects):
             if observation.depth is None:
                 self.depth.zero_()  # unknown everywhere, so the loss term is 0
             else:
@@ -74,8 +116,24 @@ class FusedStep:
     """
 
     def __init__(
-        self, gaussians: Gaussians, field: CapturedTraining, adam: FusedAdam, weights: LossWeights, camera: Camera
+        self,
+        gaussians: Gaussians,
+        field: CapturedTraining,
+        adam: FusedAdam,
+        weights: LossWeights,
+        camera: Camera,
+        losses: WeightedLosses | None = None,
     ) -> None:
+        """Create the step without capturing it.
+
+        Args:
+            gaussians: parameters.
+            field: training of the deformation field.
+            adam: optimiser of the parameters.
+            weights: weights of the losses of a picture.
+            camera: size and projection model of every observation.
+            losses: losses of rays, `WeightedLosses.can_be_captured`.
+        """
         device = gaussians.device
         self._gaussians, self._field, self._adam = gaussians, field, adam
         self._in_use: tuple[object, object, object] = None, None, None
@@ -83,29 +141,33 @@ class FusedStep:
         """Addresses of all tensors at the time of the capture."""
         self._weights = weights
         self._camera = camera
-        self._inputs = {False: StepInputs(camera, device, with_depth=weights.depth > 0)}
+        self._losses = losses if losses else None
+        self._inputs = {
+            False: StepInputs(camera, device, with_depth=weights.depth > 0, ray_depth=self._losses is not None)
+        }
         """Graph inputs by whether they belong to the right eye. Separate inputs save repeated copies when the eyes
         alternate.
         """
-        self._controls = FrameControls(device, rates=len(GAUSSIAN_TENSORS) + 1 + field.rates + 1)
-        """Controls that include the learning rates of the Gaussians in the backward pass, of
-        positions after it, and of the field, followed by the colour relaxation.
+        self._controls = FrameControls(device, rates=len(GAUSSIAN_TENSORS) + len(GEOMETRY) + field.rates + 1)
+        """Controls that include the learning rates of the Gaussians in the backward pass, of their geometry after it,
+        and of the field, followed by the colour relaxation.
         """
-        self._corrects = False
+        self._kind = StepKind(False, False, False)
+        """Kind of the newest step."""
         self._step = torch.full((1,), adam.steps, dtype=torch.int64, device=device)
         self._skipped = torch.zeros(len(GAUSSIAN_TENSORS), dtype=torch.int64, device=device)
         self._totals = torch.zeros(4, dtype=torch.int32, device=device)
         """Accumulated frame status since the last `settle` (see `accumulate_status_`)."""
-        self._unread: tuple[Tensor, Tensor] | None = None
+        self._unread: dict[str, tuple[Tensor, Tensor]] = {}
+        """Scratch moments of the tensors that are updated after the backward pass."""
         self._status = FrameStatusCopy()
         self._memory = GraphMemory(device)
         self._capacity = capacity_for(4 * gaussians.count)
-        self._captured: dict[tuple[bool, bool], CapturedSequence[Tensor]] = {}
-        """Graphs by whether colours are corrected and whether they train the right eye. The graphs share memory. This
-        is safe because they never run concurrently and no graph reads another one's buffers.
+        self._captured: dict[StepKind, CapturedSequence[Tensor]] = {}
+        """Graphs by kind. The graphs share memory. This is safe because they never run concurrently and no graph reads
+        another one's buffers.
         """
-        self._warm: set[tuple[bool, bool]] = set()
-        self._of_right = False
+        self._warm: set[StepKind] = set()
 
     def __call__(
         self,
@@ -130,17 +192,19 @@ class FusedStep:
         Returns:
             Loss before the update, [] on the device.
         """
-        self._corrects = corrects = colour_relaxation > 0
-        self._of_right = observation.of_right and gaussians.right_sh is not None
-        if self._of_right not in self._inputs:
+        kind = self._kind = StepKind(
+            colour_relaxation > 0,
+            observation.of_right and gaussians.right_sh is not None,
+            self._losses is not None and self._losses.are_rays_due(observation),
+        )
+        if kind.of_right not in self._inputs:
             self._inputs[True] = StepInputs(self._camera, gaussians.device, with_depth=False)
-        self._inputs[self._of_right].take(observation, corrects)
-        rates = [gaussian_rates[name] for name in self._names]
-        in_frame = [0.0, *rates[1:]] if self._field.reads_positions else rates
-        self._controls.set(observation.camera, time, [*in_frame, rates[0], *field_rates, colour_relaxation])
+        self._inputs[kind.of_right].take(observation, kind.corrects)
+        rates, later = [gaussian_rates[name] for name in self._names], len(self._updated_later)
+        in_frame, after = [*[0.0] * later, *rates[later:]], rates[: len(GEOMETRY)]
+        self._controls.set(observation.camera, time, [*in_frame, *after, *field_rates, colour_relaxation])
         self._gaussians = gaussians
         self._adam.steps += 1
-        kind = corrects, self._of_right
         if kind not in self._warm:  # The first launch loads kernels, which is impossible during a capture.
             self._warm.add(kind)
             return self._sequence()
@@ -181,22 +245,27 @@ class FusedStep:
         return self._addresses != before
 
     def _sequence(self) -> Tensor:
-        counts = [len(GAUSSIAN_TENSORS), 1, self._field.rates, 1]
-        in_frame, of_means, of_field, relaxation = self._controls.rates.split(counts)
-        scene, controls = self._gaussians, self._controls
-        right_sh = scene.right_sh if self._of_right else None
+        counts = [len(GAUSSIAN_TENSORS), len(GEOMETRY), self._field.rates, 1]
+        in_frame, of_geometry, of_field, relaxation = self._controls.rates.split(counts)
+        scene, controls, kind = self._gaussians, self._controls, self._kind
+        right_sh = scene.right_sh if kind.of_right else None
         seen = scene if right_sh is None else scene.seen_by_right()
         gaussians = seen.left_tensors
         deltas = self._field.deltas(scene, controls.time)
         camera = self._camera
         view = View(controls.viewmat, controls.intrinsics, camera.width_px, camera.height_px, camera_model=camera.model)
         frame = render_frame(gaussians, deltas, view, self._capacity, FrameMode.TRAINING)
-        inputs = self._inputs[self._of_right]
-        target = inputs.target if self._corrects else None
+        inputs = self._inputs[kind.of_right]
+        target = inputs.target if kind.corrects else None
+        uses_depth = self._weights.depth > 0 and target is None
         loss = frame_loss(
-            frame.image, frame.alphas, inputs.image, inputs.mask, None if target is not None else inputs.depth,
+            frame.image, frame.alphas, inputs.image, inputs.mask, inputs.depth if uses_depth else None,
             self._weights.ssim, self._weights.depth, self._weights.squared,
         )  # fmt: skip
+        value, of_rays = loss.loss, None
+        if kind.compares_rays:
+            of_losses, of_rays = self._compare_rays(scene, deltas, view, inputs, frame.status)
+            value = value + of_losses
         fits = accumulate_status_(frame.status, self._totals, self._step)
         adam = GaussianAdam(
             *self._moments(), in_frame, self._step, self._skipped, betas=self._adam.betas, epsilon=self._adam.epsilon
@@ -213,42 +282,81 @@ class FusedStep:
             right_sh.copy_(seen.sh - scene.sh)  # store Adam's update as the right eye's difference
         if correction is not None or right_sh is not None:
             gradient[:, COLOUR].zero_()
+        if of_rays is not None:
+            # The field receives zeros after an overflow and for values that are not finite.
+            gradient.add_((of_rays * fits).nan_to_num_(0.0, 0.0, 0.0))
         self._field.update(gradient, controls.time, of_field, self._step, frame.status)
         if change is not None:
             if right_sh is not None:
                 right_sh[:, 0].add_(change)
             elif self._field.add_colours is not None:
                 self._field.add_colours(change, controls.time)
-        if self._field.reads_positions:
-            self._move(scene.means, gradient, of_means, fits)
-        return loss.loss
+        self._update_later(scene, gradient, of_geometry, fits)
+        return value
+
+    @property
+    def _updated_later(self) -> tuple[str, ...]:
+        """Names of the tensors that are updated after the backward pass: those whose gradient has a further part, from
+        the field or from losses of rays.
+        """
+        if self._kind.compares_rays:
+            return tuple(GEOMETRY)
+        return ("means",) if self._field.reads_positions else ()
+
+    def _compare_rays(
+        self, scene: Gaussians, deltas: Tensor | None, view: View, inputs: StepInputs, status: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return the losses of rays and their gradient by the raw parameters [N, 16]. Reports an overflow in `status`."""
+        assert self._losses is not None
+        tensors = {name: tensor.detach() for name, tensor in scene.tensors().items() if name in GEOMETRY}
+        if deltas is not None:
+            tensors = {name: tensor + deltas[:, GEOMETRY[name]] for name, tensor in tensors.items()}
+        # In this thread, because a capture belongs to one thread.
+        with torch.enable_grad(), torch.autograd.set_multithreading_enabled(False):
+            leaves = {name: tensor.requires_grad_() for name, tensor in tensors.items()}
+            seen = Gaussians.from_tensors({**leaves, LEFT: scene.sh})
+            rays, needed = compared_rays(seen, view, inputs.mask, inputs.depth, capacity=self._capacity)
+            loss = self._losses.compare(rays)
+            found = torch.autograd.grad(loss, list(leaves.values()), allow_unused=True)
+        assert needed is not None
+        status[STATUS_NEEDED] = torch.maximum(status[STATUS_NEEDED], needed[0].int())
+        status[STATUS_OVERFLOW].bitwise_or_(needed[0] > self._capacity)
+        gradient = scene.means.new_zeros(scene.count, RAW_COLUMNS)
+        for columns, part in zip(GEOMETRY.values(), found, strict=True):
+            if part is not None:
+                gradient[:, columns] = part
+        return loss.detach(), gradient
 
     @property
     def _names(self) -> tuple[str, ...]:
         """Names of the trained tensors in the order of the ops, with the colours of the current eye."""
-        return (*GAUSSIAN_TENSORS[:-1], RIGHT if self._of_right else LEFT)
+        return (*GAUSSIAN_TENSORS[:-1], RIGHT if self._kind.of_right else LEFT)
 
     def _moments(self) -> tuple[list[Tensor], list[Tensor]]:
-        """Return Adam's moments for the backward pass. If the field contributes to the positions'
-        gradient, positions are not updated there: their rate is 0 and scratch moments are passed.
+        """Return Adam's moments for the backward pass. Tensors that are updated later have a rate of 0 there, and
+        scratch moments are passed.
         """
-        first = [self._adam.first_moments[name] for name in self._names]
-        second = [self._adam.second_moments[name] for name in self._names]
-        if self._field.reads_positions:
-            if self._unread is None or self._unread[0].shape != first[0].shape:
-                self._unread = torch.zeros_like(first[0]), torch.zeros_like(second[0])
-            first[0], second[0] = self._unread
-        return first, second
+        moments = {name: (self._adam.first_moments[name], self._adam.second_moments[name]) for name in self._names}
+        for name in self._updated_later:
+            shape = moments[name][0].shape
+            if name not in self._unread or self._unread[name][0].shape != shape:
+                self._unread[name] = torch.zeros_like(moments[name][0]), torch.zeros_like(moments[name][1])
+            moments[name] = self._unread[name]
+        return [first for first, _ in moments.values()], [second for _, second in moments.values()]
 
-    def _move(self, means: Tensor, gradient: Tensor, rate: Tensor, fits: Tensor) -> None:
-        """Apply Adam to the positions with the complete gradient."""
+    def _update_later(self, scene: Gaussians, gradient: Tensor, rates: Tensor, fits: Tensor) -> None:
+        """Apply Adam to the tensors of `_updated_later` with the complete gradient [N, 16]."""
+        if not self._updated_later:
+            return
         # The quotient is NaN if the frame overflowed its tile lists. Adam then skips all rows and their moments.
-        complete = gradient[:, :3] / fits
-        first, second = self._adam.first_moments["means"], self._adam.second_moments["means"]
-        adam_step_at_(
-            means, complete, first, second, rate, self._step, self._skipped[:1], self._adam.betas,
-            self._adam.epsilon, row_size=3,
-        )  # fmt: skip
+        complete, tensors = gradient / fits, scene.tensors()
+        for index, name in enumerate(self._updated_later):
+            tensor = tensors[name]
+            adam_step_at_(
+                tensor, complete[:, GEOMETRY[name]], self._adam.first_moments[name], self._adam.second_moments[name],
+                rates[index : index + 1], self._step, self._skipped[index : index + 1], self._adam.betas,
+                self._adam.epsilon, row_size=tensor.shape[1:].numel(),
+            )  # fmt: skip
 
 
 def _addresses_of(tensors: Sequence[Tensor]) -> tuple[int, ...]:

@@ -145,8 +145,7 @@ def mm_per_px(gaussians: Gaussians, camera: Camera) -> float:
 class TrainingStep:
     """Scene in training: its Gaussians, deformation field and optimiser.
 
-    On a GPU the step is captured as a CUDA graph (`FusedStep`) if the field supports it and no further losses are
-    named. Otherwise the gradient is computed at the deformed Gaussians, and the field's training propagates it to the
+    On a GPU the step is captured as a CUDA graph (`FusedStep`) if the field and all further losses support it. Otherwise the gradient is computed at the deformed Gaussians, and the field's training propagates it to the
     field and the canonical Gaussians.
     """
 
@@ -203,12 +202,15 @@ class TrainingStep:
         """Gradients of the last step in its picture, if the strategy reads them."""
         self._keeps_screen = strategy.screen_gradients
         captures = (
-            gaussians.device.type == "cuda" and not self._losses and self._pictures is None and not self._keeps_screen
+            gaussians.device.type == "cuda"
+            and self._losses.can_be_captured
+            and self._pictures is None
+            and not self._keeps_screen
         )
         if captures and kind.captured_training is not None and frame_deltas is not None:
             training = kind.captured_training(field)
             self._rate_values, self._frame_time = training.rate_values, frame_deltas.frame_time
-            self._captured = FusedStep(self._all_rows, training, self._adam, self._weights, camera)
+            self._captured = FusedStep(self._all_rows, training, self._adam, self._weights, camera, self._losses)
         self._training: FieldTraining = (
             AutogradTraining(field, self._field_rates) if kind.training is None else kind.training(field)
         )

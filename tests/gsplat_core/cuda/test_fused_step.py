@@ -8,6 +8,8 @@ import pytest
 import torch
 
 from gsplat_core import Camera, Gaussians, render
+from gsplat_core.deformation.field import displaced
+from gsplat_core.training.losses.registry import WeightedLosses
 from gsplat_core.training.observations import Observation, RightEye
 from gsplat_core.training.steps.fused_step import FusedStep
 from gsplat_core.training.steps.optimiser import FusedAdam
@@ -110,7 +112,7 @@ def test_steps_that_correct_colours_do_not_look_at_depth_and_others_between_them
         for turn in range(40):
             step(gaussians, one, 0.0, rates, [], 0.0 if turn % 2 else 1.5)
         assert step.settle() == 0
-        assert sorted(step._captured) == [(False, False), (True, False)]
+        assert sorted(step._captured) == [(False, False, False), (True, False, False)]
         depths[with_depth] = float(gaussians.means[:, 2].median())
     assert depths[True] > depths[False] + 0.01
     corrected = []
@@ -246,3 +248,107 @@ def test_other_tensors_are_recorded_anew(make_gaussians, observation, camera):
     for name, tensor in old.tensors().items():
         assert torch.equal(tensor, gaussians.tensors()[name])
     assert not torch.equal(more.means[500:], make_gaussians(300, seed=9).means.cuda())
+
+
+class ConstantDeltas(NoField):
+    """Adds the same deltas at all times and learns nothing."""
+
+    def __init__(self, count):
+        self.added = torch.zeros(count, 16, device="cuda")
+        self.added[:, :10] = 0.05 * torch.randn(count, 10, generator=torch.Generator().manual_seed(2)).cuda()
+
+    def deltas(self, gaussians, time):
+        return self.added
+
+
+@pytest.fixture(params=[(130, 90), (260, 180)], ids=["full size", "half size"])
+def wall_seen(request, make_gaussians) -> Observation:
+    """Picture and depth of opaque flat splats on a slanted plane, with a tool in one corner."""
+    camera = Camera.from_focal(0.7 * request.param[0], *request.param)
+    with torch.no_grad():
+        seen = render(slanted_wall(0.3, 10.0), camera)
+    mask = torch.ones(camera.height_px, camera.width_px, dtype=torch.uint8)
+    mask[:20, :30] = 0
+    image = (seen.image.clamp(0, 1) * 255).round().to(torch.uint8)
+    return Observation(seq=0, time_s=0.0, camera=camera, image=image, mask=mask, depth=seen.depth)
+
+
+def slanted_wall(slope: float, distance: float) -> Gaussians:
+    x, y = torch.meshgrid(torch.arange(-9.0, 9.1, 0.4), torch.arange(-7.0, 7.1, 0.4), indexing="xy")
+    x, y = x.ravel(), y.ravel()
+    random = torch.Generator().manual_seed(5)
+    means = torch.stack([x, y, distance + slope * x], 1)
+    quats = torch.nn.functional.normalize(
+        torch.tensor([1.0, 0, 0, 0]) + 0.1 * torch.randn(len(x), 4, generator=random), dim=1
+    )
+    scales = torch.tensor([0.35, 0.3, 0.05]).log().repeat(len(x), 1)
+    colours = torch.rand(len(x), 1, 3, generator=random) - 0.5
+    return Gaussians(means, quats, scales, torch.full((len(x),), 3.0), colours)
+
+
+@pytest.mark.parametrize("relaxation", [0.0, 1.5])
+def test_losses_of_rays_are_captured_and_learn_as_on_the_cpu(wall_seen, relaxation):
+    """Steps with and without rays by turns, one of them with colour correction, on a deformed scene."""
+    from gsplat_core.training.losses.loss import LossContext
+    from gsplat_core.training.steps.photometric import loss_and_gradients, with_losses
+
+    chosen = {"ray_depth": 2.0, "normal_consistency": 1.0}
+    start, weights = slanted_wall(0.2, 10.5), LossWeights(squared=True)
+    gaussians, field = start.clone().to("cuda"), ConstantDeltas(start.count)
+    step = FusedStep(
+        gaussians, field, FusedAdam(gaussians.tensors()), weights, wall_seen.camera, WeightedLosses(chosen)
+    )
+    losses = [float(step(gaussians, wall_seen, 0.0, RATES, [], relaxation)) for _ in range(13)]
+    assert step.settle() == 0
+    assert sorted(step._captured) == [(relaxation > 0, False, False), (relaxation > 0, False, True)]
+
+    expected, adam, losses_there = start.clone(), FusedAdam(start.tensors()), WeightedLosses(chosen)
+    context, values = LossContext((), lambda _: expected), []
+    for _ in range(13):
+        deformed = displaced(expected, field.added.cpu())
+        compared = loss_and_gradients(deformed, wall_seen, weights, relaxation)
+        compared = with_losses(compared, deformed, lambda scene: losses_there(scene, wall_seen, context))
+        values.append(float(compared.loss))
+        adam.step(expected.tensors(), compared.gradients, RATES)
+    assert losses == pytest.approx(values, rel=5e-3)
+    assert values[4] > 1.5 * values[3], "one of four steps compares rays"
+    for name, tensor in expected.tensors().items():
+        change = (tensor - start.tensors()[name]).norm()
+        assert (gaussians.tensors()[name].cpu() - tensor).norm() <= 0.1 * change + 1e-6, name
+
+
+def test_a_captured_comparison_of_rays_reads_camera_and_depth_of_its_observation(wall_seen):
+    """One graph for two cameras: the loss of each is that of a step captured for it alone."""
+    other_camera = dataclasses.replace(wall_seen.camera, K=wall_seen.camera.K * [[1.1], [1.1], [1.0]])
+    other = dataclasses.replace(wall_seen, camera=other_camera, depth=1.2 * wall_seen.depth)
+    still = dict.fromkeys(RATES, 0.0)
+
+    def ray_losses(observations):
+        gaussians = slanted_wall(0.2, 10.5).to("cuda")
+        losses = WeightedLosses({"ray_depth": 2.0, "normal_consistency": 1.0})
+        step = FusedStep(gaussians, NoField(), FusedAdam(gaussians.tensors()), LossWeights(), wall_seen.camera, losses)
+        return [float(step(gaussians, one, 0.0, still, [])) for one in observations][::4]
+
+    alone = ray_losses([wall_seen] * 9), ray_losses([other] * 9)
+    assert abs(alone[1][0] - alone[0][0]) > 0.1 * alone[0][0]
+    by_turns = ray_losses([wall_seen] * 5 + [other] * 4 + [wall_seen])
+    assert by_turns == pytest.approx([alone[0][0], alone[0][0], alone[1][0]], rel=1e-5)
+
+
+def test_rays_without_room_change_nothing_and_the_next_ones_have_room(make_gaussians, observation):
+    scene = make_gaussians(4000)
+    gaussians = dataclasses.replace(scene, log_scales=torch.full_like(scene.log_scales, 2.3)).to("cuda")
+    before, adam = gaussians.clone(), FusedAdam(gaussians.tensors())
+    losses = WeightedLosses({"ray_depth": 2.0, "normal_consistency": 1.0})
+    step = FusedStep(gaussians, NoField(), adam, LossWeights(), observation.camera, losses)
+    step(gaussians, observation, 0.0, RATES, [])
+    assert step.settle() == 1
+    assert adam.steps == 0
+    for name, tensor in gaussians.tensors().items():
+        assert torch.equal(tensor, before.tensors()[name])
+        assert not adam.first_moments[name].any()
+    for _ in range(8):
+        step(gaussians, observation, 0.0, RATES, [])
+    assert step.settle() == 0
+    for name, tensor in gaussians.tensors().items():
+        assert tensor.isfinite().all() and not torch.equal(tensor, before.tensors()[name])

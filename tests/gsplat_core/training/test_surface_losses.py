@@ -7,10 +7,12 @@ import pytest
 import torch
 
 from gsplat_core import Camera, Gaussians
+from gsplat_core.rendering.surface import view_of
 from gsplat_core.training.losses.loss import LossContext
 from gsplat_core.training.losses.normal_consistency import NormalConsistency
 from gsplat_core.training.losses.ray_depth import RayDepth
-from gsplat_core.training.losses.rendered_rays import EVERY, rays_of
+from gsplat_core.training.losses.registry import WeightedLosses
+from gsplat_core.training.losses.rendered_rays import EVERY, compared_rays, rays_of
 from gsplat_core.training.observations import Observation
 
 SMALL, LARGE = (90, 74), (256, 200)
@@ -35,27 +37,27 @@ def observation(size, tilt_deg=0.0, distance=40.0) -> Observation:
     return Observation(0, 0.0, camera, image, torch.ones(size[1], size[0], dtype=torch.uint8), depth)
 
 
-def context(scene: Gaussians) -> LossContext:
-    return LossContext((), lambda _: scene)
+def compared(kind, scene: Gaussians, seen: Observation) -> torch.Tensor:
+    return kind().compare(rays_of(scene, seen))
 
 
 @pytest.mark.parametrize("size", [SMALL, LARGE])
 @pytest.mark.parametrize("tilt_deg", [0.0, 30.0])
 def test_an_exact_wall_has_no_loss(size, tilt_deg):
     scene = wall(tilt_deg)
-    assert float(RayDepth()(scene, observation(size, tilt_deg), context(scene))) < 5e-4 * EVERY
-    assert float(NormalConsistency()(scene, observation(size, tilt_deg), context(scene))) < 2e-3 * EVERY
+    assert float(compared(RayDepth, scene, observation(size, tilt_deg))) < 5e-4
+    assert float(compared(NormalConsistency, scene, observation(size, tilt_deg))) < 2e-3
 
 
 def test_a_displaced_wall_has_the_relative_difference_and_is_moved_back():
     scene = wall(0.0, 44.0).requires_grad_()
-    loss = RayDepth()(scene, observation(SMALL), context(scene))
+    loss = compared(RayDepth, scene, observation(SMALL))
     loss.backward()
     loss = loss.detach()
-    assert float(loss) == pytest.approx(EVERY * (1 - 40 / 44), rel=1e-3)
-    moved = replace(scene.detach(), means=scene.means.detach() - 25 * scene.means.grad)
+    assert float(loss) == pytest.approx(1 - 40 / 44, rel=1e-3)
+    moved = replace(scene.detach(), means=scene.means.detach() - 100 * scene.means.grad)
     assert float(scene.means.grad[:, 2].sum()) > 0
-    assert float(RayDepth()(moved, observation(SMALL), context(moved))) < float(loss)
+    assert float(compared(RayDepth, moved, observation(SMALL))) < float(loss)
 
 
 def test_turned_splats_are_turned_back():
@@ -65,12 +67,12 @@ def test_turned_splats_are_turned_back():
     before = None
     for _ in range(30):
         scene = scene.detach().requires_grad_()
-        loss = NormalConsistency()(scene, observation(SMALL), context(scene))
+        loss = compared(NormalConsistency, scene, observation(SMALL))
         loss.backward()
         loss = loss.detach()
         before = float(loss) if before is None else before
         scene = replace(scene, quats=scene.quats - 3e-3 * scene.quats.grad.sign())
-    assert before == pytest.approx(EVERY * (1 - math.cos(0.4)), rel=0.3)
+    assert before == pytest.approx(1 - math.cos(0.4), rel=0.3)
     assert float(loss) < 0.4 * before
 
 
@@ -78,29 +80,52 @@ def test_tools_and_unknown_depth_are_not_compared():
     scene = wall(0.0, 44.0)
     seen = observation(SMALL)
     masked = replace(seen, mask=torch.zeros_like(seen.mask))
-    assert float(RayDepth()(scene, masked, context(scene))) == 0
-    assert float(NormalConsistency()(wall(30.0), masked, context(scene))) == 0
-    assert float(RayDepth()(scene, replace(seen, depth=torch.zeros_like(seen.depth)), context(scene))) == 0
-    assert RayDepth()(scene, replace(seen, depth=None), context(scene)) is None
+    assert float(compared(RayDepth, scene, masked)) == 0
+    assert float(compared(NormalConsistency, wall(30.0), masked)) == 0
+    assert float(compared(RayDepth, scene, replace(seen, depth=torch.zeros_like(seen.depth)))) == 0
 
 
-def test_losses_of_one_step_render_once(monkeypatch):
-    scene, shared = wall(0.0), context(wall(0.0))
-    first = rays_of(scene, observation(SMALL), shared)
-    assert rays_of(scene, observation(SMALL), shared) is first
+def test_without_depth_only_losses_that_need_none_are_compared():
+    scene, seen = wall(30.0), replace(observation(SMALL), depth=None)
+    context = LossContext((), lambda _: scene)
+    assert WeightedLosses({"ray_depth": 1.0})(scene, seen, context) is None
+    both = WeightedLosses({"ray_depth": 1.0, "normal_consistency": 0.5})(scene, seen, context)
+    torch.testing.assert_close(both, EVERY * 0.5 * compared(NormalConsistency, scene, seen))
+
+
+def test_one_of_a_few_steps_compares_rays_and_counts_for_all():
+    losses, scene, seen = WeightedLosses({"ray_depth": 2.0}), wall(0.0, 44.0), observation(SMALL)
+    values = [losses(scene, seen, LossContext((), lambda _: scene)) for _ in range(2 * EVERY)]
+    assert [value is not None for value in values] == 2 * [True, *[False] * (EVERY - 1)]
+    assert float(values[0]) == pytest.approx(EVERY * 2 * (1 - 40 / 44), rel=1e-3)
+
+
+@pytest.mark.parametrize("size", [SMALL, LARGE])
+def test_lists_of_a_fixed_length_give_the_same_rays_and_gradients(size):
+    """Tile lists of a captured step: equal values, and the required length."""
+    seen = observation(size, 30.0)
+    results = []
+    for capacity in (None, 1 << 15):
+        scene = wall(20.0, 41.0).requires_grad_()
+        view = view_of(seen.camera, scene.device)
+        rays, needed = compared_rays(scene, view, seen.mask, seen.depth, capacity=capacity)
+        losses = WeightedLosses({"ray_depth": 2.0, "normal_consistency": 1.0})
+        loss = losses.compare(rays)
+        loss.backward()
+        assert (needed is None) == (capacity is None)
+        results.append([loss.detach(), scene.means.grad, scene.quats.grad, scene.log_scales.grad])
+    assert 0 < int(needed) < 1 << 15
+    for exact, fixed in zip(*results, strict=True):
+        assert torch.equal(exact, fixed)
+        assert exact.abs().sum() > 0
+    *_, needed_again = compared_rays(wall(20.0, 41.0), view, seen.mask, seen.depth, capacity=100)
+    assert torch.equal(needed_again, needed)
 
 
 def test_large_pictures_are_compared_at_half_size():
     seen = observation(LARGE, 30.0)
-    rays = rays_of(wall(30.0), seen, context(wall(30.0)))
+    rays = rays_of(wall(30.0), seen)
     assert rays.alphas.shape == (LARGE[1] // 2, LARGE[0] // 2)
     inner = (slice(20, -20), slice(20, -20))
     off = (rays.depths / rays.sampled(seen.depth) - 1).abs()[inner]
     assert float(off.max()) < 1e-3
-
-
-@pytest.mark.parametrize("kind", [RayDepth, NormalConsistency])
-def test_one_of_a_few_steps_is_evaluated(kind):
-    loss, scene = kind(), wall(0.0)
-    values = [loss(scene, observation(SMALL), context(scene)) for _ in range(2 * EVERY)]
-    assert [value is not None for value in values] == 2 * [True, *[False] * (EVERY - 1)]
