@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import torch
@@ -35,10 +35,12 @@ from gsplat_core.rendering.settings import (
     SparseGradients,
     check_tensors,
     refuse_unsupported,
+    signature_of,
 )
 
 if TYPE_CHECKING:
     from gsplat_core.ops.rasterization.rasterization import Rasterized
+    from gsplat_core.rendering.single_call import SingleCall
 
 
 @dataclass(frozen=True)
@@ -370,12 +372,26 @@ Meta = dict[str, Any]
 """Intermediate results under gsplat's names."""
 
 
+MOST_CHECKED_CALLS = 256
+"""Number of signatures whose checks are remembered. While Gaussians are added or removed, their number changes."""
+
+
+class CheckedCall(NamedTuple):
+    """Result of the checks of a call."""
+
+    settings: RenderSettings
+    native: SingleCall | None
+    """Native call for the whole pipeline; None to render step by step."""
+
+
 @dataclass(frozen=True)
 class Operations(StepOperations):
     """`rasterization` on top of one implementation of the pipeline's operations."""
 
-    in_one_call: Callable[[Arguments, RenderSettings], Rasterized | None] | None = None
-    """Function that renders in one native call. It returns None for unsupported arguments."""
+    single_call: Callable[[Arguments, RenderSettings], SingleCall | None] | None = None
+    """Function that returns a native call for the whole pipeline, or None for unsupported arguments."""
+    checked: dict[Hashable, CheckedCall] = field(init=False, default_factory=dict, compare=False, repr=False)
+    """Calls that passed the checks, by `signature_of`."""
 
     def rasterization(
         self,
@@ -491,37 +507,48 @@ class Operations(StepOperations):
             InvalidInput: if a shape, dtype, device or mode does not fit; the message states the observed value.
             NotImplementedError: if an argument of gsplat is not supported; the message states its value.
         """
-        asked_for = (rays, lidar_coeffs, external_distortion_coeffs)
-        if any(value is not None and value is not False for value in asked_for):
-            refuse_unsupported(
-                rays=rays, lidar_coeffs=lidar_coeffs,
-                external_distortion_coeffs=external_distortion_coeffs,
-            )  # fmt: skip
-        settings = RenderSettings(
-            width=width, height=height, near_plane=near_plane, far_plane=far_plane, radius_clip=radius_clip, eps2d=eps2d,
-            sh_degree=sh_degree, packed=packed, tile_size=TILE_SIZE if tile_size is None else tile_size,
-            render_mode=render_mode, absgrad=absgrad, rasterize_mode=rasterize_mode, camera_model=camera_model,
-            constants=constants, global_z_order=bool(global_z_order), extra_degree=extra_signals_sh_degree,
-            normals=bool(return_normals), sparse_grad=sparse_grad, distributed=bool(distributed),
-        )  # fmt: skip
         arguments = Arguments(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars, extra_signals)
-        check_tensors(arguments, settings.has_colors)
-        ops = self
         unscented = (with_ut, with_eval3d, ut_params, radial_coeffs, tangential_coeffs, thin_prism_coeffs, ftheta_coeffs,
                      rolling_shutter, viewmats_rs)  # fmt: skip
-        if any(value is not None and value is not False for value in unscented):
-            from gsplat_core.rendering.unscented import UnscentedCamera, with_unscented_camera
+        options = (
+            width, height, near_plane, far_plane, radius_clip, eps2d, sh_degree, packed, tile_size, render_mode, sparse_grad,
+            absgrad, rasterize_mode, distributed, camera_model, return_normals, global_z_order, extra_signals_sh_degree,
+            constants, rays, lidar_coeffs, external_distortion_coeffs, *unscented,
+        )  # fmt: skip
+        ops = self
+        signature = signature_of(arguments, options)
+        call = None if signature is None else self.checked.get(signature)
+        if call is None:
+            refuse_unsupported(
+                rays=rays, lidar_coeffs=lidar_coeffs, external_distortion_coeffs=external_distortion_coeffs
+            )
+            settings = RenderSettings(
+                width=width, height=height, near_plane=near_plane, far_plane=far_plane, radius_clip=radius_clip, eps2d=eps2d,
+                sh_degree=sh_degree, packed=packed, tile_size=TILE_SIZE if tile_size is None else tile_size,
+                render_mode=render_mode, absgrad=absgrad, rasterize_mode=rasterize_mode, camera_model=camera_model,
+                constants=constants, global_z_order=bool(global_z_order), extra_degree=extra_signals_sh_degree,
+                normals=bool(return_normals), sparse_grad=sparse_grad, distributed=bool(distributed),
+            )  # fmt: skip
+            check_tensors(arguments, settings.has_colors)
+            if any(value is not None and value is not False for value in unscented):
+                from gsplat_core.rendering.unscented import UnscentedCamera, with_unscented_camera
 
-            camera = UnscentedCamera(*unscented)
-            if camera.given and distributed:
-                raise NotImplementedError(
-                    "distributed=True is not supported with with_ut and with_eval3d; leave one of them out"
-                )
-            if camera.given:
-                ops, arguments, settings = with_unscented_camera(self, camera, arguments, settings)
-        rendered = None if ops.in_one_call is None else ops.in_one_call(arguments, settings)
-        if rendered is not None:
-            return _named_as_in_gsplat(rendered, arguments, settings)
+                camera = UnscentedCamera(*unscented)
+                if camera.given and distributed:
+                    raise NotImplementedError(
+                        "distributed=True is not supported with with_ut and with_eval3d; leave one of them out"
+                    )
+                if camera.given:
+                    ops, arguments, settings = with_unscented_camera(self, camera, arguments, settings)
+                    signature = None
+            call = CheckedCall(settings, None if ops.single_call is None else ops.single_call(arguments, settings))
+            if signature is not None:
+                if len(self.checked) >= MOST_CHECKED_CALLS:
+                    self.checked.clear()
+                self.checked[signature] = call
+        settings = call.settings
+        if call.native is not None:
+            return _named_as_in_gsplat(call.native(arguments), arguments, settings)
         image, splats, extra, normals = _step_by_step(ops, arguments, settings)
         ids = splats.rows[:3] if isinstance(splats.rows, PackedProjection) else (None, None, None)
         keys = isect_ids_of(splats.flatten_ids, splats.isect_offsets, splats.nearness, math.prod(settings.tile_grid))
@@ -533,8 +560,9 @@ class Operations(StepOperations):
 
     def pictures(self, arguments: Arguments, settings: RenderSettings) -> tuple[Tensor, Tensor]:
         """Return colours and alphas as `rasterization`, without values that only `meta` needs."""
-        rendered = None if self.in_one_call is None else self.in_one_call(arguments, settings)
-        if rendered is not None:
+        native = None if self.single_call is None else self.single_call(arguments, settings)
+        if native is not None:
+            rendered = native(arguments)
             return rendered.image, rendered.alphas
         image, splats, *_ = _step_by_step(self, arguments, settings)
         return image, splats.alphas
@@ -543,7 +571,7 @@ class Operations(StepOperations):
 def _named_as_in_gsplat(out: Rasterized, arguments: Arguments, settings: RenderSettings) -> tuple[Tensor, Tensor, Meta]:
     opacities, dims = out.opacities, arguments.viewmats.shape[:-2]
     if not settings.packed and settings.rasterize_mode == "classic":
-        opacities = arguments.opacities[..., None, :]
+        opacities = arguments.opacities.unsqueeze(-2)
         if dims[-1] != 1:
             opacities = opacities.expand(*dims, -1)
     meta = _meta(out, out, (out.batch_ids, out.camera_ids, out.gaussian_ids), opacities, out.isect_ids, settings, dims)

@@ -21,7 +21,7 @@ from gsplat_core.ops.spherical_harmonics.spherical_harmonics import spherical_ha
 from gsplat_core.ops.tiles.tiles import bin_splats
 from gsplat_core.rendering.pipeline import Operations
 from gsplat_core.rendering.settings import Arguments, RenderSettings
-from gsplat_core.rendering.single_call import rasterize_in_one_call
+from gsplat_core.rendering.single_call import single_call
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.transfers import HostCopy
@@ -54,7 +54,7 @@ step_by_step = Operations(
     zero_gradients_stay_zero=True,
 )
 """Rendering pipeline as a chain of separate compiled operations, on any supported device."""
-_operations = replace(step_by_step, in_one_call=rasterize_in_one_call)
+_operations = replace(step_by_step, single_call=single_call)
 _PARAMETERS = inspect.signature(_operations.rasterization).parameters
 _POSITIONAL = [name for name, each in _PARAMETERS.items() if each.kind is each.POSITIONAL_OR_KEYWORD]
 _REQUIRED = [name for name in _POSITIONAL if _PARAMETERS[name].default is inspect.Parameter.empty]
@@ -64,32 +64,31 @@ _REQUIRED = [name for name in _POSITIONAL if _PARAMETERS[name].default is inspec
 def rasterization(*arguments: Any, **options: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:
     # Signature and docstring are copied from `Operations.rasterization`. Calling that method
     # directly would put its name into argument errors.
-    unknown = options.keys() - _PARAMETERS.keys()
-    if (
-        unknown
-        or len(arguments) > len(_POSITIONAL)
-        or len(arguments) < len(_REQUIRED)
-        or options.keys() & set(_POSITIONAL[: len(arguments)])
-    ):
-        _check_names(len(arguments), options.keys())
-    return _operations.rasterization(*arguments, **options)
+    try:
+        return _operations.rasterization(*arguments, **options)
+    except TypeError:
+        wrong = _wrong_names(len(arguments), options.keys())
+        if wrong is None:
+            raise
+    raise TypeError(wrong)
 
 
-def _check_names(positional: int, named: Collection[str]) -> None:
-    """Raise TypeError for arguments of `rasterization` that are unknown, too many, given twice or missing."""
+def _wrong_names(positional: int, named: Collection[str]) -> str | None:
+    """Return a sentence about arguments of `rasterization` that are unknown, too many, given twice or missing."""
     for name in named:
         if name not in _PARAMETERS:
             close = difflib.get_close_matches(name, _PARAMETERS, n=3, cutoff=0.5)
             advice = f"did you mean {' or '.join(close)}?" if close else f"it takes {', '.join(_PARAMETERS)}"
-            raise TypeError(f"rasterization() has no argument {name!r}; {advice}")
+            return f"rasterization() has no argument {name!r}; {advice}"
     if positional > len(_POSITIONAL):
-        raise TypeError(f"rasterization() takes at most {len(_POSITIONAL)} arguments by position, got {positional}")
+        return f"rasterization() takes at most {len(_POSITIONAL)} arguments by position, got {positional}"
     twice = [name for name in _POSITIONAL[:positional] if name in named]
     if twice:
-        raise TypeError(f"rasterization() got {', '.join(twice)} by position and by name; give it once")
+        return f"rasterization() got {', '.join(twice)} by position and by name; give it once"
     missing = [name for name in _REQUIRED[positional:] if name not in named]
     if missing:
-        raise TypeError(f"rasterization() needs {', '.join(missing)}; {', '.join(_REQUIRED)} are required")
+        return f"rasterization() needs {', '.join(missing)}; {', '.join(_REQUIRED)} are required"
+    return None
 
 
 INSTANCES_PER_GAUSSIAN = 8

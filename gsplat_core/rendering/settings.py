@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor
+from torch.nn import Parameter
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.gaussians import MAX_SH_DEGREE
@@ -182,6 +184,38 @@ def check_tensors(arguments: Arguments, has_colors: bool = True) -> None:
     if len(set(devices.values())) > 1:
         found = ", ".join(f"{name}: {device}" for name, device in devices.items())
         raise InvalidInput(f"all tensors must be on one device, got {found}")
+
+
+_PLAIN_OPTIONS = {int, float, bool, str, type(None)}
+PLAIN_TENSORS = {Tensor, Parameter, type(None)}
+"""Types of tensor arguments that may be checked once for many calls; subclasses may behave in any way."""
+
+
+def signature_of(arguments: Arguments, options: tuple[Any, ...]) -> Hashable | None:
+    """Return a key of everything in a call that the checks of arguments depend on, or None for an unusual call.
+
+    Calls with equal keys pass or fail the same checks, because no check reads the values of a tensor. The key holds no
+    tensor. A call is unusual if an argument has another type than the usual ones, or inside a transform of torch.
+
+    Args:
+        arguments: tensors of the call, not yet checked.
+        options: all other arguments.
+    """
+    if is_transformed():  # first, because a compiler cannot follow the rest
+        return None
+    types = tuple(map(type, options))
+    if not _PLAIN_OPTIONS.issuperset(types) or not PLAIN_TENSORS.issuperset(map(type, arguments)):
+        return None
+    kinds = [None if t is None else (t.shape, t.dtype, t.device, t.layout, t.requires_grad) for t in arguments]
+    # The types are part of the key, because True == 1 == 1.0.
+    return options, types, tuple(kinds), torch.is_grad_enabled()
+
+
+def is_transformed() -> bool:
+    """Return True inside a compiler, a functorch transform or a dispatch mode of torch."""
+    if torch.compiler.is_compiling():
+        return True
+    return torch._C._are_functorch_transforms_active() or torch._C._len_torch_dispatch_stack() > 0
 
 
 def _shown(value: object) -> str:

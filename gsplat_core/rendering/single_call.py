@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.nn import Parameter
 
 from gsplat_core.ops.native import CUDA_MISSING
 from gsplat_core.ops.rasterization.rasterization import (
@@ -23,29 +22,64 @@ from gsplat_core.ops.rasterization.rasterization import (
 )
 from gsplat_core.ops.rasterization.rasterization import TILE_SIZE as NATIVE_TILE_SIZE
 from gsplat_core.rendering.pipeline import camera_centers
-from gsplat_core.rendering.settings import Arguments, RenderSettings
+from gsplat_core.rendering.settings import PLAIN_TENSORS, Arguments, RenderSettings, is_transformed
 from gsplat_core.scene.cameras import CAMERA_MODELS
 
 NATIVE_CONSTANTS = "1.6"
 """gsplat version whose constants are compiled into the native call."""
 MOST_PACKED_PAIRS = 1 << 23
 """Pairs of camera and Gaussian up to which packed pictures are rendered in the native call, whose scratch memory is dense."""
-_PLAIN_TENSORS = (Tensor, Parameter)
 _DEPTH_MODES = {"RGB": NO_DEPTH, "D": DEPTH_SUM, "ED": EXPECTED_DEPTH, "RGB+D": DEPTH_SUM, "RGB+ED": EXPECTED_DEPTH}
 
 
-def rasterize_in_one_call(arguments: Arguments, settings: RenderSettings) -> Rasterized | None:
-    """Render with the native call; one host synchronisation, for the length of the tile lists.
+class SingleCall:
+    """Native call for arguments of one kind: its options, computed once for all calls with the same signature."""
 
-    Returns:
-        Result equal to that of the chain of operations, or None for unsupported or invalid arguments.
-            The chain then renders them or raises the error.
+    def __init__(self, arguments: Arguments, settings: RenderSettings) -> None:
+        assert arguments.colors is not None
+        viewmats, has_colors = arguments.viewmats, settings.has_colors
+        self._differentiable = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in arguments)
+        degree = settings.sh_degree if has_colors and settings.sh_degree is not None else PLAIN_COLORS
+        self._has_colors = has_colors
+        self._has_centers = degree != PLAIN_COLORS and self._differentiable and viewmats.requires_grad
+        options = Options(
+            width=settings.width,
+            height=settings.height,
+            camera_model=CAMERA_MODELS.index(settings.camera_model),
+            degree=degree,
+            channels=arguments.colors.shape[-1] if has_colors else 0,
+            depth_mode=_DEPTH_MODES[settings.render_mode],
+            antialiased=settings.rasterize_mode == "antialiased",
+            packed=settings.packed,
+            absgrad=settings.absgrad,
+        )
+        ranges = Ranges(settings.eps2d, settings.near_plane, settings.far_plane, settings.radius_clip)
+        self._view = View(tuple(viewmats.shape[:-2]), options, ranges)
+
+    def __call__(self, arguments: Arguments) -> Rasterized:
+        """Render; one host synchronisation, for the length of the tile lists."""
+        means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars, _ = arguments
+        triangles = None
+        if covars is not None:
+            triangles = torch.stack([covars[..., i, j] for i in range(3) for j in range(i, 3)], -1)
+            quats = scales = None
+        if not self._has_colors:
+            colors = backgrounds = None
+        centers = camera_centers(viewmats) if self._has_centers else None
+        inputs = Inputs(means, triangles, quats, scales, opacities, colors, viewmats, Ks, centers, backgrounds)
+        return rasterize(inputs, self._view, self._differentiable)
+
+
+def single_call(arguments: Arguments, settings: RenderSettings) -> SingleCall | None:
+    """Return the native call, whose result is equal to that of the chain of operations.
+
+    None for unsupported or invalid arguments. The chain then renders them or raises the error.
     """
-    return _rasterize(arguments, settings) if _takes(arguments, settings) else None
+    return SingleCall(arguments, settings) if _takes(arguments, settings) else None
 
 
 def _takes(arguments: Arguments, settings: RenderSettings) -> bool:
-    if CUDA_MISSING is not None or settings.tile_size != NATIVE_TILE_SIZE or torch.compiler.is_compiling():
+    if CUDA_MISSING is not None or settings.tile_size != NATIVE_TILE_SIZE or is_transformed():
         return False
     if settings.has_distance or settings.normals or not settings.global_z_order:
         return False
@@ -84,16 +118,16 @@ def _takes(arguments: Arguments, settings: RenderSettings) -> bool:
 
 
 def _are_plain_cuda_floats(arguments: Arguments) -> bool:
-    """Return True if all tensors are plain float32 on one CUDA device, outside torch transforms."""
+    """Return True if all tensors are plain float32 on one CUDA device."""
     device = arguments.means.device
     if device.type != "cuda":
         return False
     for tensor in arguments:
         if tensor is None:
             continue
-        if type(tensor) not in _PLAIN_TENSORS or tensor.dtype is not torch.float32 or tensor.device != device:
+        if type(tensor) not in PLAIN_TENSORS or tensor.dtype is not torch.float32 or tensor.device != device:
             return False
-    return not torch._C._are_functorch_transforms_active() and not torch._C._len_torch_dispatch_stack()
+    return True
 
 
 def _has_fitting_colors(
@@ -104,33 +138,3 @@ def _has_fitting_colors(
     if colors.dim() < 3 or colors.shape[-1] != 3 or colors.shape[-2] < (settings.sh_degree + 1) ** 2:
         return False
     return colors.shape[:-2] in (shared, per_camera)
-
-
-def _rasterize(arguments: Arguments, settings: RenderSettings) -> Rasterized:
-    means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars, _ = arguments
-    assert colors is not None
-    differentiable = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in arguments)
-    triangles = centers = None
-    if covars is not None:
-        triangles = torch.stack([covars[..., i, j] for i in range(3) for j in range(i, 3)], -1)
-        quats = scales = None
-    if not settings.has_colors:
-        backgrounds = None
-    harmonics = settings.has_colors and settings.sh_degree is not None
-    if harmonics and differentiable and viewmats.requires_grad:
-        centers = camera_centers(viewmats)
-    options = Options(
-        width=settings.width,
-        height=settings.height,
-        camera_model=CAMERA_MODELS.index(settings.camera_model),
-        degree=settings.sh_degree if harmonics and settings.sh_degree is not None else PLAIN_COLORS,
-        channels=colors.shape[-1] if settings.has_colors else 0,
-        depth_mode=_DEPTH_MODES[settings.render_mode],
-        antialiased=settings.rasterize_mode == "antialiased",
-        packed=settings.packed,
-        absgrad=settings.absgrad,
-    )
-    ranges = Ranges(settings.eps2d, settings.near_plane, settings.far_plane, settings.radius_clip)
-    shown = colors if settings.has_colors else None
-    inputs = Inputs(means, triangles, quats, scales, opacities, shown, viewmats, Ks, centers, backgrounds)
-    return rasterize(inputs, View(tuple(viewmats.shape[:-2]), options, ranges), differentiable)

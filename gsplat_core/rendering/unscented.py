@@ -127,7 +127,7 @@ def with_unscented_camera(
         # their tiles.
         return ops.bin_splats(*arguments, **options)
 
-    changes: dict[str, Any] = {"in_one_call": None}
+    changes: dict[str, Any] = {"single_call": None}
     if camera.with_ut:
         changes["fully_fused_projection"] = project
     if camera.with_eval3d:

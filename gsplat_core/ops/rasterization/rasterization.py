@@ -6,6 +6,8 @@ Follows Kerbl et al. 2023. Two autograd nodes expose the intermediate `means2d`:
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
@@ -157,17 +159,24 @@ def rasterize(inputs: Inputs, view: View, differentiable: bool) -> Rasterized:
     The host synchronises once, for the length of the tile lists. Equal inputs give bit-identical
     results, forward and backward.
     """
+    returned = 14 if view.options.packed else 11
     if not differentiable:
-        return _named(_FORWARD(inputs, *view, False), view)
+        return Rasterized(*_FORWARD(inputs, *view, False)[:returned])
     call = _Call(view)
     means2d, depths, conics, opacities, records = _Project.apply(call, *inputs)
     image, alphas = _Blend.apply(call, means2d, records, inputs.backgrounds)
-    out = _named(call.outputs, view)
-    return out._replace(image=image, alphas=alphas, means2d=means2d, depths=depths, conics=conics, opacities=opacities)
+    return Rasterized(image, alphas, means2d, depths, conics, opacities, *call.outputs[6:returned])
 
 
-def _named(outputs: list[Tensor], view: View) -> Rasterized:
-    return Rasterized(*outputs[: 14 if view.options.packed else 11])
+def _differentiable_once(backward: Callable[..., Any]) -> Callable[..., Any]:
+    """Return `once_differentiable(backward)` that calls `backward` directly if no second derivative is requested."""
+    guarded = once_differentiable(backward)
+
+    @functools.wraps(backward)
+    def called(ctx: Any, *v: Tensor | None) -> Any:
+        return guarded(ctx, *v) if torch.is_grad_enabled() else backward(ctx, *v)
+
+    return called
 
 
 class _Project(Function):
@@ -182,7 +191,7 @@ class _Project(Function):
         return out[2], out[3], out[4], out[5], own[0]
 
     @staticmethod
-    @once_differentiable
+    @_differentiable_once
     def backward(ctx: Any, *v: Tensor | None) -> tuple[Tensor | None, ...]:
         v_means2d, v_depths, v_conics, v_opacities, v_records = v
         *inputs, radii, row_of = ctx.saved_tensors
@@ -212,7 +221,7 @@ class _Blend(Function):
         return out[0], out[1]
 
     @staticmethod
-    @once_differentiable
+    @_differentiable_once
     def backward(ctx: Any, v_image: Tensor | None, v_alphas: Tensor | None) -> tuple[Tensor | None, ...]:
         *tensors, means2d = ctx.saved_tensors
         saved = Saved(*tensors)
