@@ -294,6 +294,13 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "image_loss(Tensor image, Tensor target, Tensor? mask, Tensor? depth, Tensor? target_depth, float ssim_weight, "
       "float depth_weight, bool squared=False) -> (Tensor, Tensor, Tensor, Tensor)");
 
+  // Losses of the surface along rays over tissue, with their gradients: (loss, dL/ddepths) and (loss, dL/ddepths, dL/dalphas,
+  // dL/dnormals).
+  m.def("ray_depth_loss(Tensor depths, Tensor known, Tensor tissue) -> (Tensor, Tensor)");
+  m.def(
+      "ray_normal_loss(Tensor depths, Tensor alphas, Tensor normals, Tensor tissue, Tensor K, int camera_model) -> (Tensor, "
+      "Tensor, Tensor, Tensor)");
+
   // Loss over tissue pixels and its gradients for the frame path: image [H, W, 4] with colours and the weighted sum of
   // z, alphas [H, W]. Returns (loss, terms, dL/dimage, dL/dalphas).
   m.def(

@@ -27,6 +27,7 @@ from gsplat_core.reference.points import point_moments
 from gsplat_core.reference.projection import fully_fused_projection
 from gsplat_core.reference.range_histogram import range_histogram
 from gsplat_core.reference.ray_blending import blend_rays, splat_rays
+from gsplat_core.reference.ray_losses import ray_depth_loss, ray_normal_loss
 from gsplat_core.reference.rendering import rasterization
 from gsplat_core.reference.spherical_harmonics import spherical_harmonics
 from gsplat_core.reference.splat_regression import splat_regression, splat_regression_gradients
@@ -66,6 +67,8 @@ __all__ = [
     "rasterization",
     "rasterize_to_pixels",
     "rasterize_to_pixels_2dgs",
+    "ray_depth_loss",
+    "ray_normal_loss",
     "render_frame",
     "sample_moments",
     "smooth_within_edges",

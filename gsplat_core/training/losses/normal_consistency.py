@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-import torch
 from torch import Tensor
 
-from gsplat_core.rendering.surface import normals_of_depth
+from gsplat_core.ops.ray_losses.ray_losses import ray_normal_loss
 from gsplat_core.training.losses.rendered_rays import RenderedRays
 
 
@@ -23,8 +22,5 @@ class NormalConsistency:
 
     def compare(self, rays: RenderedRays) -> Tensor:
         """Return the mean difference of both kinds of normals over the observation's tissue."""
-        normals = normals_of_depth(rays.depths, rays.view.K, rays.view.camera_model)
-        with torch.no_grad():
-            known = rays.tissue & (normals.abs().sum(-1) > 0)
-        off = rays.alphas - (rays.normals * normals).sum(-1)
-        return torch.where(known, off, 0).sum() / known.sum().clamp(min=1)
+        view = rays.view
+        return ray_normal_loss(rays.depths, rays.alphas, rays.normals, rays.tissue, view.K, view.camera_model)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-import torch
 from torch import Tensor
 
+from gsplat_core.ops.ray_losses.ray_losses import ray_depth_loss
 from gsplat_core.training.losses.rendered_rays import RenderedRays
 
 
@@ -24,10 +24,5 @@ class RayDepth:
 
     def compare(self, rays: RenderedRays) -> Tensor:
         """Return the mean difference of inverse ray depths, relative to the mean inverse depth of the observation."""
-        wanted = rays.known_depth
-        assert wanted is not None
-        known = rays.tissue & (wanted > 0) & (rays.depths > 0)
-        one = torch.ones((), device=wanted.device)
-        inverse = torch.where(known, 1 / torch.where(known, wanted, one), 0)
-        off = torch.where(known, 1 / torch.where(known, rays.depths, one), 0) - inverse
-        return off.abs().sum() / inverse.sum().clamp(min=1e-12)
+        assert rays.known_depth is not None
+        return ray_depth_loss(rays.depths, rays.known_depth, rays.tissue)

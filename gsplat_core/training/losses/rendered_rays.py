@@ -84,7 +84,8 @@ def compared_rays(
     rays, needed = blend_view_rays(scene, view, values, capacity)
     tissue = (rays.alphas >= COVERED) & (_sampled(mask, view, stride) != 0)
     known = None if depth is None else _sampled(depth, view, stride)
-    normals, further = rays.values[..., :3], rays.values[..., 3:]
+    normals = rays.values if values is None else rays.values[..., :3]
+    further = rays.values[..., 3:]
     return RenderedRays(view, stride, rays.alphas, rays.depths, normals, further, tissue, known), needed
 
 
