@@ -24,6 +24,7 @@ from gpu_timing import Times, compare, extra_mib, gsplat, measure, report, repor
 from torch import Tensor
 
 import gsplat_core
+from gsplat_core.rendering.single_call import next_capacity
 
 ASKED_MS = {"surgical50k_640x512": (0.12, 0.6), "volume1m_1080p": (0.9, 2.8)}
 """Required times in ms: forward, and forward with backward."""
@@ -95,7 +96,9 @@ def host_parts(name: str, scene: Scene) -> None:
         arguments[key] if key else None
         for key in ("means", "", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "", "")
     ]
-    sizes = ([1], [width, height, 0, 3, 3, 2, 0, 0, 0], [0.3, 0.01, 1e10, 0.0])
+    options, ranges = [width, height, 0, 3, 3, 2, 0, 0, 0, 0], [0.3, 0.01, 1e10, 0.0]
+    length = len(ops.rasterize.default(given, [1], options, ranges, False)[9])
+    sizes = ([1], [*options[:-1], next_capacity(0, length)], ranges)
     out = ops.rasterize.default(given, *sizes, True)
     own = out[11:]
     saved = [own[0], out[4], out[8], out[9], own[2], own[1], None, None, out[1], own[4], own[3]]

@@ -491,8 +491,8 @@ class Operations(StepOperations):
                 have any number of channels.
 
         On CUDA, one native call per pass renders pictures with tiles of 16 px, the constants of 1.6, and spherical harmonics
-        or at most 3 plain colour channels. Other arguments use the chain of operations. In both cases the host synchronises
-        once, for the length of the tile lists.
+        or at most 3 plain colour channels. Other arguments use the chain of operations. In both cases the host waits once, for
+        the length of the tile lists.
 
         Returns:
             render_colors [..., C, H, W, X], render_alphas [..., C, H, W, 1] and `meta`, a dict with batch_ids, camera_ids and

@@ -29,11 +29,33 @@ NATIVE_CONSTANTS = "1.6"
 """gsplat version whose constants are compiled into the native call."""
 MOST_PACKED_PAIRS = 1 << 23
 """Pairs of camera and Gaussian up to which packed pictures are rendered in the native call, whose scratch memory is dense."""
+MOST_RESERVED_ENTRIES = 1 << 22
+"""Length of the tile lists up to which memory is reserved before the length is known, at most 28 bytes per entry."""
+FEWEST_RESERVED_ENTRIES = 1 << 10
 _DEPTH_MODES = {"RGB": NO_DEPTH, "D": DEPTH_SUM, "ED": EXPECTED_DEPTH, "RGB+D": DEPTH_SUM, "RGB+ED": EXPECTED_DEPTH}
 
 
+def next_capacity(capacity: int, length: int) -> int:
+    """Return the capacity of the tile lists for the next call of the same kind, or 0 to wait for their length.
+
+    The capacity is kept while it fits, so that equal calls allocate equal sizes.
+
+    Args:
+        capacity: of the last call.
+        length: entries that the last call needed.
+    """
+    if length > MOST_RESERVED_ENTRIES:
+        return 0
+    if 0 < length <= capacity <= 2 * length:
+        return capacity
+    return length + length // 4 + FEWEST_RESERVED_ENTRIES
+
+
 class SingleCall:
-    """Native call for arguments of one kind: its options, computed once for all calls with the same signature."""
+    """Native call for arguments of one kind: its options, computed once for all calls with the same signature.
+
+    Also stores how long the tile lists of the last call were, so that the next call need not wait for their length.
+    """
 
     def __init__(self, arguments: Arguments, settings: RenderSettings) -> None:
         assert arguments.colors is not None
@@ -57,7 +79,7 @@ class SingleCall:
         self._view = View(tuple(viewmats.shape[:-2]), options, ranges)
 
     def __call__(self, arguments: Arguments) -> Rasterized:
-        """Render; one host synchronisation, for the length of the tile lists."""
+        """Render; the host waits once, for the length of the tile lists."""
         means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars, _ = arguments
         triangles = None
         if covars is not None:
@@ -67,7 +89,12 @@ class SingleCall:
             colors = backgrounds = None
         centers = camera_centers(viewmats) if self._has_centers else None
         inputs = Inputs(means, triangles, quats, scales, opacities, colors, viewmats, Ks, centers, backgrounds)
-        return rasterize(inputs, self._view, self._differentiable)
+        view = self._view
+        out = rasterize(inputs, view, self._differentiable)
+        capacity = next_capacity(view.options.capacity, out.flatten_ids.shape[0])
+        if capacity != view.options.capacity:
+            self._view = view._replace(options=view.options._replace(capacity=capacity))
+        return out
 
 
 def single_call(arguments: Arguments, settings: RenderSettings) -> SingleCall | None:

@@ -19,8 +19,11 @@ struct TileSplats {
   const int32_t* instance_splats;
   SortedIds sorted;
   int begin;
+  uint32_t last_instance;
 
-  __device__ Splat operator()(int position) const { return records[instance_splats[sorted[position - begin]]]; }
+  // If the capacity was exceeded, lists also contain numbers of dropped instances.
+  __device__ uint32_t instance(int position) const { return min(sorted[position - begin], last_instance); }
+  __device__ Splat operator()(int position) const { return records[instance_splats[instance(position)]]; }
 };
 
 __device__ inline void write_pixel(const Scene& scene, const Pixels& out, int64_t image, int64_t pixel, float through, float* sum,
@@ -46,12 +49,13 @@ __global__ void __launch_bounds__(kBlockThreads, 8)
   wait_for_preceding_kernel();
   __shared__ BlendShared<Stage> shared;
   const int tiles = int(scene.tiles()), image = int(blockIdx.x) / tiles, tile = int(blockIdx.x) % tiles;
-  const int begin = lists.begin(blockIdx.x), end = lists.begin(blockIdx.x + 1);
+  const int begin = lists.begin_within_capacity(blockIdx.x), end = lists.begin_within_capacity(blockIdx.x + 1);
   const SortedIds sorted = sort_tile(lists.keys + begin, end - begin, shared);
   const int64_t first_splat = image * scene.gaussians;
   const Splat* const records = reinterpret_cast<const Splat*>(splats.records) + first_splat;
+  const TileSplats of_tile = {records, lists.instance_splats, sorted, begin, uint32_t(lists.capacity) - 1};
   for (int i = threadIdx.x; i < end - begin; i += kBlockThreads) {
-    const uint32_t instance = sorted[i];
+    const uint32_t instance = of_tile.instance(begin + i);
     const int32_t splat = lists.instance_splats[instance];
     if (lists.sorted != nullptr) lists.sorted[begin + i] = int32_t(instance);
     lists.flatten_ids[begin + i] = int32_t(first_splat + splat);
@@ -60,7 +64,6 @@ __global__ void __launch_bounds__(kBlockThreads, 8)
   }
   const int left = tile % scene.tile_width * frame::kTile, top = tile / scene.tile_width * frame::kTile;
   const Window w(begin, end, left, top, min(left + frame::kTile, scene.width), min(top + frame::kTile, scene.height));
-  const TileSplats of_tile = {records, lists.instance_splats, sorted, begin};
   BlendedPixels<4> pixels = blend_forward<4, false, true>(w, of_tile, shared.stage);
   for (int p = 0; p < kPixelsEach; ++p) {
     if (!w.inside[p]) continue;
@@ -102,7 +105,7 @@ void fill(const Scene& scene, const Splats& splats, const Lists& lists, const fr
     frame_lists.keys = lists.keys;
     frame_lists.splat_starts = lists.splat_starts + first;
     frame_lists.instance_splats = lists.instance_splats;
-    frame_lists.capacity = lists.length;
+    frame_lists.capacity = lists.capacity;
     frame::Scratch of_image = scratch;
     of_image.footprints += first;
     of_image.depths += first;

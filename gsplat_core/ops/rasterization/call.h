@@ -50,6 +50,7 @@ class Arena {
     size_ += (size_t(count > 0 ? count : 1) * sizeof(T) + 255) / 256 * 256;
     return at;
   }
+  size_t size() const { return size_; }
   void make(const Allocator& memory) {
     tensor_.emplace(memory.empty({int64_t(size_)}, ScalarType::Byte));
     base_ = tensor_->mutable_data_ptr<uint8_t>();
@@ -65,30 +66,66 @@ class Arena {
   std::optional<Tensor> tensor_;
 };
 
-// A few words of page-locked memory per thread for reads from the device. From pageable memory the driver would need an
-// extra copy.
-class PinnedWords {
+// A number that a kernel writes directly to page-locked memory. The host reads it without a copy, and without waiting for
+// kernels that are queued later.
+class NumberFromGpu {
  public:
-  static constexpr int kCount = 16;
-
-  PinnedWords() { check_cuda(cudaHostAlloc(&words_, kCount * sizeof(int32_t), cudaHostAllocPortable), "allocating host memory"); }
-  ~PinnedWords() { cudaFreeHost(words_); }
-  PinnedWords(const PinnedWords&) = delete;
-  PinnedWords& operator=(const PinnedWords&) = delete;
-
-  static PinnedWords& of_thread() {
-    static thread_local PinnedWords words;
-    return words;
+  explicit NumberFromGpu(cudaStream_t stream) : stream_(stream), words_(Words::of_thread().next()) { words_[0] = kPending; }
+  // The kernel may still run if the call fails. It must not write into the number of the next call.
+  ~NumberFromGpu() {
+    if (words_[0] == kPending && launched_) cudaStreamSynchronize(stream_);
   }
+  NumberFromGpu(const NumberFromGpu&) = delete;
+  NumberFromGpu& operator=(const NumberFromGpu&) = delete;
 
-  void read(const int32_t* from, int count, cudaStream_t stream) {
-    check_cuda(cudaMemcpyAsync(words_, from, size_t(count) * sizeof(int32_t), cudaMemcpyDeviceToHost, stream),
-               "reading the length of the lists");
+  // Return the memory for a status [kWords] whose first entry is the number, to be written by the next kernel.
+  int32_t* written_by_kernel() {
+    launched_ = true;
+    return const_cast<int32_t*>(words_);
   }
-  int32_t operator[](int i) const { return words_[i]; }
+  void set(int32_t number) { words_[0] = number; }
+
+  // Wait for the number, which is not negative. Launch errors must have been checked before.
+  int32_t wait() const {
+    for (unsigned polls = 1; words_[0] == kPending; ++polls) {
+      if (polls % kPollsPerQuery != 0) continue;
+      const cudaError_t state = cudaStreamQuery(stream_);
+      if (state == cudaErrorNotReady) {
+        cudaGetLastError();  // the query is not an error
+      } else {
+        check_cuda(state, "projecting the Gaussians");
+        check(words_[0] != kPending, "the GPU has not reported the length of the tile lists");
+      }
+    }
+    return words_[0];
+  }
 
  private:
-  int32_t* words_ = nullptr;
+  static constexpr int32_t kPending = -1;
+  static constexpr int kWords = 4, kNumbers = 2;
+  static constexpr unsigned kPollsPerQuery = 4096;
+
+  struct Words {
+    int32_t* all = nullptr;
+    unsigned used = 0;
+    Words() {
+      check_cuda(cudaHostAlloc(&all, kNumbers * kWords * sizeof(int32_t), cudaHostAllocPortable | cudaHostAllocMapped),
+                 "allocating host memory");
+    }
+    ~Words() { cudaFreeHost(all); }
+    Words(const Words&) = delete;
+    Words& operator=(const Words&) = delete;
+    static Words& of_thread() {
+      static thread_local Words words;
+      return words;
+    }
+    // The numbers of one call do not share their words.
+    volatile int32_t* next() { return all + kWords * (used++ % kNumbers); }
+  };
+
+  cudaStream_t stream_;
+  volatile int32_t* words_;
+  bool launched_ = false;
 };
 
 }  // namespace gsplat::rasterization

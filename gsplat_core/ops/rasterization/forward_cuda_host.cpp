@@ -7,29 +7,37 @@ namespace {
 
 constexpr int64_t kFewTiles = 4096;  // up to this number of tiles every counter has its own 128 bytes
 
-// Scratch memory that is used until the length of the lists is known.
+// Scratch memory of one forward pass, in one allocation.
 struct ListScratch {
   Arena arena;
   frame::Scratch lists;
-  int32_t* status;           // [2, frame::kStatusSize]: status of the lists, then of the packed rows
   uint32_t* visible_counts;  // [images * blocks], packed
   int32_t* visible_starts;   // [images * blocks + 1], packed
   uint64_t* visible_states;
+  uint64_t* keys;            // [capacity], as in Lists
+  int32_t* instance_splats;  // [capacity]
+  float* records;            // [splats, kSplatFloats], as in Splats; this and the next are kept as tensors for the gradient
+  int32_t* splat_starts;     // [splats + 1]
 
-  ListScratch(const Allocator& memory, const Scene& scene, bool packed, cudaStream_t stream) {
+  ListScratch(const Allocator& memory, const Scene& scene, bool packed, bool training, int64_t capacity, cudaStream_t stream) {
     const int64_t tiles = scene.images() * scene.tiles(), blocks = scene.images() * scene.blocks();
     const int64_t splats = scene.images() * scene.gaussians;
     const int32_t stride = tiles <= kFewTiles ? 32 : 8;
     const int64_t states = frame::scan_state_count(tiles, blocks), visible = packed ? frame::scan_state_count(blocks, 0) : 0;
-    const size_t zeros = arena.place<uint64_t>(states + visible + tiles * stride / 2);
-    const size_t zeros_end = arena.place<int32_t>(2 * frame::kStatusSize), status_at = zeros_end;
+    const size_t zeros = arena.place<uint64_t>(states + visible + tiles * stride / 2), zeros_end = arena.size();
     const size_t footprints = arena.place<uint2>(splats), depths = arena.place<uint32_t>(splats);
     const size_t sums = arena.place<uint32_t>(blocks), starts = arena.place<uint32_t>(blocks);
     const size_t counts = arena.place<uint32_t>(packed ? blocks : 0), of_visible = arena.place<int32_t>(packed ? blocks + 1 : 0);
+    const size_t keys_at = arena.place<uint64_t>(capacity), instances = arena.place<int32_t>(capacity);
+    const size_t records_at = arena.place<float>(training ? 0 : splats * kSplatFloats);
+    const size_t splat_starts_at = arena.place<int32_t>(training ? 0 : splats + 1);
     arena.make(memory);
-    status = arena.at<int32_t>(status_at);
+    records = arena.at<float>(records_at);
+    splat_starts = arena.at<int32_t>(splat_starts_at);
     visible_counts = arena.at<uint32_t>(counts);
     visible_starts = arena.at<int32_t>(of_visible);
+    keys = arena.at<uint64_t>(keys_at);
+    instance_splats = arena.at<int32_t>(instances);
     uint64_t* const first = arena.at<uint64_t>(zeros);
     visible_states = first + states;
     lists = {.footprints = arena.at<uint2>(footprints),
@@ -43,11 +51,12 @@ struct ListScratch {
   }
 };
 
-// Count the visible splats; their number is written to status[frame::kStatusSize + frame::kStatusNeeded].
-void scan_visible(const Scene& scene, const Splats& splats, const ListScratch& scratch, cudaStream_t stream) {
+// Count the visible splats.
+void scan_visible(const Scene& scene, const Splats& splats, const ListScratch& scratch, NumberFromGpu& rows,
+                  cudaStream_t stream) {
   const int64_t blocks = scene.images() * scene.blocks();
   if (blocks == 0) {
-    check_cuda(cudaMemsetAsync(scratch.status + frame::kStatusSize, 0, sizeof(int32_t), stream), "counting no splats");
+    rows.set(0);
     return;
   }
   count_visible(scene, splats, scratch.visible_counts, stream);
@@ -56,7 +65,7 @@ void scan_visible(const Scene& scene, const Splats& splats, const ListScratch& s
   counters.tile_height = 1;
   frame::Lists lists = {};
   lists.tile_offsets = scratch.visible_starts;
-  lists.status = scratch.status + frame::kStatusSize;
+  lists.status = rows.written_by_kernel();
   lists.capacity = kMostInts;
   frame::Scratch of_counters = {};
   of_counters.counters = scratch.visible_counts;
@@ -97,7 +106,9 @@ struct Pass {
     return sizes;
   }
 
-  void run() {
+  // Render with tile lists of `capacity` instances; 0 waits for their length and takes that. Returns false if the capacity
+  // was exceeded. The results are then incomplete and must not be used.
+  bool run(int64_t capacity) {
     const int64_t n = scene.gaussians;
     const bool own_opacities = scene.antialiased;
     means2d = memory.floats(of_images({n, 2}));
@@ -106,44 +117,63 @@ struct Pass {
     radii = memory.ints(of_images({n, 2}));
     tiles_per_gauss = memory.ints(of_images({n}));
     if (own_opacities) opacities = memory.floats(of_images({n}));
-    records = memory.floats({scene.images() * n, kSplatFloats});
-    const ListScratch scratch(memory, scene, packed, call.stream);
+    ListScratch scratch(memory, scene, packed, training, capacity, call.stream);
+    if (training) {
+      records = memory.floats({scene.images() * n, kSplatFloats});
+      splat_starts = memory.ints({scene.images() * n + 1});
+      scratch.records = float_data(records);
+      scratch.splat_starts = int_data(splat_starts);
+    }
     const Splats splats = {float_data(means2d), float_data(depths),        float_data(conics), float_data(opacities),
-                           int_data(radii),     int_data(tiles_per_gauss), float_data(records)};
+                           int_data(radii),     int_data(tiles_per_gauss), scratch.records};
     project(scene, splats, scratch.lists, call.stream);
 
     offsets = memory.ints({scene.images() * scene.tiles() + 1});
-    splat_starts = memory.ints({scene.images() * n + 1});
     Lists lists = {};
     lists.tile_offsets = int_data(offsets);
-    lists.splat_starts = int_data(splat_starts);
+    lists.splat_starts = scratch.splat_starts;
     lists.tiles = scene.images() * scene.tiles();
-    scan(scene, lists, scratch.status, scratch.lists, call.stream);
-    if (packed) scan_visible(scene, splats, scratch, call.stream);
-    PinnedWords& words = PinnedWords::of_thread();
-    words.read(scratch.status, 2 * frame::kStatusSize, call.stream);
-    const Pixels pixels = make_pixels();  // overlaps with the kernels already queued
-    // The only host synchronisation: it provides the list lengths, so that the returned tensors have the exact size.
-    check_cuda(cudaStreamSynchronize(call.stream), "projecting the Gaussians");
-    lists.length = words[frame::kStatusNeeded];
-    check(lists.length < kMostInts, "the splats touch more than 2^31 - 2 tiles in all; render fewer images at a time");
+    NumberFromGpu length(call.stream), rows(call.stream);
+    scan(scene, lists, length.written_by_kernel(), scratch.lists, call.stream);
+    if (packed) scan_visible(scene, splats, scratch, rows, call.stream);
+    const Pixels pixels = make_pixels();
 
     Arena of_lists;
-    const size_t keys = of_lists.place<uint64_t>(lists.length), instances = of_lists.place<int32_t>(lists.length);
-    of_lists.make(memory);
-    lists.keys = of_lists.at<uint64_t>(keys);
-    lists.instance_splats = of_lists.at<int32_t>(instances);
-    flatten_ids = memory.ints({lists.length});
-    isect_ids = memory.longs({lists.length});
+    lists.capacity = capacity;
+    lists.keys = scratch.keys;
+    lists.instance_splats = scratch.instance_splats;
+    if (capacity == 0) {
+      lists.capacity = checked(length);
+      const size_t keys = of_lists.place<uint64_t>(lists.capacity), instances = of_lists.place<int32_t>(lists.capacity);
+      of_lists.make(memory);
+      lists.keys = of_lists.at<uint64_t>(keys);
+      lists.instance_splats = of_lists.at<int32_t>(instances);
+    }
+    flatten_ids = memory.ints({lists.capacity});
+    isect_ids = memory.longs({lists.capacity});
     lists.flatten_ids = int_data(flatten_ids);
     lists.isect_ids = long_data(isect_ids);
     if (training) {
-      sorted = memory.ints({lists.length});
+      sorted = memory.ints({lists.capacity});
       lists.sorted = int_data(sorted);
     }
     fill(scene, splats, lists, scratch.lists, call.stream);
     blend(scene, splats, lists, pixels, call.stream);
-    if (packed) pack_rows(splats, scratch, words[frame::kStatusSize + frame::kStatusNeeded], lists);
+    // The kernels above are queued, so the GPU does not idle while the host waits for the length.
+    lists.length = checked(length);
+    if (lists.length > lists.capacity) return false;
+    if (packed) pack_rows(splats, scratch, rows.wait(), lists);
+    for (Tensor* t : {&flatten_ids, &isect_ids, &sorted})
+      if (t->numel() > lists.length) *t = view(*t, {lists.length});
+    return true;
+  }
+
+  // Return the length of the lists. The only host synchronisation: it gives the returned tensors their exact size.
+  int64_t checked(const NumberFromGpu& length) const {
+    call.finish("rasterize");
+    const int64_t found = length.wait();
+    check(found < kMostInts, "the splats touch more than 2^31 - 2 tiles in all; render fewer images at a time");
+    return found;
   }
 
   Pixels make_pixels() {
@@ -181,8 +211,8 @@ struct Pass {
     renumber(lists.length, out.row_of, lists.flatten_ids, int_data(flatten_ids), call.stream);
   }
 
-  Tensor isect_offsets() const {
-    const Sizes sizes = of_images({scene.tile_height, scene.tile_width});
+  // Return a contiguous view of the first elements of a tensor.
+  static Tensor view(const Tensor& of, const Sizes& sizes) {
     Sizes strides(sizes.size());
     int64_t stride = 1;
     for (size_t i = sizes.size(); i-- > 0;) {
@@ -190,14 +220,16 @@ struct Pass {
       stride *= sizes[i];
     }
     AtenTensorHandle handle = nullptr;
-    check(aoti_torch__reinterpret_tensor(offsets.get(), int64_t(sizes.size()), sizes.data(), strides.data(), 0, &handle) == 0,
+    check(aoti_torch__reinterpret_tensor(of.get(), int64_t(sizes.size()), sizes.data(), strides.data(), 0, &handle) == 0,
           "torch could not make a view");
     return Tensor(handle);
   }
 
   std::vector<Tensor> outputs() const {
-    std::vector<Tensor> all = {image, alphas,          means2d,         depths,      conics,   opacities,
-                               radii, tiles_per_gauss, isect_offsets(), flatten_ids, isect_ids};
+    std::vector<Tensor> all = {image,       alphas,          means2d,
+                               depths,      conics,          opacities,
+                               radii,       tiles_per_gauss, view(offsets, of_images({scene.tile_height, scene.tile_width})),
+                               flatten_ids, isect_ids};
     if (packed) all.insert(all.end(), {batch_ids, camera_ids, gaussian_ids});
     if (training) all.insert(all.end(), {records, splat_starts, sorted, last, expected});
     if (training && packed) all.insert(all.end(), {row_of, dense_radii, splat_ids});
@@ -213,7 +245,7 @@ std::vector<Tensor> rasterize(OptionalTensors inputs, std::vector<int64_t> image
   const Request request(image_dims, options, ranges);
   const SceneInputs scene(call, request, inputs);
   Pass pass(call, means, scene.scene, image_dims, options[kPacked] != 0, training);
-  pass.run();
+  if (!pass.run(options[kCapacity])) pass.run(0);
   call.finish("rasterize");
   return pass.outputs();
 }

@@ -1,10 +1,10 @@
 // Fused `rasterization()` on CUDA: interface between the op's host code and its kernels. All pointers are device
 // memory.
 //
-// Forward: project (geometry, colours, tile counts) and scan. After the host has read the list lengths: fill, then sort
-// and blend per tile. An instance is a pair of a splat and a tile that it touches; instances are numbered in splat
-// order. Backward: per tile one gradient row for every instance, per splat the sum of its rows, per Gaussian the
-// gradients of its parameters. No sum depends on the execution order of blocks.
+// Forward: project (geometry, colours, tile counts), scan, fill, then sort and blend per tile. The kernels are queued for
+// lists of a given capacity; the host reads the length of the lists while they run. An instance is a pair of a splat and a
+// tile that it touches; instances are numbered in splat order. Backward: per tile one gradient row for every instance, per splat
+// the sum of its rows, per Gaussian the gradients of its parameters. No sum depends on the execution order of blocks.
 //
 // An image is one batch seen by one camera. `images` = batches * cameras, and image i belongs to batch i / cameras.
 #pragma once
@@ -51,7 +51,8 @@ struct Splats {
   float* records;  // [images, N, kSplatFloats]
 };
 
-// Tile lists of all images, concatenated; lengths are in instances.
+// Tile lists of all images, concatenated; lengths are in instances. If the capacity is exceeded, instances are dropped
+// and the picture is incomplete.
 struct Lists {
   int32_t* tile_offsets;     // [images * tiles]; scan writes one more entry, the total length
   int32_t* splat_starts;     // [images * N + 1]
@@ -60,11 +61,16 @@ struct Lists {
   int32_t* flatten_ids;      // ordered by tile and depth: image * N + splat
   int64_t* isect_ids;        // ordered by tile and depth: image | tile | depth bits, in gsplat's format
   int32_t* sorted;           // ordered by tile and depth: the instance; null if no gradient is needed
-  int64_t length;
-  int64_t tiles;  // of all images
+  int64_t capacity;          // forward: number of instances in the buffers above
+  int64_t length;            // backward
+  int64_t tiles;             // of all images
 
   // Return the start of a tile's list; for tile = tiles, the end of the last list.
   __host__ __device__ int begin(int64_t tile) const { return tile < tiles ? tile_offsets[tile] : int(length); }
+  // The same in the forward pass, before the host knows the length.
+  __device__ int begin_within_capacity(int64_t tile) const {
+    return tile_offsets[tile] < capacity ? tile_offsets[tile] : int(capacity);
+  }
 };
 
 struct Pixels {
@@ -75,7 +81,8 @@ struct Pixels {
 };
 
 void project(const Scene& scene, const Splats& out, const frame::Scratch& scratch, cudaStream_t stream);
-// Compute the lists' offsets and starts; their length is written to status[frame::kStatusNeeded].
+// Compute the lists' offsets and starts; their length is written to status[frame::kStatusNeeded]. The status may be in
+// page-locked host memory.
 // `scratch.block_counts` has one sum per block of each image.
 void scan(const Scene& scene, const Lists& lists, int32_t* status, const frame::Scratch& scratch, cudaStream_t stream);
 void fill(const Scene& scene, const Splats& splats, const Lists& lists, const frame::Scratch& scratch, cudaStream_t stream);

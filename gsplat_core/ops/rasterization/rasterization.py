@@ -46,6 +46,10 @@ class Options(NamedTuple):
     """1 to scale opacities by the antialiasing compensation, otherwise 0. The next two fields are flags, too."""
     packed: int
     absgrad: int
+    capacity: int = 0
+    """Expected length of the tile lists, or 0 if unknown. The result does not depend on it. If the lists are longer, the
+    picture is rendered twice. If it is 0, the GPU waits for the host before it fills the lists.
+    """
 
 
 class Ranges(NamedTuple):
@@ -156,7 +160,7 @@ class _Call:
 def rasterize(inputs: Inputs, view: View, differentiable: bool) -> Rasterized:
     """Render; the caller has checked shapes, dtypes and devices.
 
-    The host synchronises once, for the length of the tile lists. Equal inputs give bit-identical
+    The host waits once, for the length of the tile lists. Equal inputs give bit-identical
     results, forward and backward.
     """
     returned = 14 if view.options.packed else 11

@@ -11,7 +11,19 @@ enum DepthMode : int64_t { kNoDepth = 0, kDepthSum = 1, kExpectedDepth = 2 };
 
 // Indices into the tensor lists that the ops receive. `Inputs` and `View` in rasterization.py have the same order.
 enum Input { kMeans, kCovars, kQuats, kScales, kOpacities, kColors, kViewmats, kIntrinsics, kCenters, kBackgrounds, kInputs };
-enum Option { kWidth, kHeight, kCameraModel, kDegree, kChannels, kDepthMode, kAntialiased, kPacked, kAbsolute, kOptions };
+enum Option {
+  kWidth,
+  kHeight,
+  kCameraModel,
+  kDegree,
+  kChannels,
+  kDepthMode,
+  kAntialiased,
+  kPacked,
+  kAbsolute,
+  kCapacity,
+  kOptions
+};
 enum Range { kEps2d, kNearPlane, kFarPlane, kRadiusClip, kRanges };
 
 using OptionalTensors = std::vector<OptionalTensor>;
@@ -37,6 +49,8 @@ struct Request {
     check(options[kCameraModel] >= 0 && options[kCameraModel] <= 2, "rasterize: no camera model ", options[kCameraModel]);
     check(options[kDepthMode] >= kNoDepth && options[kDepthMode] <= kExpectedDepth, "rasterize: no depth mode ",
           options[kDepthMode]);
+    check(options[kCapacity] >= 0 && options[kCapacity] < kMostInts, "rasterize: the capacity must be 0 to 2^31 - 2, got ",
+          options[kCapacity]);
     check(channels >= 0 && channels <= kMostPlainColors && (channels > 0 || options[kDepthMode] != kNoDepth),
           "rasterize: a picture has 0 to 3 colours, and without any the depth; got ", channels);
   }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import pytest
@@ -197,7 +198,7 @@ def test_opcheck(make_scene, packed):
     t = {name: value.detach() for name, value in inputs(scene).items()}
     Ks = scene.Ks.float().cuda()
     given = [t["means"], None, t["quats"], t["scales"], t["opacities"], t["colors"], t["viewmats"], Ks, None, None]
-    sizes = ([2], [scene.width, scene.height, 0, 3, 3, 2, True, packed, True], [0.3, 0.01, 1e10, 0.0])
+    sizes = ([2], [scene.width, scene.height, 0, 3, 3, 2, True, packed, True, 0], [0.3, 0.01, 1e10, 0.0])
     ops = torch.ops.gsplat_core
     torch.library.opcheck(ops.rasterize.default, (given, *sizes, True))
     out = ops.rasterize(given, *sizes, True)
@@ -213,3 +214,56 @@ def test_opcheck(make_scene, packed):
         ops.rasterize(given, [], *sizes[1:], True)
     with pytest.raises(RuntimeError, match="quats"):
         ops.rasterize([*given[:2], t["quats"][:-1], *given[3:]], *sizes, True)
+
+
+@pytest.mark.parametrize("packed", [False, True])
+@pytest.mark.parametrize("training", [False, True])
+@pytest.mark.parametrize(("count", "cameras"), [(0, 1), (150, 1), (3000, 3)])
+def test_the_reserved_capacity_does_not_change_the_result(make_scene, packed, training, count, cameras):
+    scene = make_scene(count, cameras=cameras, width=200, height=70)
+    scene.scales[: count // 20] *= 20  # footprints that a whole warp lists
+    t = {name: value.detach() for name, value in inputs(scene).items()}
+    Ks = scene.Ks.float().cuda()
+    given = [t["means"], None, t["quats"], t["scales"], t["opacities"], t["colors"], t["viewmats"], Ks, None, None]
+
+    def rendered(capacity: int) -> list[Tensor]:
+        options = [scene.width, scene.height, 0, 3, 3, 2, False, packed, False, capacity]
+        out = torch.ops.gsplat_core.rasterize(given, [cameras], options, [0.3, 0.01, 1e10, 0.0], training)
+        records = 14 if packed else 11  # rows of culled Gaussians are not written
+        return [each for i, each in enumerate(out) if i != records]
+
+    exact = rendered(0)
+    length = len(exact[9])
+    assert (length > 0) == (count > 0)
+    for capacity in (1, length // 2 + 1, max(1, length - 1), length + 1, 10 * length + 1):
+        for wanted, found in zip(exact, rendered(capacity), strict=True):
+            assert torch.equal(wanted, found), capacity
+
+
+def test_scenes_that_grow_and_shrink_between_calls(make_scene, calls):
+    scene = make_scene(500, width=120, height=90)
+    for scale in (1.0, 8.0, 8.0, 0.2, 0.2, 4.0):
+        leaves = inputs(scene, scales=scene.scales * scale)
+        seen, meta = run(rasterization, scene, leaves, packed=False, render_mode="RGB+ED")
+        assert_same(seen, run(step_by_step.rasterization, scene, leaves, packed=False, render_mode="RGB+ED")[0])
+        check_lists(meta)
+    assert calls == [True] * 6
+
+
+def test_calls_of_threads_on_their_own_streams_do_not_mix(make_scene):
+    scenes = [make_scene(count, width=90, height=70) for count in (40, 400, 2000)]
+    given = [{name: t.detach() for name, t in inputs(scene).items()} for scene in scenes]
+
+    def render(index: int) -> Tensor:
+        scene = scenes[index]
+        shape = {"Ks": scene.Ks.float().cuda(), "width": scene.width, "height": scene.height, "sh_degree": 3}
+        return rasterization(**given[index], **shape)[0]
+
+    def repeated(index: int) -> list[Tensor]:
+        with torch.cuda.stream(torch.cuda.Stream()):
+            return [render(index).cpu() for _ in range(50)]
+
+    wanted = [render(index).cpu() for index in range(len(scenes))]
+    with ThreadPoolExecutor(len(scenes)) as threads:
+        for picture, pictures in zip(wanted, threads.map(repeated, range(len(scenes))), strict=True):
+            assert all(torch.equal(picture, each) for each in pictures)

@@ -1,0 +1,72 @@
+"""Capacities of the tile lists that the native call is asked for, without a GPU: the native call is replaced."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from gsplat_core.ops.rasterization.rasterization import Rasterized
+from gsplat_core.rendering import single_call
+from gsplat_core.rendering.settings import Arguments, RenderSettings
+from gsplat_core.rendering.single_call import FEWEST_RESERVED_ENTRIES, MOST_RESERVED_ENTRIES, SingleCall, next_capacity
+
+SETTINGS = RenderSettings(16, 16, sh_degree=0, render_mode="RGB+ED")
+
+
+def arguments() -> Arguments:
+    return Arguments(
+        torch.zeros(2, 3), torch.ones(2, 4), torch.ones(2, 3), torch.ones(2), torch.ones(2, 1, 3), torch.eye(4)[None],
+        torch.eye(3)[None], None, None,
+    )  # fmt: skip
+
+
+@pytest.fixture
+def capacities_for(monkeypatch):
+    """Return a function from the lengths of the lists of successive calls to the capacities of these calls."""
+
+    def of(lengths: list[int]) -> list[int]:
+        found: list[int] = []
+
+        def rasterize(inputs, view, differentiable):
+            length = lengths[len(found)]
+            found.append(view.options.capacity)
+            empty, ids = torch.empty(0), torch.empty(1, dtype=torch.int32).expand(length)
+            return Rasterized(*[empty] * 9, flatten_ids=ids, isect_ids=empty)
+
+        monkeypatch.setattr(single_call, "rasterize", rasterize)
+        call = SingleCall(arguments(), SETTINGS)
+        for _ in lengths:
+            call(arguments())
+        return found
+
+    return of
+
+
+def test_the_first_call_waits_and_equal_calls_have_one_capacity_with_space_to_spare(capacities_for):
+    first, *others = capacities_for([100_000] * 4)
+    assert first == 0
+    assert len(set(others)) == 1 and 110_000 <= others[0] <= 150_000
+
+
+def test_lists_that_outgrow_the_capacity_raise_it_for_the_next_call(capacities_for):
+    capacities = capacities_for([10_000, 50_000, 50_000, 55_000])
+    assert capacities[1] < 50_000 < 55_000 < capacities[2] == capacities[3]
+
+
+def test_lists_that_become_short_free_memory(capacities_for):
+    capacities = capacities_for([100_000, 100_000, 1000, 1000, 0, 0])
+    assert capacities[3] < 4000
+    assert capacities[5] == FEWEST_RESERVED_ENTRIES
+
+
+def test_nothing_is_reserved_for_very_long_lists(capacities_for):
+    long = MOST_RESERVED_ENTRIES + 1
+    assert capacities_for([long, long, 1000, 1000, long, long])[:3] == [0, 0, 0]
+    assert capacities_for([1000, long, long])[2] == 0
+
+
+@pytest.mark.parametrize("length", [0, 1, 1000, 10**6, MOST_RESERVED_ENTRIES])
+def test_the_capacity_settles_at_once_and_fits(length):
+    capacity = next_capacity(0, length)
+    assert length < capacity <= 2 * length + FEWEST_RESERVED_ENTRIES
+    assert next_capacity(capacity, length) == capacity
