@@ -84,7 +84,8 @@ def test_the_gradient_of_the_intrinsics_in_double_precision(make_scene, model):
     (expected,) = torch.autograd.grad(sum((t * w).sum() for t, w in zip(out[1:], weights, strict=True)), Ks)
     assert (out.radii > 0).any() and expected.abs().sum() > 0
     torch.testing.assert_close(found, expected)
-    torch.autograd.gradcheck(lambda Ks: project_with(Ks)[1:], Ks, atol=1e-4, fast_mode=True)
+    # Depths do not depend on the intrinsics; in fast mode torch 2.11 fails for such an output.
+    torch.autograd.gradcheck(lambda Ks: [project_with(Ks)[index] for index in (1, 3, 4)], Ks, atol=1e-4, fast_mode=True)
 
 
 @pytest.mark.parametrize("model", MODELS)
