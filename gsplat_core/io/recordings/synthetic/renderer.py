@@ -74,7 +74,7 @@ def _tool_shade(parts: list[Part], camera: Camera, local: Array, lamp: Lamp) -> 
     coarse = local[::step, ::step].reshape(-1, 3)
     to_light = lamp.shadow_from - coarse
     shade = np.ones(len(coarse), np.float32)
-    for reach in (0.015, 0.05, 0.10, 0.17, 0.26, 0.37):
+    for reach in (0.015, 0.05, 0.10, 0.17, 0.26, 0.37) if parts else ():
         at = (coarse + np.float32(reach) * to_light) @ rotation + camera.position.astype(np.float32)
         gap, _ = distance(parts, at)
         blur = np.float32(1.0 + 22 * reach)

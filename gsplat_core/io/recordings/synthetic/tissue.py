@@ -201,24 +201,25 @@ class TissueTexture:
         canvas = np.zeros((self.size, self.size), np.uint8)
         stack = []
         for _ in range(count):
-            start = rng.uniform(-HALF_EXTENT_MM, HALF_EXTENT_MM, 2)
-            stack.append((start, rng.uniform(0, 2 * np.pi), width_mm * rng.uniform(0.6, 1.0), 0))
+            x, y = (float(at) for at in rng.uniform(-HALF_EXTENT_MM, HALF_EXTENT_MM, 2))
+            stack.append((x, y, rng.uniform(0, 2 * np.pi), width_mm * rng.uniform(0.6, 1.0), 0))
+        pixel = lambda at_mm: round((at_mm + HALF_EXTENT_MM) / self.texel_mm * 16)  # sixteenths, for `cv2.line`
         while stack:
-            point, heading, width, depth = stack.pop()
+            x, y, heading, width, depth = stack.pop()
             bend = rng.normal(0, 0.02)
             for _ in range(int(rng.uniform(16, 40))):
                 bend = 0.9 * bend + rng.normal(0, 0.045)
                 heading += bend
-                towards = point + 1.3 * np.array([np.cos(heading), np.sin(heading)])
-                ends = [np.round((p + HALF_EXTENT_MM) / self.texel_mm * 16).astype(int) for p in (point, towards)]
+                start = pixel(x), pixel(y)
+                x, y = x + 1.3 * float(np.cos(heading)), y + 1.3 * float(np.sin(heading))
                 thickness = max(1, round(width / self.texel_mm))
-                cv2.line(canvas, ends[0].tolist(), ends[1].tolist(), 255, thickness, cv2.LINE_AA, shift=4)
-                point, width = towards, width * 0.988
+                cv2.line(canvas, start, (pixel(x), pixel(y)), 255, thickness, cv2.LINE_AA, shift=4)
+                width *= 0.988
             if depth < 4 and width > 0.2:
                 for side in (-1, 1):
                     if rng.random() < 0.88:
                         stack.append(
-                            (point, heading + side * rng.uniform(0.25, 0.8), width * rng.uniform(0.55, 0.85), depth + 1)
+                            (x, y, heading + side * rng.uniform(0.25, 0.8), width * rng.uniform(0.55, 0.85), depth + 1)
                         )
         cover = canvas.astype(np.float32) / 255
         soft = cv2.GaussianBlur(cover, (0, 0), blur_mm / self.texel_mm)

@@ -200,26 +200,27 @@ def _smooth(x: float) -> float:
 
 
 def distance(parts: list[Part], points: Array) -> tuple[Array, NDArray[np.int8]]:
-    """Return the distance of points [N, 3] to the tool and the index of the nearest part.
+    """Return the distance of points [N, 3] to a tool of at least one part, and the index of the nearest part.
 
     The distance is slightly underestimated where a part tapers.
     """
+    gaps = _gaps(parts, points)
+    return gaps.min(axis=0), gaps.argmin(axis=0).astype(np.int8)
+
+
+def _gaps(parts: list[Part], points: Array) -> Array:
+    """Return the distance of points [N, 3] to each part, [parts, N]."""
     x, y, z = np.ascontiguousarray(points.T)
-    nearest = np.full(len(points), np.inf, np.float32)
-    which = np.zeros(len(points), np.int8)
-    for index, part in enumerate(parts):
-        a_x, a_y, a_z = part.a.astype(np.float32)
-        b_x, b_y, b_z = (part.b - part.a).astype(np.float32)
-        length2 = b_x * b_x + b_y * b_y + b_z * b_z
-        p_x, p_y, p_z = x - a_x, y - a_y, z - a_z
-        dot = p_x * b_x + p_y * b_y + p_z * b_z
-        h = np.clip(dot / length2, 0, 1)
-        squared = p_x * p_x + p_y * p_y + p_z * p_z - h * (2 * dot - h * length2)
-        taper = np.float32(part.radius_b_mm - part.radius_a_mm)
-        gap = np.sqrt(np.maximum(squared, 0)) - np.float32(part.radius_a_mm) - taper * h
-        which[gap < nearest] = index
-        nearest = np.minimum(nearest, gap)
-    return nearest, which
+    a_x, a_y, a_z = np.array([part.a for part in parts], np.float32).T[..., None]
+    b_x, b_y, b_z = np.array([part.b - part.a for part in parts], np.float32).T[..., None]
+    radius = np.array([[part.radius_a_mm] for part in parts], np.float32)
+    taper = np.array([[part.radius_b_mm - part.radius_a_mm] for part in parts], np.float32)
+    length2 = b_x * b_x + b_y * b_y + b_z * b_z
+    p_x, p_y, p_z = x - a_x, y - a_y, z - a_z
+    dot = p_x * b_x + p_y * b_y + p_z * b_z
+    h = np.clip(dot / length2, 0, 1)
+    squared = p_x * p_x + p_y * p_y + p_z * p_z - h * (2 * dot - h * length2)
+    return np.asarray(np.sqrt(np.maximum(squared, 0)) - radius - taper * h, np.float32)
 
 
 def trace(parts: list[Part], origin: NDArray[np.float64], rays: Array, limit_mm: Array, pixel_rad: float) -> ToolHits:
@@ -236,9 +237,10 @@ def trace(parts: list[Part], origin: NDArray[np.float64], rays: Array, limit_mm:
     closest = np.full(count, np.inf, np.float32)
     reach = np.zeros(count, np.float32)
     active = may_meet(parts, start, rays)
+    along = rays[active]
     s = np.full(len(active), NEAREST_MM, np.float32)
     for _ in range(TRACE_STEPS):
-        gap, _ = distance(parts, start + rays[active] * s[:, None])
+        gap = _gaps(parts, start + along * s[:, None]).min(axis=0)
         passing = gap / (s * np.float32(pixel_rad))
         closer = passing < closest[active]
         closest[active[closer]], reach[active[closer]] = passing[closer], s[closer]
@@ -246,7 +248,7 @@ def trace(parts: list[Part], origin: NDArray[np.float64], rays: Array, limit_mm:
         travelled[active[touched]] = s[touched]
         s = s + np.float32(0.97) * gap
         alive = ~touched & (s < limit_mm[active])
-        active, s = active[alive], s[alive]
+        active, along, s = active[alive], along[alive], s[alive]
         if not active.size:
             break
     hit = np.isfinite(travelled)
@@ -262,9 +264,9 @@ def trace(parts: list[Part], origin: NDArray[np.float64], rays: Array, limit_mm:
         for index, part in enumerate(parts):
             own = touching[which == index]
             offset = at[which == index] - part.a.astype(np.float32)
-            along = (part.b - part.a).astype(np.float32)
-            h = np.clip(offset @ along / np.float32(along @ along), 0, 1)
-            away = offset - h[:, None] * along
+            axis = (part.b - part.a).astype(np.float32)
+            h = np.clip(offset @ axis / np.float32(axis @ axis), 0, 1)
+            away = offset - h[:, None] * axis
             normal[own] = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-6)
     return ToolHits(travelled, cover, normal, material)
 
