@@ -196,10 +196,8 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "render_frame_backward_adam_(Tensor(a!)[] gaussians, Tensor(b!)[] first_moments, Tensor(c!)[] second_moments, Tensor "
       "rates, "
       "Tensor step, Tensor(d!) skipped, Tensor? deltas, Tensor viewmat, Tensor K, Tensor? background, Tensor[] forward, "
-      "Tensor v_image, Tensor? v_alphas, Tensor? residuals, Tensor? relaxation, float eps2d, int camera_model, float beta1, "
-      "float "
-      "beta2, float epsilon, bool needs_raw, "
-      "bool deterministic) -> Tensor v_raw");
+      "Tensor v_image, Tensor? v_alphas, Tensor? residuals, Tensor? relaxation, Tensor? added, float eps2d, int camera_model, "
+      "float beta1, float beta2, float epsilon, bool needs_raw, bool deterministic) -> Tensor v_raw");
 
   // Accumulate a frame's status [4] in `totals`: the maximum of every entry, except that overflows are counted. If this
   // frame did not overflow, increment step and return fits [1] = 1, otherwise 0.

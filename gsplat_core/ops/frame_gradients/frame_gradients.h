@@ -26,6 +26,8 @@ struct PictureGradient {
   float4* rows;
   bool atomic;
   ColourCorrection correction;
+  // [N, kRawColumns], or null: gradient of further losses, added to that of the picture. Its colours are ignored.
+  const float* added;
 };
 
 // Outputs of the gradient. All zero if the frame overflowed, because its image is incomplete and must not be trained

@@ -118,6 +118,7 @@ def render_frame_backward_adam_(
     v_image: Tensor,
     v_alphas: Tensor | None = None,
     correction: ColourCorrection | None = None,
+    added: Tensor | None = None,
     *,
     needs_raw: bool = True,
     deterministic: bool = True,
@@ -137,6 +138,8 @@ def render_frame_backward_adam_(
         v_alphas: [H, W], dL/dalphas; None for zero.
         correction: residuals that replace the colour gradient. Column `COLOUR` of the result is then the colour update,
             and `sh` is not changed. Requires SH degree 0 and a `v_image` with zeros in the last channel.
+        added: gradient [N, 16] of further losses by the raw parameters with deltas, added to that of the picture. Its
+            colours are ignored.
         needs_raw: return the raw gradients.
         deterministic: as in `render_frame_backward`.
 
@@ -152,9 +155,11 @@ def render_frame_backward_adam_(
     residuals, relaxation = correction or (None, None)
     if residuals is not None:
         require_shape("residuals", residuals, (view.height, view.width, 4), "[H, W, 4]")
+    if added is not None:
+        require_shape("added", added, (len(gaussians[0]), RAW_COLUMNS), "[N, 16]")
     raw: Tensor = torch.ops.gsplat_core.render_frame_backward_adam_(
         list(gaussians), list(adam.first_moments), list(adam.second_moments), adam.rates, adam.step, adam.skipped, deltas,
-        *view.tensors, list(forward[1:]), v_image, v_alphas, residuals, relaxation, view.eps2d, view.model_index, *adam.betas,
+        *view.tensors, list(forward[1:]), v_image, v_alphas, residuals, relaxation, added, view.eps2d, view.model_index, *adam.betas,
         adam.epsilon, needs_raw, deterministic,
     )  # fmt: skip
     return raw if needs_raw else None

@@ -24,7 +24,7 @@ ViewArguments view_of(const Tensor& v_image, double eps2d, int64_t camera_model)
 // Checked forward results and image gradient, converted to kernel arguments.
 struct Backward {
   Tensor alphas, last, records, tile_offsets, sorted, splat_starts, instance_splats, status, v_image;
-  OptionalTensor v_alphas, residuals, relaxation;
+  OptionalTensor v_alphas, residuals, relaxation, added;
   Lists lists;
   PictureGradient from;
 
@@ -58,7 +58,8 @@ struct Backward {
             .last = pointer(last),
             .rows = inputs.call.array<float4>((deterministic ? lists.capacity : scene.count) * kRowQuads),
             .atomic = !deterministic,
-            .correction = {}};
+            .correction = {},
+            .added = nullptr};
   }
 
   // Enable colour corrections by `residuals`, if given.
@@ -71,6 +72,13 @@ struct Backward {
     relaxation = inputs.call.floats(*relaxation_in, "relaxation");
     check(relaxation->numel() == 1, "relaxation must be one float32, got ", relaxation->numel());
     from.correction = {data(*residuals), data(*relaxation)};
+  }
+
+  // Add the gradient of further losses, if given.
+  void add(const Inputs& inputs, const OptionalTensor& added_in) {
+    if (!added_in) return;
+    added = floats(inputs, *added_in, kRawColumns * inputs.scene.count, "added");
+    from.added = data(*added);
   }
 
  private:
@@ -117,11 +125,12 @@ std::tuple<Tensor, Tensor> render_frame_backward(Tensors gaussians, OptionalTens
 Tensor render_frame_backward_adam_(Tensors gaussians, Tensors first, Tensors second, Tensor rates, Tensor step, Tensor skipped,
                                    OptionalTensor deltas, Tensor viewmat, Tensor intrinsics, OptionalTensor background,
                                    Tensors forward, Tensor v_image, OptionalTensor v_alphas, OptionalTensor residuals,
-                                   OptionalTensor relaxation, double eps2d, int64_t camera_model, double beta1, double beta2,
-                                   double epsilon, bool needs_raw, bool deterministic) {
+                                   OptionalTensor relaxation, OptionalTensor added, double eps2d, int64_t camera_model,
+                                   double beta1, double beta2, double epsilon, bool needs_raw, bool deterministic) {
   Inputs inputs(gaussians, deltas, viewmat, intrinsics, background, view_of(v_image, eps2d, camera_model));
   Backward pass(inputs, forward, v_image, v_alphas, deterministic);
   pass.correct(inputs, residuals, relaxation);
+  pass.add(inputs, added);
   const CudaCall& call = inputs.call;
   check(first.size() == kTensors && second.size() == kTensors, "render_frame_backward_adam_: there must be ", kTensors,
         " first and second moments, got ", first.size(), " and ", second.size());

@@ -156,6 +156,16 @@ __device__ inline SplatRow sum_rows(const float4* rows, int start, int count, in
   return sum;
 }
 
+// Add a raw row, except for its colours, to another one.
+__device__ inline void add_geometry(const float* added, float (&row)[kRawColumns]) {
+  static_assert(kRawColor == 10 && kRawOpacity == 13);
+  const float4* const quads = reinterpret_cast<const float4*>(added);
+  const float4 a = quads[0], b = quads[1], c = quads[2], d = quads[3];
+  const float values[kRawColor] = {a.x, a.y, a.z, a.w, b.x, b.y, b.z, b.w, c.x, c.y};
+  for (int k = 0; k < kRawColor; ++k) row[k] += values[k];
+  row[kRawOpacity] += d.y;
+}
+
 // Results of a warp: the raw gradients of its 32 Gaussians, and the coefficients' gradients, stored over the
 // coefficients.
 template <int kDegree>
@@ -205,6 +215,7 @@ struct WarpGradients {
     for (int k = 0; k < 3; ++k) row[kRawLogScale + k] = g.log_scales[k];
     for (int k = 0; k < 3; ++k) row[kRawColor + k] = g.color[k];
     row[kRawOpacity] = g.logit;
+    if (from.added != nullptr && lane < rows && !cut) add_geometry(from.added + kRawColumns * n, row);
     raw.put(lane, row);
   }
 };

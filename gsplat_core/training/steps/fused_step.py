@@ -33,7 +33,7 @@ from gsplat_core.rendering.frame_renderer import (
     capacity_for,
 )
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.gaussians import COLOUR, LOG_SCALE, OPACITY, POSITION, RAW_COLUMNS, ROTATION, Gaussians
+from gsplat_core.scene.gaussians import COLOUR, LOG_SCALE, OPACITY, POSITION, ROTATION, Gaussians
 from gsplat_core.training.losses.registry import WeightedLosses
 from gsplat_core.training.losses.rendered_rays import compared_rays
 from gsplat_core.training.observations import Observation
@@ -48,9 +48,7 @@ GEOMETRY: Mapping[str, slice | int] = {
     "log_scales": LOG_SCALE,
     "logit_opacities": OPACITY.start,
 }
-"""Columns of the raw gradient of the tensors that can be updated after the backward pass, in the order of
-`GAUSSIAN_TENSORS`.
-"""
+"""Columns of a raw row of the tensors that losses of rays train."""
 
 
 class StepKind(NamedTuple):
@@ -148,9 +146,9 @@ class FusedStep:
         """Graph inputs by whether they belong to the right eye. Separate inputs save repeated copies when the eyes
         alternate.
         """
-        self._controls = FrameControls(device, rates=len(GAUSSIAN_TENSORS) + len(GEOMETRY) + field.rates + 1)
-        """Controls that include the learning rates of the Gaussians in the backward pass, of their geometry after it,
-        and of the field, followed by the colour relaxation.
+        self._controls = FrameControls(device, rates=len(GAUSSIAN_TENSORS) + 1 + field.rates + 1)
+        """Controls that include the learning rates of the Gaussians in the backward pass, of
+        positions after it, and of the field, followed by the colour relaxation.
         """
         self._kind = StepKind(False, False, False)
         """Kind of the newest step."""
@@ -158,8 +156,8 @@ class FusedStep:
         self._skipped = torch.zeros(len(GAUSSIAN_TENSORS), dtype=torch.int64, device=device)
         self._totals = torch.zeros(4, dtype=torch.int32, device=device)
         """Accumulated frame status since the last `settle` (see `accumulate_status_`)."""
-        self._unread: dict[str, tuple[Tensor, Tensor]] = {}
-        """Scratch moments of the tensors that are updated after the backward pass."""
+        self._unread: tuple[Tensor, Tensor] | None = None
+        """Scratch moments of positions that are updated after the backward pass."""
         self._status = FrameStatusCopy()
         self._memory = GraphMemory(device)
         self._capacity = capacity_for(4 * gaussians.count)
@@ -200,9 +198,9 @@ class FusedStep:
         if kind.of_right not in self._inputs:
             self._inputs[True] = StepInputs(self._camera, gaussians.device, with_depth=False)
         self._inputs[kind.of_right].take(observation, kind.corrects)
-        rates, later = [gaussian_rates[name] for name in self._names], len(self._updated_later)
-        in_frame, after = [*[0.0] * later, *rates[later:]], rates[: len(GEOMETRY)]
-        self._controls.set(observation.camera, time, [*in_frame, *after, *field_rates, colour_relaxation])
+        rates = [gaussian_rates[name] for name in self._names]
+        in_frame = [0.0, *rates[1:]] if self._field.reads_positions else rates
+        self._controls.set(observation.camera, time, [*in_frame, rates[0], *field_rates, colour_relaxation])
         self._gaussians = gaussians
         self._adam.steps += 1
         if kind not in self._warm:  # The first launch loads kernels, which is impossible during a capture.
@@ -245,8 +243,8 @@ class FusedStep:
         return self._addresses != before
 
     def _sequence(self) -> Tensor:
-        counts = [len(GAUSSIAN_TENSORS), len(GEOMETRY), self._field.rates, 1]
-        in_frame, of_geometry, of_field, relaxation = self._controls.rates.split(counts)
+        counts = [len(GAUSSIAN_TENSORS), 1, self._field.rates, 1]
+        in_frame, of_means, of_field, relaxation = self._controls.rates.split(counts)
         scene, controls, kind = self._gaussians, self._controls, self._kind
         right_sh = scene.right_sh if kind.of_right else None
         seen = scene if right_sh is None else scene.seen_by_right()
@@ -272,7 +270,7 @@ class FusedStep:
         )
         correction = None if target is None else target.correction(frame.image, relaxation)
         gradient = render_frame_backward_adam_(
-            gaussians, adam, deltas, view, frame, loss.grad_image, loss.grad_alphas, correction
+            gaussians, adam, deltas, view, frame, loss.grad_image, loss.grad_alphas, correction, of_rays
         )
         assert gradient is not None
         change = None
@@ -282,26 +280,15 @@ class FusedStep:
             right_sh.copy_(seen.sh - scene.sh)  # store Adam's update as the right eye's difference
         if correction is not None or right_sh is not None:
             gradient[:, COLOUR].zero_()
-        if of_rays is not None:
-            # The field receives zeros after an overflow and for values that are not finite.
-            gradient.add_((of_rays * fits).nan_to_num_(0.0, 0.0, 0.0))
         self._field.update(gradient, controls.time, of_field, self._step, frame.status)
         if change is not None:
             if right_sh is not None:
                 right_sh[:, 0].add_(change)
             elif self._field.add_colours is not None:
                 self._field.add_colours(change, controls.time)
-        self._update_later(scene, gradient, of_geometry, fits)
+        if self._field.reads_positions:
+            self._move(scene.means, gradient, of_means, fits)
         return value
-
-    @property
-    def _updated_later(self) -> tuple[str, ...]:
-        """Names of the tensors that are updated after the backward pass: those whose gradient has a further part, from
-        the field or from losses of rays.
-        """
-        if self._kind.compares_rays:
-            return tuple(GEOMETRY)
-        return ("means",) if self._field.reads_positions else ()
 
     def _compare_rays(
         self, scene: Gaussians, deltas: Tensor | None, view: View, inputs: StepInputs, status: Tensor
@@ -321,11 +308,12 @@ class FusedStep:
         assert needed is not None
         status[STATUS_NEEDED] = torch.maximum(status[STATUS_NEEDED], needed[0].int())
         status[STATUS_OVERFLOW].bitwise_or_(needed[0] > self._capacity)
-        gradient = scene.means.new_zeros(scene.count, RAW_COLUMNS)
-        for columns, part in zip(GEOMETRY.values(), found, strict=True):
-            if part is not None:
-                gradient[:, columns] = part
-        return loss.detach(), gradient
+        parts = [
+            torch.zeros_like(leaf) if part is None else part for leaf, part in zip(leaves.values(), found, strict=True)
+        ]
+        means, quats, log_scales, logit_opacities = parts
+        none = torch.zeros_like(means)
+        return loss.detach(), torch.cat([means, quats, log_scales, none, logit_opacities[:, None], none[:, :2]], 1)
 
     @property
     def _names(self) -> tuple[str, ...]:
@@ -333,30 +321,26 @@ class FusedStep:
         return (*GAUSSIAN_TENSORS[:-1], RIGHT if self._kind.of_right else LEFT)
 
     def _moments(self) -> tuple[list[Tensor], list[Tensor]]:
-        """Return Adam's moments for the backward pass. Tensors that are updated later have a rate of 0 there, and
-        scratch moments are passed.
+        """Return Adam's moments for the backward pass. If the field contributes to the positions'
+        gradient, positions are not updated there: their rate is 0 and scratch moments are passed.
         """
-        moments = {name: (self._adam.first_moments[name], self._adam.second_moments[name]) for name in self._names}
-        for name in self._updated_later:
-            shape = moments[name][0].shape
-            if name not in self._unread or self._unread[name][0].shape != shape:
-                self._unread[name] = torch.zeros_like(moments[name][0]), torch.zeros_like(moments[name][1])
-            moments[name] = self._unread[name]
-        return [first for first, _ in moments.values()], [second for _, second in moments.values()]
+        first = [self._adam.first_moments[name] for name in self._names]
+        second = [self._adam.second_moments[name] for name in self._names]
+        if self._field.reads_positions:
+            if self._unread is None or self._unread[0].shape != first[0].shape:
+                self._unread = torch.zeros_like(first[0]), torch.zeros_like(second[0])
+            first[0], second[0] = self._unread
+        return first, second
 
-    def _update_later(self, scene: Gaussians, gradient: Tensor, rates: Tensor, fits: Tensor) -> None:
-        """Apply Adam to the tensors of `_updated_later` with the complete gradient [N, 16]."""
-        if not self._updated_later:
-            return
+    def _move(self, means: Tensor, gradient: Tensor, rate: Tensor, fits: Tensor) -> None:
+        """Apply Adam to the positions with the complete gradient."""
         # The quotient is NaN if the frame overflowed its tile lists. Adam then skips all rows and their moments.
-        complete, tensors = gradient / fits, scene.tensors()
-        for index, name in enumerate(self._updated_later):
-            tensor = tensors[name]
-            adam_step_at_(
-                tensor, complete[:, GEOMETRY[name]], self._adam.first_moments[name], self._adam.second_moments[name],
-                rates[index : index + 1], self._step, self._skipped[index : index + 1], self._adam.betas,
-                self._adam.epsilon, row_size=tensor.shape[1:].numel(),
-            )  # fmt: skip
+        complete = gradient[:, :3] / fits
+        first, second = self._adam.first_moments["means"], self._adam.second_moments["means"]
+        adam_step_at_(
+            means, complete, first, second, rate, self._step, self._skipped[:1], self._adam.betas,
+            self._adam.epsilon, row_size=3,
+        )  # fmt: skip
 
 
 def _addresses_of(tensors: Sequence[Tensor]) -> tuple[int, ...]:

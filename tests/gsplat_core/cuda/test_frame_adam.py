@@ -12,6 +12,7 @@ from torch import Tensor
 from gsplat_core.ops.frame.frame import STATUS_OVERFLOW, Frame
 from gsplat_core.ops.frame_gradients.frame_gradients import GaussianAdam, render_frame_backward_adam_
 from gsplat_core.reference.adam import adam_step
+from gsplat_core.scene.gaussians import OPACITY
 from tests.gsplat_core.cuda.frame_scenes import (
     NAMES,
     FrameScene,
@@ -41,6 +42,7 @@ class AdamState:
         scale: float = 1.0,
         dtype: torch.dtype = torch.int64,
         needs_raw: bool = True,
+        added: Tensor | None = None,
     ) -> Tensor | None:
         s = self.scene
         v_image, v_alphas = s.picture_gradients()
@@ -54,6 +56,7 @@ class AdamState:
             forward,
             scale * v_image.cuda(),
             scale * v_alphas.cuda(),
+            added=added,
             needs_raw=needs_raw,
         )
 
@@ -99,6 +102,31 @@ def test_fused_adam_leaves_rows_alone_whose_gradient_is_not_finite() -> None:
     assert raw.isfinite().all()
 
 
+@pytest.mark.parametrize("degree", [0, 2])
+def test_fused_adam_adds_the_gradient_of_further_losses_except_for_colours(degree: int) -> None:
+    scene = on_gpu(frame_scene(333, degree=degree, deltas=True))
+    added = torch.randn(333, 16, generator=torch.Generator().manual_seed(1)).cuda()
+    added[7] = math.nan
+    state, forward = AdamState(scene), rendered(scene)
+    gradients = backward(scene, forward)
+    wanted = gradients.raw + torch.where(torch.arange(16, device="cuda") < 10, added, 0)
+    wanted[:, OPACITY] = (gradients.raw + added)[:, OPACITY]
+    named = by_name(gradients._replace(raw=wanted), scene.sh.shape[1])
+    expected = [[t.double().cpu() for t in group] for group in (scene.gaussians, state.first, state.second)]
+    for rate, name, p, m, v in zip(state.rates, NAMES, *expected, strict=True):
+        adam_step(p, named[name], m, v, 1, rate, row_size=max(1, p[0].numel()))
+    raw = state.step(forward, 1, added=added)
+    assert raw is not None
+    assert not raw[7].any()
+    finite = torch.arange(333, device="cuda") != 7
+    torch.testing.assert_close(raw[finite, :14], wanted[finite, :14])
+    assert not raw[:, 14:].any()
+    assert state.skipped.tolist() == [1, 1, 1, 1, 0]
+    for group, exact_group in zip((state.scene.gaussians, state.first, state.second), expected, strict=True):
+        for actual, exact in zip(group, exact_group, strict=True):
+            torch.testing.assert_close(actual.cpu().double(), exact, rtol=1e-5, atol=2e-6)
+
+
 def test_fused_adam_without_raw_gradients_and_twice_the_same() -> None:
     scene = on_gpu(frame_scene(1000, 200, 100, degree=3))
     forward = rendered(scene)
@@ -138,7 +166,7 @@ def test_a_frame_that_overflowed_changes_nothing() -> None:
     forward = rendered(scene)
     forward.status[STATUS_OVERFLOW] = 1
     state = AdamState(scene)
-    raw = state.step(forward, 1)
+    raw = state.step(forward, 1, added=torch.ones(300, 16, device="cuda"))
     assert raw is not None
     assert not raw.any()
     assert all(torch.equal(a, b) for a, b in zip(state.scene.gaussians, scene.gaussians, strict=True))
@@ -150,8 +178,8 @@ def test_op_passes_opcheck(degree: int) -> None:
     scene = on_gpu(frame_scene(30, 20, 18, degree=degree, deltas=degree > 0))
     v_image, v_alphas = (t.cuda() for t in scene.picture_gradients())
     state = AdamState(scene)
-    without_colours = (None, None)
-    inputs = (scene.deltas, *scene.view.tensors, list(rendered(scene)[1:]), v_image, v_alphas, *without_colours)
+    without_colours, added = (None, None), torch.ones(30, 16, device="cuda") if degree > 0 else None
+    inputs = (scene.deltas, *scene.view.tensors, list(rendered(scene)[1:]), v_image, v_alphas, *without_colours, added)
     rates, step = torch.full((5,), 0.01, device="cuda"), torch.ones(1, dtype=torch.int64, device="cuda")
     adam = (state.scene.gaussians, state.first, state.second, rates, step, state.skipped)
     options = (0.3, 0, 0.9, 0.999, 1e-8, degree > 0, True)
