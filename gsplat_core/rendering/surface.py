@@ -110,12 +110,10 @@ def blend_view_rays(
     means2d, conics, *lists, needed = _projected(gaussians, scales, opacities, view, capacity)
     rays, normals = splat_rays(gaussians.means, gaussians.quats, scales, view.viewmat, view.K, view.camera_model)
     values = normals if values is None else torch.cat([normals, values], 1)
-    parts = [
-        blend_rays(means2d, conics, opacities, rays, part, view.width, view.height, *lists)
-        for part in values.split(MAX_CHANNELS, 1)
-    ]
-    if len(parts) == 1:
-        return parts[0], needed
+    blend = lambda part: blend_rays(means2d, conics, opacities, rays, part, view.width, view.height, *lists)
+    if values.shape[1] <= MAX_CHANNELS:
+        return blend(values), needed
+    parts = [blend(part) for part in values.split(MAX_CHANNELS, 1)]
     return parts[0]._replace(values=torch.cat([part.values for part in parts], -1)), needed
 
 

@@ -132,14 +132,25 @@ def _setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]
     *tensors, width, height, max_alpha = inputs
     _, alphas, depths, _, variances, last, median_at = output
     ctx.mark_non_differentiable(variances, last, median_at)
+    ctx.set_materialize_grads(False)
     ctx.save_for_backward(*tensors, alphas, depths, last, median_at)
     ctx.sizes, ctx.max_alpha = (width, height), max_alpha
 
 
 def _backward(
-    ctx: Any, v_values: Tensor, v_alphas: Tensor, v_depths: Tensor, v_medians: Tensor, *_: Tensor | None
+    ctx: Any,
+    v_values: Tensor | None,
+    v_alphas: Tensor | None,
+    v_depths: Tensor | None,
+    v_medians: Tensor | None,
+    *_: Tensor | None,
 ) -> tuple[Tensor | None, ...]:
     *tensors, alphas, depths, last, median_at = ctx.saved_tensors
+    if v_values is None:
+        v_values = alphas.new_zeros(*alphas.shape, tensors[4].shape[1])
+    v_alphas, v_depths, v_medians = (
+        torch.zeros_like(alphas) if each is None else each for each in (v_alphas, v_depths, v_medians)
+    )
     gradients = torch.ops.gsplat_core.blend_rays_backward(
         *tensors, *ctx.sizes, alphas, depths, last, median_at, v_values, v_alphas, v_depths, v_medians, ctx.max_alpha
     )

@@ -117,5 +117,7 @@ class WeightedLosses:
             rays: rays for which `are_rays_due` returned True.
         """
         has_depth = rays.known_depth is not None
-        terms = [weight * loss.compare(rays) for loss, weight in self._of_rays if has_depth or not loss.needs_depth]
-        return EVERY * sum(terms[1:], start=terms[0])
+        terms = [
+            (EVERY * weight) * loss.compare(rays) for loss, weight in self._of_rays if has_depth or not loss.needs_depth
+        ]
+        return sum(terms[1:], start=terms[0])

@@ -78,8 +78,8 @@ def compared_rays(
     stride = 1 if view.width * view.height <= SMALL_PIXELS else 2
     if stride > 1:
         K = view.K.clone()
-        K[:2] /= stride
-        K[:2, 2] += 0.5 - 0.5 / stride
+        K[:2].div_(stride)
+        K[:2, 2].add_(0.5 - 0.5 / stride)
         view = view._replace(K=K, width=view.width // stride, height=view.height // stride)
     rays, needed = blend_view_rays(scene, view, values, capacity)
     tissue = (rays.alphas >= COVERED) & (_sampled(mask, view, stride) != 0)
