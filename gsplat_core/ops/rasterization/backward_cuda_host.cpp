@@ -95,8 +95,9 @@ std::vector<Tensor> rasterize_inputs_backward(OptionalTensors given, Tensor radi
   const ProjectedGradients from = {
       int_data(radii), row_of ? int_data(*row_of) : nullptr, data(v[0]), data(v[1]), data(v[2]), data(v[3]), data(v[4])};
   const Allocator memory(radii);
+  const Tensor none = memory.floats({0});
   const auto gradient_of = [&](Input i, bool wanted) {
-    return memory.floats(wanted && inputs.tensors[i] ? sizes_of(*inputs.tensors[i]) : Sizes{0});
+    return wanted && inputs.tensors[i] ? memory.floats(sizes_of(*inputs.tensors[i])) : none;
   };
   std::vector<Tensor> out;
   const bool views = needs[kViewmats] || needs[kCenters];

@@ -111,13 +111,13 @@ struct Pass {
   bool run(int64_t capacity) {
     const int64_t n = scene.gaussians;
     const bool own_opacities = scene.antialiased;
+    ListScratch scratch(memory, scene, packed, training, capacity, call.stream);  // its memory is cleared during the allocations
     means2d = memory.floats(of_images({n, 2}));
     depths = memory.floats(of_images({n}));
     conics = memory.floats(of_images({n, 3}));
     radii = memory.ints(of_images({n, 2}));
     tiles_per_gauss = memory.ints(of_images({n}));
     if (own_opacities) opacities = memory.floats(of_images({n}));
-    ListScratch scratch(memory, scene, packed, training, capacity, call.stream);
     if (training) {
       records = memory.floats({scene.images() * n, kSplatFloats});
       splat_starts = memory.ints({scene.images() * n + 1});
