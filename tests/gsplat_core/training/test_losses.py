@@ -12,6 +12,7 @@ from gsplat_core.training.config import LearningRates, ReconstructorConfig
 from gsplat_core.training.growth.initialisation import gaussians_from_frame
 from gsplat_core.training.losses.loss import LossContext
 from gsplat_core.training.losses.registry import loss_weights
+from gsplat_core.training.losses.rendered_rays import EVERY
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.steps.photometric import LossWeights, loss_and_gradients
@@ -31,10 +32,31 @@ class SmallOpacities:
         return scene.logit_opacities.mean() if observation.seq < 100 else None
 
 
+COMPARED_RAYS = []
+
+
+class NearSurface:
+    """Mean depth of the rays, as an example of a loss of rays; records the sizes of the compared pictures."""
+
+    name = "near_surface"
+    default_weight = 1.0
+    needs_depth = False
+
+    def compare(self, rays):
+        COMPARED_RAYS.append(tuple(rays.depths.shape))
+        return torch.where(rays.tissue, rays.depths, 0).mean()
+
+
 @pytest.fixture
 def small_opacities(monkeypatch):
     monkeypatch.setattr(LOSSES, "_entries", {**LOSSES._entries, "small_opacities": SmallOpacities})
     SEEN_BY_THE_LOSS.clear()
+
+
+@pytest.fixture
+def near_surface(monkeypatch):
+    monkeypatch.setattr(LOSSES, "_entries", {**LOSSES._entries, "near_surface": NearSurface})
+    COMPARED_RAYS.clear()
 
 
 @pytest.fixture
@@ -86,6 +108,19 @@ def test_a_named_loss_is_trained(small_opacities, make_step, make_frame, camera,
     for _ in range(3):
         with_loss(seen)
     assert bool((with_loss.gaussians.logit_opacities < before - 0.2).all())
+
+
+@pytest.mark.parametrize("field", ["basis", "hexplane"])
+def test_a_named_loss_of_rays_is_trained_in_some_steps(near_surface, make_step, make_frame, camera, field):
+    seen = Observation.of(make_frame(4, shift_px=1), camera)
+    rates = LearningRates(0.5, 0.0, 0.0, 0.0, 0.0)
+    plain, with_loss = make_step(field, rates=rates), make_step(field, rates=rates, losses=("near_surface:100",))
+    for _ in range(2 * EVERY):
+        plain(seen)
+        with_loss(seen)
+    assert len(COMPARED_RAYS) == 2
+    nearer = plain.at(seen.time_s).means[:, 2] - with_loss.at(seen.time_s).means[:, 2]
+    assert float(nearer.median()) > 0.02
 
 
 def test_the_loss_value_is_added(small_opacities, make_step, make_frame, camera):
@@ -143,3 +178,20 @@ def test_a_named_loss_is_trained_on_a_gpu(gpu, small_opacities, make_frame, came
     lower = plain.snapshot().gaussians.logit_opacities - online.snapshot().gaussians.logit_opacities
     assert float(lower.mean()) > 0.1
     assert SEEN_BY_THE_LOSS
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("field", ["basis", "hexplane"])
+def test_a_named_loss_of_rays_is_captured_on_a_gpu(gpu, near_surface, make_frame, camera, field):
+    """Python runs for few of ten comparisons: before a capture and in it."""
+    rates = LearningRates(0.5, 0.0, 0.0, 0.0, 0.0)
+    config = ReconstructorConfig(
+        field=field, gaussians=300, rates=rates, losses=("near_surface:100",), first_frame_steps=10 * EVERY
+    )
+    online = Reconstructor(config, camera, device=gpu)
+    online.observe(make_frame())
+    plain = Reconstructor(dataclasses.replace(config, losses=()), camera, device=gpu)
+    plain.observe(make_frame())
+    assert 0 < len(COMPARED_RAYS) <= 4
+    nearer = plain.snapshot().gaussians.means[:, 2] - online.snapshot().gaussians.means[:, 2]
+    assert float(nearer.median()) > 0.02
