@@ -541,11 +541,7 @@ class Operations(StepOperations):
                 if camera.given:
                     ops, arguments, settings = with_unscented_camera(self, camera, arguments, settings)
                     signature = None
-            call = CheckedCall(settings, None if ops.single_call is None else ops.single_call(arguments, settings))
-            if signature is not None:
-                if len(self.checked) >= MOST_CHECKED_CALLS:
-                    self.checked.clear()
-                self.checked[signature] = call
+            call = ops._chosen(signature, arguments, settings)
         settings = call.settings
         if call.native is not None:
             return _named_as_in_gsplat(call.native(arguments), arguments, settings)
@@ -560,12 +556,24 @@ class Operations(StepOperations):
 
     def pictures(self, arguments: Arguments, settings: RenderSettings) -> tuple[Tensor, Tensor]:
         """Return colours and alphas as `rasterization`, without values that only `meta` needs."""
-        native = None if self.single_call is None else self.single_call(arguments, settings)
-        if native is not None:
-            rendered = native(arguments)
+        signature = signature_of(arguments, tuple(vars(settings).values()))
+        call = None if signature is None else self.checked.get(signature)
+        if call is None:
+            call = self._chosen(signature, arguments, settings)
+        if call.native is not None:
+            rendered = call.native(arguments)
             return rendered.image, rendered.alphas
         image, splats, *_ = _step_by_step(self, arguments, settings)
         return image, splats.alphas
+
+    def _chosen(self, signature: Hashable | None, arguments: Arguments, settings: RenderSettings) -> CheckedCall:
+        """Choose between a native call and the chain of operations; remember the choice if there is a signature."""
+        call = CheckedCall(settings, None if self.single_call is None else self.single_call(arguments, settings))
+        if signature is not None:
+            if len(self.checked) >= MOST_CHECKED_CALLS:
+                self.checked.clear()
+            self.checked[signature] = call
+        return call
 
 
 def _named_as_in_gsplat(out: Rasterized, arguments: Arguments, settings: RenderSettings) -> tuple[Tensor, Tensor, Meta]:

@@ -11,7 +11,7 @@ from gsplat_core.errors import InvalidInput
 from gsplat_core.rendering import pipeline
 from gsplat_core.rendering.pipeline import Operations
 from gsplat_core.rendering.rasterization import step_by_step
-from gsplat_core.rendering.settings import check_tensors
+from gsplat_core.rendering.settings import Arguments, RenderSettings, check_tensors
 
 
 @pytest.fixture
@@ -107,3 +107,16 @@ def test_a_native_call_is_chosen_once_and_gets_the_tensors_of_each_call():
             operations.rasterization(**call)
     assert chosen == [16]
     assert [arguments.means is call["means"] for arguments, call in zip(rendered, calls, strict=True)] == [True, True]
+
+
+def test_pictures_without_meta_choose_once_and_never_take_the_choice_of_a_call_with_meta(operations):
+    chosen = []
+    operations = replace(operations, single_call=lambda arguments, settings: chosen.append(settings.width))
+    call = scene()
+    tensors = [call.get(name) for name in Arguments._fields]
+    settings = RenderSettings(16, 16)
+    with_meta = operations.rasterization(**call)
+    for _ in range(2):
+        image, alphas = operations.pictures(Arguments(*tensors), settings)
+        assert torch.equal(image, with_meta[0]) and torch.equal(alphas, with_meta[1])
+    assert chosen == [16, 16]
