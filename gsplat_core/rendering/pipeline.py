@@ -498,7 +498,7 @@ class Operations(StepOperations):
             render_colors [..., C, H, W, X], render_alphas [..., C, H, W, 1] and `meta`, a dict with batch_ids, camera_ids and
             gaussian_ids (None unless packed), radii, means2d (call retain_grad() on it to see its gradient), depths,
             conics, opacities, tile_width, tile_height, tiles_per_gauss, isect_ids, flatten_ids, isect_offsets, width,
-            height, tile_size, n_batches and n_cameras.
+            height, tile_size, n_batches and n_cameras. On CUDA flatten_ids and isect_ids may be views of larger memory.
 
         A Gaussian with a NaN or an infinity in any input, or a rotation of length zero, is culled. It has radii 0,
         gets zero gradients and does not affect other Gaussians.
