@@ -57,7 +57,8 @@ std::tuple<Tensor, Tensor> ray_depth_loss(Tensor depths, Tensor known, Tensor ti
   const int64_t height = depths_.size(0), width = depths_.size(1);
   Tensor value = call.empty({}), v_depths = call.empty({height, width});
   run(call,
-      {data(depths_), data(known_), tissue_.const_data_ptr<uint8_t>(), int32_t(height), int32_t(width), mutable_data(v_depths)},
+      DepthLoss{data(depths_), data(known_), tissue_.const_data_ptr<uint8_t>(), int32_t(height), int32_t(width),
+                mutable_data(v_depths)},
       mutable_data(value));
   call.finish("ray_depth_loss");
   return {value, v_depths};
@@ -79,19 +80,19 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> ray_normal_loss(Tensor depths, Tensor
   Tensor value = call.empty({}), v_depths = call.empty({height, width}), v_alphas = call.empty({height, width});
   Tensor v_normals = call.empty({height, width, 3});
   run(call,
-      {.depths = data(depths_),
-       .alphas = data(alphas_),
-       .normals = data(normals_),
-       .tissue = tissue_.const_data_ptr<uint8_t>(),
-       .K = data(K_),
-       .height = int32_t(height),
-       .width = int32_t(width),
-       .camera_model = int32_t(camera_model),
-       .changes = call.array<float>(4 * pixels),
-       .bits = call.array<uint8_t>(pixels),
-       .v_depths = mutable_data(v_depths),
-       .v_alphas = mutable_data(v_alphas),
-       .v_normals = mutable_data(v_normals)},
+      NormalLoss{.depths = data(depths_),
+                 .alphas = data(alphas_),
+                 .normals = data(normals_),
+                 .tissue = tissue_.const_data_ptr<uint8_t>(),
+                 .K = data(K_),
+                 .height = int32_t(height),
+                 .width = int32_t(width),
+                 .camera_model = int32_t(camera_model),
+                 .changes = call.array<float>(4 * pixels),
+                 .bits = call.array<uint8_t>(pixels),
+                 .v_depths = mutable_data(v_depths),
+                 .v_alphas = mutable_data(v_alphas),
+                 .v_normals = mutable_data(v_normals)},
       mutable_data(value));
   call.finish("ray_normal_loss");
   return {value, v_depths, v_alphas, v_normals};

@@ -196,7 +196,9 @@ class FusedStep:
             self._losses is not None and self._losses.are_rays_due(observation),
         )
         if kind.of_right not in self._inputs:
-            self._inputs[True] = StepInputs(self._camera, gaussians.device, with_depth=False)
+            self._inputs[True] = StepInputs(
+                self._camera, gaussians.device, with_depth=False, ray_depth=self._losses is not None
+            )
         self._inputs[kind.of_right].take(observation, kind.corrects)
         rates = [gaussian_rates[name] for name in self._names]
         in_frame = [0.0, *rates[1:]] if self._field.reads_positions else rates
