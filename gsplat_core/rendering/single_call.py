@@ -38,7 +38,8 @@ _DEPTH_MODES = {"RGB": NO_DEPTH, "D": DEPTH_SUM, "ED": EXPECTED_DEPTH, "RGB+D": 
 def next_capacity(capacity: int, length: int) -> int:
     """Return the capacity of the tile lists for the next call of the same kind, or 0 to wait for their length.
 
-    The capacity is kept while it fits, so that equal calls allocate equal sizes.
+    The capacity is kept while at least an eighth of the length is to spare, so that equal calls allocate equal sizes.
+    It falls slowly, because views with long and with short lists may alternate.
 
     Args:
         capacity: of the last call.
@@ -46,9 +47,9 @@ def next_capacity(capacity: int, length: int) -> int:
     """
     if length > MOST_RESERVED_ENTRIES:
         return 0
-    if 0 < length <= capacity <= 2 * length:
+    if 0 < length + length // 8 <= capacity <= 2 * length:
         return capacity
-    return length + length // 4 + FEWEST_RESERVED_ENTRIES
+    return max(length + length // 4 + FEWEST_RESERVED_ENTRIES, capacity - capacity // 16)
 
 
 class SingleCall:

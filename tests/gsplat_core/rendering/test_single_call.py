@@ -53,10 +53,16 @@ def test_lists_that_outgrow_the_capacity_raise_it_for_the_next_call(capacities_f
     assert capacities[1] < 50_000 < 55_000 < capacities[2] == capacities[3]
 
 
-def test_lists_that_become_short_free_memory(capacities_for):
-    capacities = capacities_for([100_000, 100_000, 1000, 1000, 0, 0])
-    assert capacities[3] < 4000
-    assert capacities[5] == FEWEST_RESERVED_ENTRIES
+def test_lists_that_stay_short_free_memory(capacities_for):
+    capacities = capacities_for([100_000, 100_000, *[1000] * 100, *[0] * 100])
+    assert capacities[101] < 4000
+    assert capacities[-1] == FEWEST_RESERVED_ENTRIES
+
+
+def test_views_with_long_and_short_lists_may_alternate(capacities_for):
+    lengths = [100_000, 1000] * 20
+    capacities = capacities_for(lengths)
+    assert all(length <= capacity for length, capacity in zip(lengths[1:], capacities[1:], strict=True))
 
 
 def test_nothing_is_reserved_for_very_long_lists(capacities_for):
