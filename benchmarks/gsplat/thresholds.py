@@ -1,12 +1,13 @@
-"""Differences of blended pictures from float64, in the scene and with the calls of gsplat's `test_rasterize_to_pixels`.
+"""Differences of blended pictures from float64, in the scenes and with the calls of two tests of gsplat.
 
     python benchmarks/gsplat/thresholds.py [--device cpu|cuda] [--points 20000] [--seeds 0 1 2]
 
-Blending omits a splat with an opacity below 1/255 and ends where the transmittance is at most 1e-4. A splat whose value is
-closer to a threshold than float32 can represent is decided by rounding. Two correct implementations then differ at this
-pixel. The picture is therefore compared with float64 pictures in which the thresholds are changed by the relative amount
-MARGIN. A value that differs from the float64 picture by more than the tolerance of gsplat's test, but is within it for
-one of the changed pictures, is explained by rounding.
+The tests are `test_rasterize_to_pixels` with 3 channels and `test_rasterize_to_pixels_2dgs`. Blending omits a splat with an
+opacity below 1/255 and ends where the transmittance is at most 1e-4. A splat whose value is closer to a threshold than
+the rounding of float32 is decided by rounding. Two correct implementations then differ at this pixel. The picture is
+therefore compared with float64 pictures in which the thresholds are changed by the relative amount `margin`. A value that
+differs from the float64 picture by more than the tolerance of gsplat's test, but is within it for one of the changed
+pictures, is explained by rounding.
 """
 
 from __future__ import annotations
@@ -15,7 +16,10 @@ import itertools
 import math
 import sys
 import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 from unittest.mock import patch
 
@@ -25,16 +29,76 @@ from own_tests import synthetic_scene
 from torch import Tensor
 
 import gsplat_core
-from gsplat_core.reference import compositing
+from gsplat_core.reference import compositing, surfel_blending
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "methods"))
 
 import log
 
 TILE_SIZE = 16
-MARGIN = 1e-5
-TOLERANCE = {"rtol": 1.3e-6, "atol": 1e-5}
-"""Tolerance of `torch.testing.assert_close` for float32, which gsplat's test uses."""
+
+
+@dataclass(frozen=True)
+class Test:
+    """A test of gsplat: compared function, its float64 reference, margin of thresholds and tolerance."""
+
+    blend: Callable[..., Sequence[Tensor]]
+    reference: Callable[..., Sequence[Tensor]]
+    module: ModuleType
+    margin: float
+    rtol: float
+    atol: float
+
+    def close(self, found: Tensor, expected: Tensor) -> Tensor:
+        """Return where values are within the tolerance of the test, bool."""
+        return torch.isclose(found.double(), expected, rtol=self.rtol, atol=self.atol)
+
+    def compared(self, arguments: dict[str, Any]) -> dict[str, Any]:
+        """Return the numbers of values that differ from float64, and of those that rounding at a threshold explains."""
+        found = torch.cat(self.blend(**arguments)[:OUTPUTS], -1)
+        doubles = {
+            name: value.double() if isinstance(value, Tensor) and value.is_floating_point() else value
+            for name, value in arguments.items()
+        }
+        explained = torch.zeros_like(found, dtype=torch.bool)
+        # The first picture has the thresholds as they are.
+        for alpha, stop in itertools.product((0, -1, 1), repeat=2):
+            with (
+                torch.no_grad(),
+                patch.object(self.module, "ALPHA_MIN", self.module.ALPHA_MIN * (1 + alpha * self.margin)),
+                patch.object(
+                    self.module, "TRANSMITTANCE_STOP", self.module.TRANSMITTANCE_STOP * (1 + stop * self.margin)
+                ),
+            ):
+                expected = torch.cat(self.reference(**doubles)[:OUTPUTS], -1)
+            if alpha == stop == 0:
+                error, different = (found - expected).abs(), ~self.close(found, expected)
+            explained |= self.close(found, expected)
+        left = error[different & ~explained]
+        return {
+            "values": found.numel(),
+            "different": int(different.sum()),
+            "explained": int((different & explained).sum()),
+            "largest_difference": float(error.max()),
+            "largest_unexplained": float(left.max()) if left.numel() else 0.0,
+        }
+
+
+OUTPUTS = 3
+"""Number of outputs that are compared: colours, opacities and normals."""
+TESTS = {
+    "test_rasterize_to_pixels": Test(
+        gsplat_core.rasterize_to_pixels, compositing.rasterize_to_pixels, compositing, 1e-5, 1.3e-6, 1e-5
+    ),
+    "test_rasterize_to_pixels_2dgs": Test(
+        gsplat_core.rasterize_to_pixels_2dgs,
+        surfel_blending.rasterize_to_pixels_2dgs,
+        surfel_blending,
+        1e-3,
+        1e-3,
+        1e-3,
+    ),
+}
 
 
 def scene(points: int, width: int, height: int, seed: int, device: str) -> dict[str, Any]:
@@ -73,36 +137,36 @@ def scene(points: int, width: int, height: int, seed: int, device: str) -> dict[
     }
 
 
-def close(found: Tensor, expected: Tensor) -> Tensor:
-    """Return where values are within the tolerance of gsplat's test, bool."""
-    return torch.isclose(found.double(), expected, rtol=TOLERANCE["rtol"], atol=TOLERANCE["atol"])
-
-
-def compared(arguments: dict[str, Any]) -> dict[str, Any]:
-    """Return the numbers of values that differ from float64, and of those that rounding at a threshold explains."""
-    found = torch.cat(gsplat_core.rasterize_to_pixels(**arguments), -1)
-    doubles = {
-        name: value.double() if isinstance(value, Tensor) and value.is_floating_point() else value
-        for name, value in arguments.items()
-    }
-    explained = torch.zeros_like(found, dtype=torch.bool)
-    for alpha, stop in itertools.product((0, -1, 1), repeat=2):
-        with (
-            torch.no_grad(),
-            patch.object(compositing, "ALPHA_MIN", compositing.ALPHA_MIN * (1 + alpha * MARGIN)),
-            patch.object(compositing, "TRANSMITTANCE_STOP", compositing.TRANSMITTANCE_STOP * (1 + stop * MARGIN)),
-        ):
-            expected = torch.cat(compositing.rasterize_to_pixels(**doubles), -1)
-        if alpha == stop == 0:
-            different = ~close(found, expected)
-            error = (found - expected).abs()
-        explained |= close(found, expected)
+def surfel_scene(count: int, width: int, height: int, seed: int, device: str) -> dict[str, Any]:
+    """Return the arguments of `rasterize_to_pixels_2dgs` as the test makes them, for one of its equal cameras."""
+    random = torch.Generator().manual_seed(seed)
+    means = torch.randn(count, 3, generator=random)
+    quats = torch.nn.functional.normalize(torch.randn(count, 4, generator=random), dim=-1)
+    scales = torch.ones(count, 3)
+    scales[:, :2] *= 0.1
+    opacities, colors = 0.5 * torch.rand(1, count, generator=random), torch.rand(1, count, 3, generator=random)
+    Ks = torch.tensor([[[width, 0.0, width // 2], [0.0, width, height // 2], [0.0, 0.0, 1.0]]])
+    means, quats, scales, opacities, colors, Ks = (
+        each.to(device) for each in (means, quats, scales, opacities, colors, Ks)
+    )
+    radii, means2d, depths, transforms, normals = gsplat_core.fully_fused_projection_2dgs(
+        means, quats, scales, torch.eye(4, device=device)[None], Ks, width, height
+    )
+    tiles = math.ceil(width / TILE_SIZE), math.ceil(height / TILE_SIZE)
+    _, isect_ids, flatten_ids = gsplat_core.isect_tiles(means2d, radii, depths, TILE_SIZE, *tiles)
     return {
-        "values": found.numel(),
-        "different": int(different.sum()),
-        "explained": int((different & explained).sum()),
-        "largest_difference": float(error.max()),
-        "largest_difference_within_tolerance": float(error[~different].max()),
+        "means2d": means2d,
+        "ray_transforms": transforms,
+        "colors": torch.cat([colors, depths[..., None]], -1),
+        "opacities": opacities,
+        "normals": normals,
+        "densify": torch.zeros_like(means2d),
+        "image_width": width,
+        "image_height": height,
+        "tile_size": TILE_SIZE,
+        "isect_offsets": gsplat_core.isect_offset_encode(isect_ids, 1, *tiles),
+        "flatten_ids": flatten_ids,
+        "backgrounds": torch.zeros(1, 4, device=device),
     }
 
 
@@ -113,8 +177,19 @@ def main() -> None:
     parser.add_argument("--height", type=int, default=240)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     chosen = parser.parse_args()
-    runs = [compared(scene(chosen.points, chosen.width, chosen.height, seed, chosen.device)) for seed in chosen.seeds]
-    log.write("thresholds", chosen, {"margin": MARGIN, **TOLERANCE, "runs": runs}, "gsplat")
+    size = chosen.width, chosen.height
+    figures: dict[str, Any] = {}
+    for name, test in TESTS.items():
+        surfels = test.module is surfel_blending
+        scenes = (
+            surfel_scene(chosen.points // 20, 2 * size[0], 2 * size[1], seed, chosen.device)
+            if surfels
+            else scene(chosen.points, *size, seed, chosen.device)
+            for seed in chosen.seeds
+        )
+        stated = {"margin": test.margin, "rtol": test.rtol, "atol": test.atol}
+        figures[name] = {**stated, "runs": [test.compared(each) for each in scenes]}
+    log.write("thresholds", chosen, figures, "gsplat")
 
 
 if __name__ == "__main__":
