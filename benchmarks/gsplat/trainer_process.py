@@ -73,6 +73,8 @@ def main() -> None:
     complete()
     add_seed(int(seed))
     waited = watch_waiting()
+    # The first step of an optimiser imports this package of torch, which takes seconds and would count as training.
+    importlib.import_module("torch._dynamo")
     runpy.run_path(script, run_name="__main__")
     gsplat = importlib.import_module("gsplat")
     found = {

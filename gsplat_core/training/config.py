@@ -52,6 +52,14 @@ class LearningRates:
     def __post_init__(self) -> None:
         check_rates({name: rate for name, rate in vars(self).items() if name != "field"})
 
+    @classmethod
+    def offline(cls, field: FieldRates | None = None) -> LearningRates:
+        """Return the rates for `Reconstructor.fit`, which lowers them towards the end of training.
+
+        The Gaussians' own rates are twice as high as for a stream, which keeps them constant.
+        """
+        return cls(means_px=0.06, quats=4e-3, log_scales=1e-2, logit_opacities=4e-2, sh=1e-2, field=field)
+
 
 @dataclass(frozen=True)
 class ReconstructorConfig:
@@ -172,7 +180,7 @@ class ReconstructorConfig:
             motion_spacing_s=FIELDS[field].offline_spacing_s,
             squared_error=True,
             depth_of_recording="parallax",
-            rates=LearningRates(field=FIELDS[field].offline_rates),
+            rates=LearningRates.offline(FIELDS[field].offline_rates),
         )
 
     def starting_from(self, frame: Frame, all_known: bool) -> ReconstructorConfig:
