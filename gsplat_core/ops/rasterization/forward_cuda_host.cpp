@@ -163,7 +163,7 @@ struct Pass {
     lists.length = checked(length);
     if (lists.length > lists.capacity) return false;
     if (packed) pack_rows(splats, scratch, rows.wait(), lists);
-    for (Tensor* t : {&flatten_ids, &isect_ids, &sorted})
+    for (Tensor* t : {&flatten_ids, &splat_ids, &isect_ids, &sorted})
       if (t->numel() > lists.length) *t = view(*t, {lists.length});
     return true;
   }
