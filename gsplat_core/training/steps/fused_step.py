@@ -184,7 +184,7 @@ class FusedStep:
             time: normalised time from `FrameDeltas.frame_time`.
             gaussian_rates: Adam's learning rates of the Gaussians' tensors by name.
             field_rates: learning rates of the field.
-            colour_relaxation: above 0, colours are corrected (`colour_correction`) and depth is not compared, because
+            colour_relaxation: above 0, colours are corrected (`colour_correction`) and depth is compared only along rays, because
                 the correction uses the channel of its gradient. Not possible for a field without colours.
 
         Returns:

@@ -222,7 +222,7 @@ class TrainingStep:
             observation: target.
             rate_scale: factor of all learning rates.
             colour_relaxation: above 0, colours at the observation's time are corrected (`colour_correction`) instead of
-                trained, if the field supports it. A captured step then ignores depth.
+                trained, if the field supports it. A captured step then compares depth only along rays.
 
         Returns:
             Loss before the update, [] on the device. A captured step is only queued; reading the loss or `settle` waits
