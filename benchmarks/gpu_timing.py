@@ -125,10 +125,11 @@ def extra_mib(work: Work, calls: int = 3) -> float:
 
 def gsplat() -> ModuleType | None:
     """Return the gsplat module, or None if it is not installed (`benchmarks/peers/build_gsplat.py`)."""
-    try:
-        import gsplat as module
-    except ImportError as error:
-        print(f"gsplat is not compared: {error}", file=sys.stderr)
+    import gsplat as module
+
+    if not hasattr(module, "rasterization"):
+        # Without it, the folder of this name next to this file is imported.
+        print("gsplat is not compared: it is not installed", file=sys.stderr)
         return None
     return module
 
