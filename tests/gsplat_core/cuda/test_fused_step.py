@@ -262,7 +262,7 @@ class ConstantDeltas(NoField):
 
 
 @pytest.fixture(params=[(130, 90), (260, 180)], ids=["full size", "half size"])
-def wall_seen(request, make_gaussians) -> Observation:
+def wall_seen(request) -> Observation:
     """Picture and depth of opaque flat splats on a slanted plane, with a tool in one corner."""
     camera = Camera.from_focal(0.7 * request.param[0], *request.param)
     with torch.no_grad():
