@@ -21,58 +21,22 @@ demo: native
 	@set -e; if $(BIN)/python -m services.cli.gpu_check; then device=cuda; $(MAKE) --no-print-directory cuda; else device=cpu; fi; \
 	  set -x; $(BIN)/intrasplat replay out/recording --out $(OUT) --depth stereo --device $$device
 
-# Run the fast tests (`test`), or also those marked as slow (`test-all`), in groups of which JOBS run at a time. There are more of them than
-# cores, because many tests wait for processes. The output of a group is printed when it has ended.
-JOBS ?= $(shell expr $$(nproc) + 2)
-SYSTEM_TESTS := tests/system
-PROGRAM_TESTS := tests/attacks tests/test_examples.py tests/recipes tests/deploy
-REGISTRY_TESTS := $(addprefix tests/services/,registry jobs exports audit supervisor recordings)
-TRAINING_TESTS := tests/gsplat_core/training tests/gsplat_core/experimental tests/gsplat_core/evaluation
-OP_TESTS := tests/gsplat_core/ops tests/gsplat_core/rendering tests/gsplat_core/deformation
-GEOMETRY_TESTS := tests/gsplat_core/geometry
-NUMERIC := training rest ops geometry
-GROUPS := system programs training registry rest operators services ops geometry
-ignoring = $(patsubst %,--ignore=%,$1)
-test-of-system: TESTS = $(SYSTEM_TESTS)
-test-of-programs: TESTS = $(PROGRAM_TESTS)
-test-of-registry: TESTS = $(REGISTRY_TESTS)
-test-of-services: TESTS = tests/services $(call ignoring,$(REGISTRY_TESTS))
-test-of-operators: TESTS = tests/operators
-test-of-training: TESTS = $(TRAINING_TESTS)
-test-of-ops: TESTS = $(OP_TESTS)
-test-of-geometry: TESTS = $(GEOMETRY_TESTS)
-test-of-rest: TESTS = $(call ignoring,$(SYSTEM_TESTS) $(PROGRAM_TESTS) tests/services tests/operators $(TRAINING_TESTS) $(OP_TESTS) $(GEOMETRY_TESTS))
-.PHONY: $(GROUPS:%=test-of-%)
-BESIDE = --no-print-directory --jobs=$(JOBS) --output-sync=target --keep-going
+# Run the fast tests (`test`), or also those marked as slow (`test-all`), in groups of which JOBS run at a time. `tests/groups.py` has the
+# groups. Child processes of tests load compiled modules instead of compiling them again.
+TESTS = PYTHONDONTWRITEBYTECODE= $(BIN)/python -m tests.groups
 test: native .venv/.development
-	@$(MAKE) $(BESIDE) MARKED='not slow' $(GROUPS:%=test-of-%)
+	@$(TESTS) --fast $(JOBS:%=--jobs %)
 
 test-all: native .venv/.development
-	@$(MAKE) $(BESIDE) MARKED= $(GROUPS:%=test-of-%)
+	@$(TESTS) $(JOBS:%=--jobs %)
+
+# Run the tests that failed in the last run once more, one group at a time, and only if the groups ended with failed tests.
+test-again: native .venv/.development
+	@$(TESTS) --again
 
 # The numeric tests with each instruction set of this processor, in torch, its BLAS, numpy's BLAS and our own kernels.
 test-isa: native .venv/.development
 	tests/instruction_sets.sh
-
-# One thread per process, because most arrays in tests are too small for several threads. Tests of threading set the number themselves.
-$(GROUPS:%=test-of-%): export OMP_NUM_THREADS ?= 1
-$(GROUPS:%=test-of-%): export OPENBLAS_NUM_THREADS ?= 1
-$(GROUPS:%=test-of-%): export OPENCV_FOR_THREADS_NUM ?= 1
-# Numeric tests use what the others leave, because processes of the service run with a lower priority than the tests that wait for them.
-$(NUMERIC:%=test-of-%): NICE := nice -n 10
-# Child processes load compiled modules instead of compiling them again.
-$(GROUPS:%=test-of-%): export PYTHONDONTWRITEBYTECODE :=
-# Each group keeps its exit code and its failed tests in build/tests, for `test-again`.
-$(GROUPS:%=test-of-%):
-	@mkdir -p build/tests; echo 2 > build/tests/$(@:test-of-%=%).code
-	@rc=0; set -x; $(NICE) $(BIN)/python -m pytest -o cache_dir=build/tests/$(@:test-of-%=%) $(if $(MARKED),-m "$(MARKED)") $(AGAIN) $(TESTS) || rc=$$?; \
-	  { set +x; } 2> /dev/null; echo $$rc > build/tests/$(@:test-of-%=%).code; exit $$rc
-
-# Run the tests that failed in the last run once more, one group at a time, and only if the groups ended with failed tests.
-test-again: native .venv/.development
-	@set -e; for group in $(GROUPS); do code=$$(cat build/tests/$$group.code); \
-	  if [ $$code = 1 ]; then $(MAKE) --no-print-directory test-of-$$group MARKED= NICE= AGAIN="--last-failed --last-failed-no-failures none"; \
-	  elif [ $$code != 0 ]; then echo "tests of $$group ended with code $$code"; exit 1; fi; done
 
 lint: .venv/.development
 	$(BIN)/ruff check .

@@ -33,7 +33,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.forks import PACKAGES, ROOT, import_libraries, pytest_fork
+from tests.forks import PACKAGES, ROOT, import_libraries_alone, pytest_fork
 
 RECORDS = ROOT / "out" / "executed"
 ALL = -1
@@ -382,7 +382,7 @@ def main() -> None:
     if options.fresh:
         for path in RECORDS.glob("*.npz"):
             path.unlink()
-    import_libraries()
+    import_libraries_alone()
     bring_up_to_date(options.jobs, options.folders)
 
 

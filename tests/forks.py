@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import math
 import os
 import signal
 import sys
@@ -16,10 +17,13 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("gsplat_core", "operators", "services")
-LIBRARIES = ("torch", "numpy", "cv2", "pydantic", "fastapi", "uvicorn", "zmq", "httpx", "typer", "onnx")
+LIBRARIES = (
+    "torch", "numpy", "cv2", "pydantic", "fastapi", "uvicorn", "zmq", "httpx2", "typer", "onnx", "sqlalchemy", "alembic", "av",
+    "hypothesis",
+)  # fmt: skip
 """Libraries that take long to import. None of them imports the project."""
-SINGLE = ("PYTHONDONTWRITEBYTECODE", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
-"""Environment variables that are 1 for all tests: no bytecode is kept, and no test takes several cores."""
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
+"""Environment variables that limit the threads of numeric libraries."""
 RAISED = 70
 """Exit code of a fork whose function raised an exception."""
 OPTIONS = [
@@ -30,13 +34,28 @@ OPTIONS = [
 
 
 def import_libraries() -> None:
-    """Import the large libraries once. Forks of this process do not import them again."""
-    os.environ.update({name: "1" for name in SINGLE})
+    """Import the large libraries once. Forks of this process do not import them again.
+
+    Numeric libraries get one thread unless the environment sets another number, because most arrays in tests are too small for several.
+    """
+    for name in THREADS:
+        os.environ.setdefault(name, "1")
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as in the Makefile: idle threads of OpenMP do not spin
-    sys.dont_write_bytecode = True
     for name in LIBRARIES:
         with suppress(ImportError):
             importlib.import_module(name)
+    threads = len(os.listdir("/proc/self/task"))
+    if threads > 1:
+        sys.exit(
+            f"the libraries started {threads - 1} threads, which a fork would not have: set {' and '.join(THREADS)} to 1"
+        )
+
+
+def import_libraries_alone() -> None:
+    """Import the large libraries without the project, for forks that execute a changed project. No bytecode is kept."""
+    os.environ.update({name: "1" for name in ("PYTHONDONTWRITEBYTECODE", *THREADS)})
+    sys.dont_write_bytecode = True
+    import_libraries()
     loaded = [name for name in sys.modules if name.split(".")[0] in PACKAGES]
     if loaded:
         sys.exit(f"the libraries imported {loaded[0]}: it would not be loaded again")
@@ -51,7 +70,7 @@ class Fork:
         limit_s: time limit in seconds.
     """
 
-    def __init__(self, function: Callable[[], int], output: Path, limit_s: float) -> None:
+    def __init__(self, function: Callable[[], int], output: Path, limit_s: float = math.inf) -> None:
         sys.stdout.flush()
         self.output, self._deadline = output, time.monotonic() + limit_s
         self._pid = os.fork()
@@ -70,6 +89,11 @@ class Fork:
                 traceback.print_exc()
             sys.stdout.flush()
             os._exit(code)
+
+    def interrupt(self) -> None:
+        """Send SIGINT to the fork and to the processes in its group."""
+        with suppress(ProcessLookupError):
+            os.killpg(self._pid, signal.SIGINT)
 
     def ended(self) -> bool:
         """Return whether the fork has ended; it is killed after the time limit, with the processes that it left running."""
@@ -90,7 +114,7 @@ class Fork:
 
 
 def pytest_fork(
-    tests: Sequence[str], folder: Path, plugin: object, hook: str = "", limit_s: float = 1e9,
+    tests: Sequence[str], folder: Path, plugin: object, hook: str = "", limit_s: float = math.inf,
     after: Callable[[], None] = lambda: None,
 ) -> Fork:  # fmt: skip
     """Run pytest in a fork.

@@ -49,7 +49,7 @@ import pytest
 import torch
 
 from tests.executed import Executed, bring_up_to_date
-from tests.forks import RAISED, ROOT, Fork, execute_everywhere, import_libraries, pytest_fork
+from tests.forks import RAISED, ROOT, Fork, execute_everywhere, import_libraries_alone, pytest_fork
 
 PARTS = ("training", "geometry", "depth", "poses", "endoscope", "experimental")
 """Packages of the core that are sampled, wherever they are in its tree. Kernels and data classes are left out."""
@@ -568,7 +568,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=ROOT / "out" / "mutants.jsonl")
     parser.add_argument("--least", type=float, default=0.85, help="exit code 1 where a smaller share is killed")
     options = parser.parse_args()
-    import_libraries()
+    import_libraries_alone()
     if options.survivors:
         chosen = survivors_of(options.survivors)
     else:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shlex
 import shutil
 import subprocess
 from pathlib import Path
@@ -15,7 +14,7 @@ from tests.missing import missing
 ROOT = Path(__file__).resolve().parents[2]
 
 
-OF_MAKE = ("CUDACXX", "MAKEFLAGS", "MAKEOVERRIDES", "MAKELEVEL", "MARKED", "AGAIN", "NICE")
+OF_MAKE = ("CUDACXX", "MAKEFLAGS", "MAKEOVERRIDES", "MAKELEVEL")
 """Variables that a make above these tests sets."""
 
 
@@ -61,28 +60,11 @@ def test_ci_builds_the_cuda_kernels_and_requires_them():
 
 @pytest.mark.parametrize(("target", "selected"), [("test", True), ("test-all", False)])
 def test_slow_tests_are_left_out_by_the_fast_command_alone(target, selected):
-    commands = [line for line in dry_run(target).splitlines() if "-m pytest " in line]
-    assert len(commands) > 1
-    assert all(('-m "not slow"' in line) == selected for line in commands)
+    (command,) = [line for line in dry_run(target).splitlines() if "-m tests.groups" in line]
+    assert ("--fast" in command.split()) == selected
 
 
 def test_ci_runs_all_tests():
     lines = (ROOT / ".ci" / "run").read_text().splitlines()
     commands = [line.partition("||")[0].split() for line in lines if line.startswith("make ")]
     assert any("test-all" in words for words in commands) and not any("test" in words for words in commands)
-
-
-def test_the_groups_of_tests_are_all_of_them_and_none_twice():
-    commands = [line.partition("-m pytest ")[2] for line in dry_run("test-all").splitlines() if "-m pytest " in line]
-    words = [shlex.split(command.partition("||")[0]) for command in commands]
-    assert all(each[0] == "-o" and each[1].startswith("cache_dir=build/tests/") for each in words)
-    groups = [each[2:] for each in words]
-    ignored = [[word.removeprefix("--ignore=") for word in group if word.startswith("--")] for group in groups]
-    paths = [[word for word in group if not word.startswith("--")] or ["."] for group in groups]
-    every = {path for each in paths for path in each} - {"."}
-    assert paths.count(["."]) == 1 and all((ROOT / path).exists() for path in every)
-    for own, without in zip(paths, ignored, strict=True):
-        assert set(without) <= every, "what one group leaves out is in another one"
-        for path in every - set(own):
-            below = any(Path(path).is_relative_to(folder) for folder in own)
-            assert not below or any(Path(path).is_relative_to(folder) for folder in without), path
