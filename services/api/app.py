@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fastapi import APIRouter, FastAPI
-from fastapi.routing import APIRoute
 from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
 from services.api import audit as audit_routes
 from services.api import display, models, pages, recordings, replays, service, snapshots, streams
 from services.api import keys as key_routes
+from services.api.guard import operation_id
 from services.api.middleware import AddressRate, HeadLength, KnownHosts, Observed, SecurityHeaders, TokenBuckets
 from services.api.observability import Measures
 from services.api.pages import ABOUT, describe
@@ -60,11 +60,13 @@ def new_app(settings: ServiceSettings, parts: Parts | None = None) -> FastAPI:
         description=ABOUT,
         openapi_url=None, docs_url=None, redoc_url=None,  # `pages.py` serves them, without external resources
         redirect_slashes=False,
-        generate_unique_id_function=_operation_id,
+        generate_unique_id_function=operation_id,
         lifespan=_lifespan,
     )  # fmt: skip
     app.state.control = control
-    for router in (*ROUTERS, *parts.routers):
+    for router in ROUTERS:
+        app.router.routes += router.routes  # `include_router` would build each of them again at the first request
+    for router in parts.routers:
         app.include_router(router)
     answer_with_problems(app, parts.errors)
     describe(app)
@@ -155,7 +157,3 @@ def _remove_unfinished(uploads: Path) -> None:
     for name in os.listdir(uploads):
         if name.startswith("upload-"):
             (uploads / name).unlink()
-
-
-def _operation_id(route: APIRoute) -> str:
-    return route.name

@@ -122,7 +122,12 @@ class GuardedRoute(APIRoute):
 
 def new_router(tag: str, prefix: str = "/v1") -> APIRouter:
     """Create a router whose routes enforce their access rule (`GuardedRoute`)."""
-    return APIRouter(prefix=prefix, tags=[tag], route_class=GuardedRoute)
+    return APIRouter(prefix=prefix, tags=[tag], route_class=GuardedRoute, generate_unique_id_function=operation_id)
+
+
+def operation_id(route: APIRoute) -> str:
+    """Return the operation id in the OpenAPI document: the name of the route's function."""
+    return route.name
 
 
 async def _caller_of(connection: HTTPConnection) -> Caller:
