@@ -64,7 +64,7 @@ def depth_normals(depth: Tensor, camera: Camera) -> Tensor:
 
 
 def normals_of_depth(depth: Tensor, K: Tensor, camera_model: str) -> Tensor:
-    """Do the work of `depth_normals` with an intrinsic matrix [3, 3] on the device of the depth."""
+    """Return the normals of `depth_normals` for an intrinsic matrix [3, 3] on the device of the depth."""
     height, width = depth.shape
     if camera_model == "fisheye" or min(height, width) < 3:
         return depth.new_zeros(height, width, 3)

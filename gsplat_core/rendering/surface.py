@@ -89,11 +89,11 @@ def view_of(camera: Camera, device: torch.device, dtype: torch.dtype | None = No
 def blend_view_rays(
     gaussians: Gaussians, view: View, values: Tensor | None = None, capacity: int | None = None
 ) -> tuple[BlendedRays, Tensor | None]:
-    """Do the work of `render_rays` for a camera on the device.
+    """Render the rays of `render_rays` for a camera whose matrices are on the device.
 
     Args:
         gaussians: Gaussians at one time, float32.
-        view: camera of the result; its matrices are read on the device.
+        view: camera of the result.
         values: further values [N, D] to blend.
         capacity: length of the tile lists, with which a CUDA graph can capture the call; see `bin_splats`. None makes
             them as long as needed.

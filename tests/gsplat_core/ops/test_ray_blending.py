@@ -64,6 +64,22 @@ def test_two_veils_before_a_wall() -> None:
     assert float(blended.variances) == pytest.approx(variance, rel=1e-5)
 
 
+@pytest.mark.parametrize("name", ["values", "alphas", "depths", "medians"])
+def test_the_gradient_of_one_output_is_that_without_the_others(name: str) -> None:
+    s, gradients = ray_scene(120), []
+    for others in (0.0, None):
+        inputs = [getattr(s, each).clone().requires_grad_() for each in INPUTS]
+        outputs = blend_rays(*inputs, s.width, s.height, *s.lists())
+        total = getattr(outputs, name).square().sum()
+        if others is not None:
+            total = total + others * sum(output.sum() for output in outputs[:4])
+        total.backward()
+        gradients.append([each.grad for each in inputs])
+    for seen, wanted in zip(*gradients, strict=True):
+        assert torch.equal(seen, wanted)
+    assert any(each.any() for each in gradients[0])
+
+
 def test_the_same_bits_for_any_number_of_threads() -> None:
     s = ray_scene(3000, 300, 200)
     threads = torch.get_num_threads()
