@@ -95,9 +95,9 @@ std::vector<Tensor> rasterize_inputs_backward(OptionalTensors given, Tensor radi
   const ProjectedGradients from = {
       int_data(radii), row_of ? int_data(*row_of) : nullptr, data(v[0]), data(v[1]), data(v[2]), data(v[3]), data(v[4])};
   const Allocator memory(radii);
-  const Tensor none = memory.floats({0});
+  // Outputs of an op must not share memory, so each gradient that is not requested is an empty tensor of its own.
   const auto gradient_of = [&](Input i, bool wanted) {
-    return wanted && inputs.tensors[i] ? memory.floats(sizes_of(*inputs.tensors[i])) : none;
+    return memory.floats(wanted && inputs.tensors[i] ? sizes_of(*inputs.tensors[i]) : Sizes{0});
   };
   std::vector<Tensor> out;
   const bool views = needs[kViewmats] || needs[kCenters];
