@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import lru_cache
+from itertools import count, islice
 from pathlib import Path
 
 import cv2
@@ -24,9 +26,20 @@ def clip(recordings_dir: Path, name: str) -> tuple[Image, ...]:
     return tuple(frame.image for frame in open_recording(recordings_dir / (PLACES | OTHERS)[name]))
 
 
-@lru_cache(maxsize=8)
-def texture(seed: int, count: int, width: int = 160, height: int = 128) -> tuple[Image, ...]:
-    """Reddish tissue with structure at several scales, which sways by a few pixels and never repeats."""
+def texture(seed: int, number: int, width: int = 160, height: int = 128) -> tuple[Image, ...]:
+    """Reddish tissue with structure at several scales, which sways by a few pixels and never repeats; not to be written to."""
+    made, further = _textures(seed, width, height)
+    made.extend(islice(further, max(0, number - len(made))))
+    return tuple(made[:number])
+
+
+@lru_cache(maxsize=12)
+def _textures(seed: int, width: int, height: int) -> tuple[list[Image], Iterator[Image]]:
+    """Pictures of `texture` that were made, and those that follow them."""
+    return [], _further(seed, width, height)
+
+
+def _further(seed: int, width: int, height: int) -> Iterator[Image]:
     rng = np.random.default_rng(seed)
     large = np.zeros((height + 32, width + 32), np.float32)
     for size in (3, 8, 20):
@@ -34,13 +47,13 @@ def texture(seed: int, count: int, width: int = 160, height: int = 128) -> tuple
         large += cv2.resize(coarse, large.shape[::-1], interpolation=cv2.INTER_CUBIC) * size**0.5
     large = 110 + 28 * (large - large.mean()) / large.std()
     tint = np.array([1.3, 0.75, 0.7]) * (1 + 0.1 * rng.normal(size=3))
-    pictures = []
-    for k in range(count):
+    for k in count():
         shift = np.array([[1, 0, -16 + 4 * np.sin(0.21 * k)], [0, 1, -16 + 3 * np.cos(0.17 * k)]], np.float32)
         grey = cv2.warpAffine(large, shift, (width, height), flags=cv2.INTER_LINEAR)
         grain = rng.normal(0, 1.5, (height, width, 3))
-        pictures.append(np.clip(grey[..., None] * tint + grain, 0, 255).astype(np.uint8))
-    return tuple(pictures)
+        picture = np.clip(grey[..., None] * tint + grain, 0, 255).astype(np.uint8)
+        picture.setflags(write=False)
+        yield picture
 
 
 def resized(images: tuple[Image, ...] | list[Image], like: Image) -> list[Image]:
