@@ -44,11 +44,6 @@ def import_libraries() -> None:
     for name in LIBRARIES:
         with suppress(ImportError):
             importlib.import_module(name)
-    threads = len(os.listdir("/proc/self/task"))
-    if threads > 1:
-        sys.exit(
-            f"the libraries started {threads - 1} threads, which a fork would not have: set {' and '.join(THREADS)} to 1"
-        )
 
 
 def import_libraries_alone() -> None:

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.forks import ROOT, Fork, import_libraries
+from tests.forks import ROOT, THREADS, Fork, import_libraries
 
 GROUPS: dict[str, tuple[str, ...]] = {
     "services": ("tests/services",),
@@ -146,6 +146,11 @@ def main() -> int:
     import_libraries()
     for name in PROJECT:
         importlib.import_module(name)
+    threads = len(os.listdir("/proc/self/task"))
+    if threads > 1:
+        sys.exit(
+            f"the imports started {threads - 1} threads, which a fork would not have: set {', '.join(THREADS)} to 1"
+        )
     # The libraries imported plugins of pytest, whose assertions are therefore not rewritten.
     return run(groups, ["-W", "ignore::pytest.PytestAssertRewriteWarning", *options], jobs, RESULTS)
 
