@@ -108,7 +108,6 @@ METHODS = (
             figure("wall at 35°: error of ray depth", "wall 35 deg: ray depth, largest error %", "at most 0.3", 4, unit="%"),
             figure("wall at 35°: error of centre depth", "wall 35 deg: centre depth, largest error %", "", unit="%"),
             figure("wall at 60°: error of ray depth", "wall 60 deg: ray depth, largest error %", "", unit="%", note="likely the limit to 3 standard deviations; not tested separately"),
-            figure("extra time of a training step", "step: extra cost of both %", "at most 25", 0, unit="%", note="measured beside five other runs on the GPU, which lengthens the short step most; the next table has a run with less beside it"),
             figure("stereo: depth against today", "stereo: ray_depth,normal_consistency, ray depth, RMS %", "at most 0.9 of today's", 3, unit="%"),
             figure("stereo: depth today", "stereo: today, ray depth, RMS %", "", 3, unit="%"),
             figure("stereo: normals", "stereo: ray_depth,normal_consistency, normals of ray depth, mean deg", "at most 4.5", unit="°"),
@@ -119,7 +118,7 @@ METHODS = (
         ),
     ),
     Method(
-        "4. Step time of the losses, fewer runs on the same GPU", "surface-step",
+        "4. Step time of the losses ray_depth and normal_consistency", "surface-step",
         (
             figure("step without the losses", "step: losses none, ms", "", unit="ms"),
             figure("step with both losses", "step: losses both, ms", "", unit="ms"),
