@@ -270,7 +270,7 @@ def trainer(logs: Logs) -> str:
     said = (
         "`simple_trainer.py` of gsplat's examples, abridged to what it uses without a viewer, on a synthetic scene in COLMAP's"
         " format. Each training is a process of its own, with the same arguments and seeds for all variants of a strategy, but"
-        " for `--visible_adam` where `SelectiveAdam` is named, and `--strategy.compat 1.5.3` for `default` with ours, because"
+        " for the option `visible_adam` where `SelectiveAdam` is named, and `--strategy.compat 1.5.3` for `default` with ours, because"
         " gsplat 1.5.3 never resets opacities. Every 8th image is held out and scored. Median of the seeds, with the worst in"
         " brackets. Training time excludes start and evaluation, and includes waiting for the trainer's own reader of pictures,"
         " which is the same for all. Ratios are to gsplat with the same seed; the last one is without the waiting. Peak memory is"
