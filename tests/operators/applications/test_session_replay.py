@@ -32,7 +32,7 @@ from operators.sources.source import SourceDescription, ThreadedSource
 FRAMES = 14
 
 
-SHOWN_S, FOUND_S = 1.0, 60.0
+SHOWN_S, FOUND_S = 20.0, 60.0
 
 
 class _Scope(ThreadedSource):
