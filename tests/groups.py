@@ -23,19 +23,19 @@ import pytest
 from tests.forks import ROOT, THREADS, Fork, import_libraries
 
 GROUPS: dict[str, tuple[str, ...]] = {
-    "services": ("tests/services",),
-    "rest": ("tests",),
-    "operators": ("tests/operators",),
-    "training": ("tests/gsplat_core/training", "tests/gsplat_core/experimental", "tests/gsplat_core/evaluation"),
-    "programs": ("tests/attacks", "tests/test_examples.py", "tests/recipes", "tests/deploy"),
     "system": ("tests/system",),
     "registry": tuple(
         f"tests/services/{name}" for name in ("registry", "jobs", "exports", "audit", "supervisor", "recordings")
     ),
-    "geometry": ("tests/gsplat_core/geometry",),
+    "rest": ("tests",),
+    "training": ("tests/gsplat_core/training", "tests/gsplat_core/experimental", "tests/gsplat_core/evaluation"),
+    "operators": ("tests/operators",),
+    "services": ("tests/services",),
     "ops": ("tests/gsplat_core/ops", "tests/gsplat_core/rendering", "tests/gsplat_core/deformation"),
+    "programs": ("tests/attacks", "tests/test_examples.py", "tests/recipes", "tests/deploy"),
+    "geometry": ("tests/gsplat_core/geometry",),
 }
-"""Folders and files of each group, without those that another group names. Groups that take long come first."""
+"""Folders and files of each group, without those that another group names. Groups that take long come first, those with most of the slow tests before others."""
 PROJECT = ("operators.applications.replay", "services.cli.app", "services.api.app")
 """Modules of the project that most groups import, with what these import."""
 RESULTS = ROOT / "build" / "tests"
