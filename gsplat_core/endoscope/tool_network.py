@@ -26,6 +26,13 @@ CERTAIN = 2.0
 EDGE_RADIUS_PX, EDGE_CONTRAST = 3, 0.01
 """Radius of the guided filter and its squared contrast, of logarithms of colours, above which edges are kept."""
 
+SMALLEST_INNER_REGION = 0.02
+"""Smallest area of a region that does not reach the border of the view, as a share of the picture. Tools enter from the border; clips,
+glare and cavities do not.
+"""
+BORDER: NDArray[np.uint8] = np.ones((7, 7), np.uint8)
+"""Structuring element by which a view is eroded to find its border, three pixels wide."""
+
 
 class NetworkToolFinder:
     """Tool segmentation of single pictures on the CPU. Deterministic, without state between pictures."""
@@ -60,7 +67,9 @@ class NetworkToolFinder:
         self._network.setInput(planes)
         smoothed = along_edges(self._network.forward()[0, 0], planes[0])
         levels = (smoothed * np.float32(127 / CERTAIN) + 128).clip(0, 255).astype(np.uint8)
-        levels *= field_of_view(lowest_and_highest(small)[1])
+        view = field_of_view(lowest_and_highest(small)[1])
+        levels *= view
+        remove_inner_regions(levels, view)
         cv2.resize(levels, (width, height), dst=tissue, interpolation=cv2.INTER_LINEAR)
         cv2.threshold(tissue, 128, 1, cv2.THRESH_BINARY_INV, dst=tissue)
         return tissue
@@ -80,6 +89,24 @@ def along_edges(logits: NDArray[np.float32], planes: NDArray[np.float32]) -> NDA
     cv2.resize(logits.clip(-CERTAIN, CERTAIN), (width, height), dst=coarse, interpolation=cv2.INTER_LINEAR)
     guide = cv2.merge([planes[3], planes[4], 0.5 * planes[1]])
     return np.asarray(cv2.ximgproc.guidedFilter(guide, coarse, EDGE_RADIUS_PX, EDGE_CONTRAST), np.float32)
+
+
+def remove_inner_regions(levels: NDArray[np.uint8], view: NDArray[np.uint8]) -> None:
+    """Set small regions of tool to 0 that do not reach the border of the view.
+
+    Args:
+        levels: uint8 [h, w], above 128 = tool. Changed in place.
+        view: uint8 [h, w], 1 in the field of view, 0 outside.
+    """
+    tool = cv2.threshold(levels, 128, 1, cv2.THRESH_BINARY)[1]
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(tool, connectivity=4)
+    small = stats[:, cv2.CC_STAT_AREA] < SMALLEST_INNER_REGION * levels.size
+    small[0] = False
+    if count == 1 or not small.any():
+        return
+    inner = cv2.erode(view, BORDER, borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    small[labels[view != inner]] = False
+    levels[small[labels]] = 0
 
 
 def features(small: NDArray[np.uint8], inputs: int = 5) -> NDArray[np.float32]:

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from gsplat_core.endoscope.tool_network import NetworkToolFinder
+from gsplat_core.endoscope.tool_network import NetworkToolFinder, remove_inner_regions
 from gsplat_core.errors import InvalidInput
 
 
@@ -63,3 +63,18 @@ def test_a_tiny_picture_is_all_tissue(finder):
 def test_an_array_that_is_no_picture_is_refused(finder, image):
     with pytest.raises(InvalidInput, match=r"image must be RGB uint8 \[H, W, 3\], got"):
         finder.find(image)
+
+
+def test_small_regions_inside_the_view_are_no_tools():
+    """A region at the border of the picture or of a round view stays, and so does a large one inside."""
+    view = np.ones((96, 128), np.uint8)
+    view[:, :20] = 0
+    levels = np.full((96, 128), 100, np.uint8) * view
+    at_the_border = (slice(0, 6), slice(60, 66)), (slice(40, 46), slice(21, 27))
+    inside, large = (slice(40, 50), slice(50, 60)), (slice(60, 80), slice(70, 90))
+    for place in (*at_the_border, inside, large):
+        levels[place] = 200
+    wanted = levels.copy()
+    wanted[inside] = 0
+    remove_inner_regions(levels, view)
+    np.testing.assert_array_equal(levels, wanted)
