@@ -27,7 +27,7 @@ from gsplat_core.endoscope.sequence import SequenceCheck
 from gsplat_core.endoscope.sharpness import SharpnessGate
 from gsplat_core.endoscope.stream_clock import OUT_OF_ORDER, StreamClock
 from gsplat_core.endoscope.strip import StripDetector
-from gsplat_core.scene.frames import Frame, FrameStatus
+from gsplat_core.scene.frames import CUT_IN_DOUBT, Frame, FrameStatus
 from operators.graph import Operator, OperatorSpec
 from operators.outcome import OutcomeBuilder
 
@@ -502,9 +502,6 @@ class SharpnessStage(Stage):
         return frame if fault is None else self.withhold(frame, fault)
 
 
-IN_DOUBT = "cut in doubt"
-
-
 @dataclass(frozen=True)
 class CutCounts(StageCounts):
     """Number of new scenes by reason (cut, returned, resized, frame rate), and of frames withheld as possible cuts."""
@@ -550,7 +547,7 @@ class CutStage(Stage):
             return frame
         verdict = self._detector.observe(frame.image, frame.seq, frame.pts_ns)
         if verdict.in_doubt:
-            return self.withhold(frame, IN_DOUBT)
+            return self.withhold(frame, CUT_IN_DOUBT)
         if verdict.new_scene is None:
             return frame
         self.found[verdict.new_scene] += 1

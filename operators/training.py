@@ -49,7 +49,7 @@ class TrainingCounts:
     """Statistics of the training of a run."""
 
     frames: int = 0
-    """Number of frames that were trained on."""
+    """Number of frames that were trained on, with those that were only followed."""
     steps: int = 0
     """Optimiser steps on the newest frame before its display."""
     passed_over: int = 0
@@ -57,9 +57,9 @@ class TrainingCounts:
     rehearsed: int = 0
     """Number of rehearsal steps, which train on earlier frames of the training window."""
     withheld: dict[str, int] = field(default_factory=dict)
-    """Number of frames excluded from training (withheld or damaged), by reason."""
+    """Number of frames excluded from memory and scores (withheld or damaged), by reason."""
     withheld_now: dict[str, int] = field(default_factory=dict)
-    """Number of frames excluded from training since the last one that was not, by reason."""
+    """Number of frames excluded from memory and scores since the last one that was not, by reason."""
     scenes: dict[str, int] = field(default_factory=dict)
     """Number of times that the model was restarted for a new scene, by reason."""
     renewed: int = 0
@@ -86,7 +86,7 @@ class Learner:
         self.newest: Model | Snapshot | None = None
         """Last published model of the current scene; None before its first frame."""
         self.learned: Frame | None = None
-        """Newest frame that the model was trained on."""
+        """Newest frame that the model was trained on and keeps for rehearsal."""
         self._scene = 0
         """Number of the scene that the model represents."""
         self.reconstructor = make()
@@ -96,7 +96,7 @@ class Learner:
         self.reconstructor, self.newest = self._make(), None
 
     def accepts(self, frame: Frame) -> bool:
-        """Return True if a frame can be trained on. Counts the reason if not."""
+        """Return True if a frame can be trained on and kept. Counts the reason if not."""
         reason = frame.unusable
         if reason is None:
             self.counts.withheld_now = {}
@@ -139,10 +139,14 @@ class Learner:
         self.newest = None
 
     def observe(self, frame: Frame, *, budget: Budget | None = None, train: bool) -> Reconstruction:
-        """Process the next frame, train on it if `train` is True, and publish the model."""
-        report = self.reconstructor.observe(frame, budget=budget, train=train)
+        """Process the next frame, train on it if `train` is True, and publish the model.
+
+        The model keeps the frame for rehearsal and growth only if the frame is usable.
+        """
+        usable = frame.unusable is None
+        report = self.reconstructor.observe(frame, budget=budget, train=train, keep=usable)
         if train:
-            self.learned = frame
+            self.learned = frame if usable else self.learned
             self.counts.frames += 1
             self.counts.steps += report.steps
         self._record(lambda: Observed(seq=frame.seq, steps=report.steps, train=train))
@@ -153,7 +157,7 @@ class Learner:
             trained=train,
             steps=report.steps,
             arriving_loss=report.arriving_loss,
-            content=self.learned if frame.unusable else frame,
+            content=frame if train or usable else self.learned,
         )
 
     def take_depth(self, frame: Frame, late: LateDepth | None = None) -> bool:
@@ -225,8 +229,9 @@ class Training(ABC):
 class EveryFrame(Training):
     """Trains the configured number of steps on each frame.
 
-    Damaged, withheld and held-out frames are displayed with the newest model. The first frame of a
-    scene is trained on even if it is held out, because the following ones need a model.
+    Damaged, withheld and held-out frames are displayed with the newest model, except frames that the model follows
+    (`Frame.is_followed`). The first frame of a scene is trained on even if it is held out, because the following ones
+    need a model.
     """
 
     def __init__(self, held_out: Callable[[Frame], bool] = lambda frame: False) -> None:
@@ -238,7 +243,7 @@ class EveryFrame(Training):
         usable = learner.accepts(frame)
         if not learner.enter(frame, usable=usable):
             return None
-        train = learner.newest is None or (usable and not self._held_out(frame))
+        train = learner.newest is None or ((usable or frame.is_followed) and not self._held_out(frame))
         return learner.observe(frame, train=train)
 
     def contribute(self, outcome: OutcomeBuilder, counts: TrainingCounts) -> None:
@@ -256,8 +261,8 @@ class EveryFrame(Training):
 class UntilDisplay(Training):
     """Trains on each frame until its display deadline, and rehearses until the next frame.
 
-    Frames that are too late are dropped. Withheld and damaged frames are displayed with the current
-    model and not trained on.
+    Frames that are too late are dropped. Withheld and damaged frames are displayed with the current model and not
+    trained on, except frames that the model follows (`Frame.is_followed`).
     """
 
     def __init__(
@@ -303,7 +308,7 @@ class UntilDisplay(Training):
         if usable and self._depth is not None:
             self._depth.offer(frame)
         budget = self._clock.budget(frame, first=first, behind=behind)
-        shown = learner.observe(frame, budget=budget, train=usable)
+        shown = learner.observe(frame, budget=budget, train=usable or frame.is_followed)
         if usable:
             # The initialisation of a scene already covers its first frame.
             self._since_grown = 0 if first else self._since_grown + 1
@@ -406,7 +411,7 @@ class RecordedCalls(Training):
         if observed is None or not self._has_reconstructor:
             return None
         train = observed.train and frame.status is not FrameStatus.DAMAGED
-        if not train:
+        if not train or frame.unusable is not None:
             learner.accepts(frame)
         if learner.newest is None and not train:
             return None

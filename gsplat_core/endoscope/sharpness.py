@@ -28,6 +28,7 @@ from gsplat_core.endoscope.reduced import (
     sampled,
     sampled_mask,
 )
+from gsplat_core.scene.frames import BLUR
 
 SIDE_PX = 320
 """Approximate longer side of the subsampled picture for measuring sharpness, in pixels."""
@@ -107,7 +108,7 @@ class SharpnessGate:
             kept: [H, W], 0 outside the tissue, or None.
 
         Returns:
-            "blur", "smoke", or None for a good frame.
+            `BLUR`, "smoke", or None for a good frame.
         """
         elapsed_s = 0.0 if self._last_ns is None else (pts_ns - self._last_ns) * 1e-9
         self._last_ns = pts_ns
@@ -165,8 +166,8 @@ class SharpnessGate:
             smoke = pale and float(clear[2] - usual[2]) >= SMOKE_HAZE
         if smoke:
             return "smoke"
-        limit = SHARP_ABOVE if self._fault == "blur" else BLURRED_BELOW
-        return "blur" if sharpness < limit else None
+        limit = SHARP_ABOVE if self._fault == BLUR else BLURRED_BELOW
+        return BLUR if sharpness < limit else None
 
 
 def appearance(image: NDArray[np.uint8], kept: NDArray[np.generic] | None = None) -> Appearance | None:

@@ -26,6 +26,10 @@ class FrameStatus(Enum):
     """Picture that may contain the decoder's error concealment. It is displayed, but neither trained on nor scored."""
 
 
+BLUR, CUT_IN_DOUBT = "blur", "cut in doubt"
+"""Values of `Frame.withheld` for a blurred frame, and for one that may belong to another scene."""
+
+
 @dataclass(frozen=True)
 class Frame:
     """Video frame with its sensor data. Operators replace frames by changed copies and never modify them."""
@@ -74,7 +78,10 @@ class Frame:
     exposure: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """Gain of red, green and blue relative to the scene's colours at the start of the stream."""
     withheld: str | None = None
-    """Reason for withholding the frame from training ("blur", "out of body"); None to train on it."""
+    """Reason for withholding the frame from memory and scores ("blur", "out of body"); None to train on it and keep it.
+
+    The model follows some of these frames for their display (`is_followed`).
+    """
     new_scene: str | None = None
     """Reason for a scene change at this frame ("cut", "resized"); None if the scene continues."""
     scene: int = 0
@@ -88,6 +95,14 @@ class Frame:
         if self.withheld is not None:
             return self.withheld
         return "damaged" if self.status is FrameStatus.DAMAGED else None
+
+    @property
+    def is_followed(self) -> bool:
+        """True if the model follows the frame for its display, although it is withheld from memory and scores.
+
+        Blur and doubt about a cut last a few frames. A display that waits for them to end shows tissue that has moved on.
+        """
+        return self.withheld in (BLUR, CUT_IN_DOUBT) and self.status is not FrameStatus.DAMAGED
 
     @property
     def tissue(self) -> NDArray[np.uint8] | None:

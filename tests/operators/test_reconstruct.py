@@ -27,7 +27,7 @@ class FakeReconstructor:
         self.version = 0
         self.make_model = make_model
 
-    def observe(self, frame, *, budget=None, train=True):
+    def observe(self, frame, *, budget=None, train=True, keep=True):
         self.calls.append(("observe", frame.seq, train))
         return SimpleNamespace(
             seq=frame.seq,
@@ -86,7 +86,7 @@ def test_withheld_frames_are_shown_and_a_cut_begins_a_scene_without_a_clock(fram
     frames = [
         frame(0, withheld="black"),
         frame(1),
-        frame(2, withheld="blur"),
+        frame(2, withheld="smoke"),
         frame(3, status=FrameStatus.DAMAGED),
         frame(4, new_scene="cut", scene=1, withheld="smoke"),
         frame(5, scene=1),
@@ -103,7 +103,7 @@ def test_withheld_frames_are_shown_and_a_cut_begins_a_scene_without_a_clock(fram
     outcome = OutcomeBuilder()
     operator.contribute(outcome)
     assert outcome.notes == (
-        "4 frames were neither trained on nor scored (black: 1, blur: 1, damaged: 1, smoke: 1)",
+        "4 frames were neither trained on nor scored (black: 1, damaged: 1, smoke: 2)",
         "the frames show 2 scenes (begun by a frame that was not used: 1); the saved model is that of the last one",
     )
 

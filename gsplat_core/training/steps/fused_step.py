@@ -288,6 +288,8 @@ class FusedStep:
                 right_sh[:, 0].add_(change)
             elif self._field.add_colours is not None:
                 self._field.add_colours(change, controls.time)
+            else:
+                scene.sh[:, 0].add_(change)
         if self._field.reads_positions:
             self._move(scene.means, gradient, of_means, fits)
         return value

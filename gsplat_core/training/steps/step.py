@@ -222,14 +222,15 @@ class TrainingStep:
             observation: target.
             rate_scale: factor of all learning rates.
             colour_relaxation: above 0, colours at the observation's time are corrected (`colour_correction`) instead of
-                trained, if the field supports it. A captured step then compares depth only along rays.
+                trained; for a field without temporal colours, those of all times. A captured step then compares depth only
+                along rays.
 
         Returns:
             Loss before the update, [] on the device. A captured step is only queued; reading the loss or `settle` waits
             for it.
         """
         add_colours = self.capabilities.add_colours
-        relaxation = 0.0 if add_colours is None or self._pictures is not None else colour_relaxation
+        relaxation = 0.0 if self._pictures is not None else colour_relaxation
         if self._captured is not None:
             self._relaxation = relaxation
             return self._captured_step(self._captured, observation, rate_scale)
@@ -255,6 +256,8 @@ class TrainingStep:
                 right_sh[:, 0] += compared.colour_change
             elif add_colours is not None:
                 add_colours(observation.time_s, compared.colour_change)
+            else:
+                self.gaussians.sh[:, 0] += compared.colour_change
         return compared.loss
 
     def scale_about(self, camera: Camera, factor: Tensor) -> None:

@@ -169,11 +169,18 @@ def test_corrected_colours_change_at_the_time_of_the_frame(make_step, make_frame
     assert (later.sh - far.sh).abs().max() < 0.05 * (at_once.sh - canonical.sh).abs().max()
 
 
-def test_a_field_that_takes_no_colours_at_one_time_trains_them(make_step, make_frame, camera):
-    trained, corrected = make_step("hexplane", squared_error=True), make_step("hexplane", squared_error=True)
-    seen = Observation.of(make_frame(4, shift_px=2), camera)
-    for _ in range(2):
-        assert trained(seen) == corrected(seen, colour_relaxation=1.0)
+def test_colours_of_all_times_are_corrected_in_a_field_without_temporal_colours(make_step, make_frame, camera):
+    step = make_step("hexplane", rates=still("hexplane"), squared_error=True)
+    canonical = step.gaussians.clone()
+    dark = make_frame(4)
+    dark = dataclasses.replace(dark, image=dark.image // 2)
+    seen = Observation.of(dark, camera)
+    losses = [float(step(seen, colour_relaxation=1.0)) for _ in range(4)]
+    assert losses == sorted(losses, reverse=True)
+    assert losses[1] < 0.2 * losses[0]
+    assert torch.equal(step.gaussians.means, canonical.means)
+    assert (step.gaussians.sh - canonical.sh).abs().max() > 0.1
+    assert torch.equal(step.at(1.0).sh, step.gaussians.sh)
 
 
 def test_correcting_a_frame_that_is_all_tool_changes_nothing(make_step, make_frame, camera):
