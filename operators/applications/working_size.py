@@ -6,11 +6,12 @@ measured. The measurement also serves as the trial run, so that one-time initial
 
 from __future__ import annotations
 
+import itertools
 import math
 import statistics
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -96,7 +97,11 @@ FIRST_PIXELS = 320 * 256
 """Number of pixels of the first measurement, for larger streams."""
 SHARE_OF_INTERVAL = 0.9
 """Largest share of the frame interval that the latency of a frame may take."""
-MOST_MEASUREMENTS = 4
+MOST_MEASUREMENTS = 6
+NEIGHBOURS = 2
+"""Largest distance in size steps of a further measurement from the chosen size."""
+ROUNDING = 1e-9
+"""Relative tolerance of a latency, so that a size that just fits is not lost by rounding."""
 STARTING_FRAMES, TIMED_FRAMES = 3, 9
 """Number of frames per measurement: frames that initialise the model and are not timed, then timed frames."""
 GIVEN_UP_S = 2.0
@@ -135,6 +140,9 @@ def choose_working_size(
 ) -> WorkingSize:
     """Choose the largest size whose frames take at most `share` of the frame interval.
 
+    The latency is a fixed time and a time per pixel, fitted to measurements at several sizes near the chosen one. A single
+    measurement that other load disturbed therefore changes the choice by little.
+
     Args:
         about: description of the stream at full size.
         measure: returns the latency of a frame in seconds at a scale; called at most `MOST_MEASUREMENTS` times.
@@ -143,40 +151,77 @@ def choose_working_size(
     interval_s = 1 / about.fps
     smallest = min(SCALE_STEPS, math.ceil(SCALE_STEPS * MIN_SIDE_PX / min(about.width_px, about.height_px)))
     guess = math.floor(SCALE_STEPS * math.sqrt(FIRST_PIXELS / (about.width_px * about.height_px)))
-    step = min(SCALE_STEPS, max(smallest, guess))
+    sizes = range(smallest, SCALE_STEPS + 1)
+    step: int | None = min(SCALE_STEPS, max(smallest, guess))
     measured: dict[int, float] = {}
-    while step not in measured and len(measured) < MOST_MEASUREMENTS:
+    while step is not None and len(measured) < MOST_MEASUREMENTS:
         measured[step] = measure(step / SCALE_STEPS)
-        step = min(SCALE_STEPS, max(smallest, _largest_that_fits(measured, share * interval_s)))
-    fitting = [step for step, took_s in measured.items() if took_s <= share * interval_s]
-    chosen = max(fitting) if fitting else min(measured)
+        latency = Latency.of(measured)
+        chosen = latency.largest(sizes, share * interval_s)
+        step = _next_to_measure(chosen, measured, sizes, share * interval_s)
     scaled = scaled_description(about, chosen / SCALE_STEPS)
     return WorkingSize(
         scale=chosen / SCALE_STEPS,
         width_px=scaled.width_px,
         height_px=scaled.height_px,
-        frame_s=measured[chosen],
+        frame_s=latency.at(chosen),
         interval_s=interval_s,
         full_size=(about.width_px, about.height_px),
     )
 
 
-def _largest_that_fits(measured: dict[int, float], allowed_s: float) -> int:
-    """Estimate the largest size step whose frames take `allowed_s`, from a fixed cost and a cost per pixel."""
-    near = sorted(measured, key=lambda step: abs(measured[step] - allowed_s))[:2]
-    if len(near) == 1:
-        (only,) = near
-        squared = only**2 * allowed_s / measured[only]
-        if measured[only] <= allowed_s:
-            # If the fixed cost dominates, this estimate is too small. A measurement at a size about a quarter larger gives
-            # the cost per pixel.
-            squared = max(squared, (only + max(1, only // 4)) ** 2)
-    else:
-        (a, b), (s, t) = near, (measured[near[0]], measured[near[1]])
-        per_pixel = (t - s) / (b**2 - a**2)
-        # Without a positive slope, for example under other load, assume proportional cost.
-        squared = a**2 + (allowed_s - s) / per_pixel if per_pixel > 0 else a**2 * allowed_s / s
-    return math.floor(math.sqrt(max(0.0, squared)))
+def lower_quartile(values: Iterable[float]) -> float:
+    """Return the value that a quarter of the values are below, and the smallest of fewer than four values.
+
+    Other load only lengthens frames, so small values vary less from run to run than the median.
+    """
+    ordered = sorted(values)
+    return ordered[len(ordered) // 4]
+
+
+@dataclass(frozen=True)
+class Latency:
+    """Latency of a frame as a function of the size step: a fixed time and a time per pixel."""
+
+    fixed_s: float
+    each_s: float
+    """Time per square of the size step, to which the number of pixels is proportional."""
+
+    @classmethod
+    def of(cls, measured: Mapping[int, float]) -> Latency:
+        """Fit the latency to measurements in seconds by size step: the median slope of all pairs (Theil 1950, Sen 1968).
+
+        Without a positive slope, which a single measurement or other load can cause, the time is proportional to the
+        number of pixels.
+        """
+        pairs = itertools.combinations(sorted(measured.items()), 2)
+        slopes = [(later_s - earlier_s) / (b**2 - a**2) for (a, earlier_s), (b, later_s) in pairs]
+        each_s = statistics.median(slopes) if slopes else 0.0
+        fixed_s = lower_quartile(took_s - each_s * step**2 for step, took_s in measured.items())
+        if each_s <= 0 or fixed_s < 0:
+            return cls(0.0, lower_quartile(took_s / step**2 for step, took_s in measured.items()))
+        return cls(fixed_s, each_s)
+
+    def at(self, step: int) -> float:
+        """Return the latency in seconds at a size step."""
+        return self.fixed_s + self.each_s * step**2
+
+    def largest(self, sizes: Sequence[int], allowed_s: float) -> int:
+        """Return the largest of the size steps at which a frame takes at most `allowed_s`, or else the smallest."""
+        return max((step for step in sizes if self.at(step) <= allowed_s * (1 + ROUNDING)), default=min(sizes))
+
+
+def _next_to_measure(chosen: int, measured: Mapping[int, float], sizes: Sequence[int], allowed_s: float) -> int | None:
+    """Return the size step to measure next: the chosen one, or else its nearest neighbour, larger ones first.
+
+    Returns None if nothing near is left, or if the largest size was measured to fit.
+    """
+    if chosen not in measured:
+        return chosen
+    if chosen == max(sizes) and measured[chosen] <= allowed_s:
+        return None
+    near = [step for step in sizes if step not in measured and abs(step - chosen) <= NEIGHBOURS]
+    return min(near, key=lambda step: (abs(step - chosen), -step), default=None)
 
 
 class PacedTissue(ThreadedSource):
@@ -214,15 +259,15 @@ class PacedTissue(ThreadedSource):
 
     @property
     def frame_s(self) -> float:
-        """Median latency of a timed frame in seconds; `GIVEN_UP_S` if no frame was displayed."""
+        """Lower quartile of the latencies of the timed frames in seconds; `GIVEN_UP_S` if no frame was displayed."""
         timed = [took_s for seq, took_s in self.took_s.items() if seq >= STARTING_FRAMES]
-        return statistics.median(timed or [GIVEN_UP_S])
+        return lower_quartile(timed or [GIVEN_UP_S])
 
 
 def measured_frame_s(
     settings: LiveSettings, about: SourceDescription, new_graph: Callable[[PacedTissue, LiveSettings], Application]
 ) -> float:
-    """Run the graph made by `new_graph` on paced pictures and return the median latency of a frame in seconds.
+    """Run the graph made by `new_graph` on paced pictures and return the latency of a frame in seconds.
 
     Args:
         settings: settings of the live run; the number of steps is set to the minimum.
