@@ -15,7 +15,7 @@ from benchmarks.tool_network.tissue import Picture, Plane, TissuePool, falloff, 
 SIZE_PX = (128, 160)
 """Height and width of a training picture."""
 DRAWN_PX = (192, 240)
-WITHOUT_TOOLS = (0.15, 0.22)
+WITHOUT_TOOLS = (0.22, 0.22)
 """Share of pictures without instruments, elsewhere and inside of hollow organs."""
 HOLLOW = 0.25
 """Share of pictures by flexible endoscopes from inside a hollow organ."""
@@ -37,7 +37,7 @@ def training_picture(
     inner_light = rng.random() < 0.5
     if not inner_light:
         image = image * light[..., None]
-    if rng.random() < 0.06:
+    if rng.random() < 0.14:
         image = clips(rng, np.asarray(image, np.float32))
     if rng.random() >= WITHOUT_TOOLS[hollow]:
         shares = [0.75, 0.2, 0.05, 0] if hollow else [0.4, 0.33, 0.17, 0.1]

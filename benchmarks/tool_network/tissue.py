@@ -46,6 +46,10 @@ COLOURED /= COLOURED.sum()
 """Frequency of the palettes for round shapes from the border, which would look like tools in a grey one."""
 
 
+PALE, DARKENED, GLARING = 0.22, 0.15, 0.2
+"""Share of pictures with tissue as pale as tools, with black regions, and with large highlights."""
+
+
 def noise(rng: Generator, height: int, width: int, coarse: int, octaves: int, gain: float = 0.55) -> Plane:
     """Return smooth noise [h, w] with a mean near 0 and a standard deviation near 1; `coarse` cells along the height."""
     total = np.zeros((height, width), np.float32)
@@ -304,6 +308,45 @@ def spots(rng: Generator, image: Picture) -> None:
     image += plane[..., None] * rng.uniform(0.85, 1.05, 3).astype(np.float32)
 
 
+def pale(rng: Generator, image: Picture) -> Picture:
+    """Return a picture whose tissue, or a part of it, is as pale as tools: membranes, fat, scars and bloodless tissue."""
+    height, width = image.shape[:2]
+    level = image.mean(-1, keepdims=True)
+    mean = float(level.mean())
+    flat = np.maximum(mean + (level - mean) * rng.uniform(0.3, 1.1), 0)
+    tint = np.array([1, rng.uniform(0.7, 1), rng.uniform(0.75, 1.08)]) * np.exp(rng.normal(0, 0.05, 3))
+    white = flat * (rng.uniform(0.35, 0.85) / (mean + 0.02)) * tint.astype(np.float32)
+    share: Plane | float = rng.uniform(0.4, 0.97)
+    if rng.random() < 0.5:
+        low = rng.uniform(-1.2, 0.8)
+        where = noise(rng, height, width, int(rng.integers(1, 4)), int(rng.integers(1, 5)), 0.5)
+        share = (share * smooth(where, low, low + rng.uniform(0.05, 2)))[..., None]
+    return np.asarray(image + share * (white - image), np.float32)
+
+
+def dark(rng: Generator, image: Picture) -> Picture:
+    """Return a picture with shadows, cavities or clotted blood that are nearly as dark as black tools."""
+    height, width = image.shape[:2]
+    field = noise(rng, height, width, int(rng.integers(1, 5)), int(rng.integers(1, 6)), rng.uniform(0.3, 0.7))
+    low = rng.uniform(0, 1.6)
+    where = smooth(field, low, low + rng.uniform(0.05, 1.2))[..., None]
+    colour = rng.uniform(0, 0.09) * np.array([1, rng.uniform(0.4, 1), rng.uniform(0.4, 1)], np.float32)
+    black = image * np.float32(rng.uniform(0, 0.15)) + colour
+    return np.asarray(image + where * rng.uniform(0.75, 1) * (black - image), np.float32)
+
+
+def glare(rng: Generator, image: Picture) -> Picture:
+    """Return a picture with large overexposed patches of wet tissue, with sharp and streaky outlines."""
+    height, width = image.shape[:2]
+    low = rng.uniform(0.5, 1.6)
+    field = noise(rng, height, width, int(rng.integers(2, 5)), int(rng.integers(1, 6)), rng.uniform(0.4, 0.8))
+    where = smooth(field, low, low + rng.uniform(0.1, 1))
+    if rng.random() < 0.7:
+        fine = fibres(rng, height, width) if rng.random() < 0.6 else noise(rng, height, width, height // 6, 2, 0.7)
+        where = where * smooth(fine, rng.uniform(-2, 0), rng.uniform(0.8, 2.5))
+    return np.asarray(image + where[..., None] * rng.uniform(0.4, 1.6) * rng.uniform(0.88, 1.0, 3), np.float32)
+
+
 def blood(rng: Generator, image: Picture) -> Picture:
     """Return a picture with pools of blood."""
     height, width = image.shape[:2]
@@ -401,6 +444,10 @@ def tissue(
         image = lumen(rng, height, width)
     else:
         image = organs(rng, height, width)
+    if rng.random() < PALE:
+        image = pale(rng, image)
+        if rng.random() < 0.5:
+            vessels(rng, image, int(rng.integers(1, 9)))
     if rng.random() < 0.8:
         image = detail(rng, np.asarray(image, np.float32), 0.35)
     if rng.random() < 0.4:
@@ -410,6 +457,10 @@ def tissue(
         image = cloth(rng, image)
     if rng.random() < 0.3:
         image = blood(rng, image)
+    if rng.random() < DARKENED:
+        image = dark(rng, image)
+    if rng.random() < GLARING:
+        image = glare(rng, image)
     if rng.random() < 0.5:
         for _ in range(int(rng.integers(1, 4))):
             spots(rng, image)

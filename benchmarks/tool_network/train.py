@@ -8,10 +8,13 @@ The weights are the mean over checkpoints, since long training on the same pictu
 averaged is decided by validation pictures. They are drawn from other seeds, half of them over photographs that training does not see
 (`hamlyn_pair`). No annotated recording is read.
 
-Usage: python -m benchmarks.tool_network.train FOLDER [--recordings DIR] [--device cuda] [--workers 16] [--minutes 8] [--seed 0] [--plain] [--start FOLDER]
+Usage: python -m benchmarks.tool_network.train FOLDER [--recordings DIR] [--device cuda] [--workers 16] [--minutes 8] [--seed 0] [--plain]
+        [--start FOLDER] [--pictures FOLDER]
+    python -m benchmarks.tool_network.train FOLDER --draw [--recordings DIR] [--workers 12] [--minutes 9]
     python -m benchmarks.tool_network.train FOLDER --export
-FOLDER receives `tool_network.onnx`, `checkpoint.pt` (from half the time on) and `training.json` (options, speed, validation).
-The second form writes `tool_network.onnx` from `checkpoint.pt`. Only torch, numpy and OpenCV are needed.
+FOLDER receives `tool_network.onnx`, `checkpoint.pt` (from half the time on), `kept.pt` (earlier weights, half precision) and `training.json`
+(options, speed, validation). The second form writes pictures into FOLDER, from which several trainings read at the same time with
+`--pictures`. The third form writes `tool_network.onnx` from `checkpoint.pt`. Only torch, numpy and OpenCV are needed.
 """
 
 from __future__ import annotations
@@ -25,10 +28,10 @@ import queue
 import sys
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 from unittest import mock
 
 import cv2
@@ -65,6 +68,10 @@ COARSE = 0.3
 """Weight of the loss of the coarse output."""
 SENT_AT_ONCE = 8
 """Pictures that a worker sends in one message."""
+IN_A_FILE = 64
+"""Pictures in a file for several trainings."""
+SAVED_EVERY = 8
+"""Number of checkpoints of which one is saved in `kept.pt`."""
 FIRST_PICTURES = 100
 """Training pictures of each worker before training begins."""
 VALIDATION_SHARE = 0.1
@@ -77,14 +84,18 @@ Pictures = NDArray[np.uint8]
 """RGB and coverage by tools, uint8 [N, h, w, 4]."""
 
 
+class Pipe(Protocol):
+    """Receiver of drawn pictures. The flag is true for validation pictures."""
+
+    def put(self, message: tuple[bool, Pictures], /) -> None: ...
+
+
 def four_channels(rng: np.random.Generator, pool: TissuePool, recorded: RecordedTools | None) -> Pictures:
     image, mask = training_picture(rng, pool, recorded)
     return np.concatenate([image, mask[..., None]], axis=2)
 
 
-def draw(
-    worker: int, workers: int, seed: int, recordings: Path | None, validation: int, to: mp.Queue[tuple[bool, Pictures]]
-) -> None:
+def draw(worker: int, workers: int, seed: int, recordings: Path | None, validation: int, to: Pipe) -> None:
     """Draw this worker's share of the validation pictures, then training pictures until the process is ended."""
     cv2.setNumThreads(1)
     held_out = Photographs(recordings, only=HELD_OUT) if recordings is not None else None
@@ -100,6 +111,34 @@ def draw(
         to.put((False, np.stack([four_channels(rng, pool, recorded) for _ in range(SENT_AT_ONCE)])))
 
 
+def draw_files(worker: int, workers: int, seed: int, recordings: Path | None, validation: int, folder: Path) -> None:
+    """Write what `draw` sends into files of a folder, until the process is ended."""
+
+    class Files:
+        def __init__(self) -> None:
+            self.count, self.waiting = 0, list[Pictures]()
+
+        def put(self, message: tuple[bool, Pictures]) -> None:
+            validates, pictures = message
+            self.waiting.append(pictures)
+            if validates or sum(map(len, self.waiting)) >= IN_A_FILE:
+                name = f"{'validation' if validates else 'training'}_{worker:03d}_{self.count:06d}"
+                np.save(folder / f"{name}.part.npy", np.concatenate(self.waiting))
+                (folder / f"{name}.part.npy").rename(folder / f"{name}.npy")
+                self.waiting.clear()
+                self.count += 1
+
+    draw(worker, workers, seed, recordings, validation, Files())
+
+
+def from_files(folder: Path, read: set[str]) -> Iterator[tuple[bool, Pictures]]:
+    """Yield pictures from files that are not in `read`, at most 64 files, and add their names to it."""
+    names = sorted(path.name for path in folder.glob("*_*.npy") if not path.name.endswith(".part.npy"))
+    for name in [name for name in names if name not in read][:64]:
+        read.add(name)
+        yield name.startswith("validation"), np.load(folder / name)
+
+
 class Store:
     """Drawn pictures on the device; new ones replace the oldest."""
 
@@ -112,14 +151,16 @@ class Store:
         self.pictures[at] = torch.from_numpy(pictures).to(self.pictures.device)
         self.count += len(pictures)
 
-    def batch(self, size: int, chance: torch.Generator, plain: bool = False) -> tuple[Tensor, Tensor]:
+    def batch(
+        self, size: int, chance: torch.Generator, plain: bool = False, grey: float = 0.0
+    ) -> tuple[Tensor, Tensor]:
         """Return altered pictures [N, 3, h, w] in 0..1, of `INPUT_PX`, and their coverage by tools [N, 1, h / 2, w / 2].
 
-        `plain` leaves out the changes of texture.
+        `plain` leaves out the changes of texture. `grey` is the share of pictures with little or no colour.
         """
         there = min(self.count, len(self.pictures))
         at = torch.randint(0, there, (size,), generator=chance, device=self.pictures.device)
-        return altered(reduced(self.pictures[at]), chance, plain)
+        return altered(reduced(self.pictures[at]), chance, plain, grey)
 
 
 def reduced(pictures: Tensor) -> Tensor:
@@ -128,10 +169,11 @@ def reduced(pictures: Tensor) -> Tensor:
     return nn.functional.interpolate(planes, INPUT_PX, mode="bilinear", antialias=True)
 
 
-def altered(both: Tensor, chance: torch.Generator, plain: bool = False) -> tuple[Tensor, Tensor]:
+def altered(both: Tensor, chance: torch.Generator, plain: bool = False, grey: float = 0.0) -> tuple[Tensor, Tensor]:
     """Return mirrored, turned, scaled, recoloured and blurred pictures, a share of them with the tools of another one.
 
-    Unless `plain`, other shares have tools with foreign texture, and a random filter.
+    Unless `plain`, other shares have tools with foreign texture, and a random filter. A share of `grey` has at most 80 % of its
+    saturation, so that tools are told by their shape.
 
     Drawing takes longer than training, so the pictures would be learned by heart otherwise.
     """
@@ -165,6 +207,9 @@ def altered(both: Tensor, chance: torch.Generator, plain: bool = False) -> tuple
         torch.cat([pictures, cover], 1), grid, padding_mode="reflection", align_corners=False
     )
     pictures = recoloured(moved[:, :3], chance)
+    if grey > 0:
+        level = pictures.mean(1, keepdim=True)
+        pictures = pictures + (uniform(1) < grey) * (1 - 0.8 * uniform(1)) * (level - pictures)
     if not plain:
         pictures = filtered(pictures, chance)
     light = nn.functional.interpolate(normal(1, 3, 4), INPUT_PX, mode="bicubic")
@@ -227,6 +272,11 @@ def mean_of(states: list[dict[str, Tensor]]) -> ToolNetwork:
     network = ToolNetwork().to(next(iter(states[0].values())).device)
     network.load_state_dict({name: sum(state[name].float() for state in states) / len(states) for name in states[0]})
     return network
+
+
+def halved(value: Tensor) -> Tensor:
+    """Return a tensor on the CPU, in half precision if it is of floating point."""
+    return value.cpu().half() if value.is_floating_point() else value.cpu()
 
 
 def settled(network: nn.Module, store: Store, batch: int) -> nn.Module:
@@ -310,10 +360,16 @@ def main() -> int:
     parser.add_argument("--batch", type=int, default=64)
     parser.add_argument("--store", type=int, default=100_000, help="pictures that are kept, 82 kB each")
     parser.add_argument("--validation", type=int, default=800, help="number of validation pictures")
+    parser.add_argument(
+        "--first", type=int, default=0, help="training pictures before training begins, with --pictures"
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--rate", type=float, default=LEARNING_RATE)
     parser.add_argument("--plain", action="store_true", help="without foreign texture, random filters and mixed styles")
+    parser.add_argument("--grey", type=float, default=0.0, help="share of pictures with little or no colour")
     parser.add_argument("--start", type=Path, help="folder of an earlier training, whose weights are trained further")
+    parser.add_argument("--pictures", type=Path, help="folder into which --draw writes; no pictures are drawn then")
+    parser.add_argument("--draw", action="store_true", help="only write pictures into FOLDER, for --minutes")
     parser.add_argument("--export", action="store_true", help="only write the ONNX file of checkpoint.pt")
     arguments = parser.parse_args()
     folder: Path = arguments.folder
@@ -327,33 +383,46 @@ def main() -> int:
         parser.error(f"--recordings {arguments.recordings} has no folder 'colon'; give the folder of all recordings")
     began = time.monotonic()
     context = mp.get_context("fork")
+    if arguments.pictures is not None:
+        read: set[str] = set()
+        return train(arguments, lambda: from_files(arguments.pictures, read), [], began)
     to: mp.Queue[tuple[bool, Pictures]] = context.Queue(4 * arguments.workers)
-    shared = (arguments.workers, arguments.seed + 1, arguments.recordings, arguments.validation, to)
+    shared = (arguments.workers, arguments.seed + 1, arguments.recordings, arguments.validation)
+    if arguments.draw:
+        shared, target = (*shared, folder), draw_files
+    else:
+        shared, target = (*shared, to), draw
     workers: list[BaseProcess] = [
-        context.Process(target=draw, args=(worker, *shared), daemon=True) for worker in range(arguments.workers)
+        context.Process(target=target, args=(worker, *shared), daemon=True) for worker in range(arguments.workers)
     ]
     for worker in workers:
         worker.start()
     try:
-        return train(arguments, to, workers, began)
+        if arguments.draw:
+            time.sleep(60 * arguments.minutes)
+            return 0
+        return train(arguments, lambda: received(to, workers), workers, began)
     finally:
         for worker in workers:
             worker.terminate()
 
 
 def train(
-    arguments: argparse.Namespace, to: mp.Queue[tuple[bool, Pictures]], workers: list[BaseProcess], began: float
+    arguments: argparse.Namespace,
+    drawn: Callable[[], Iterator[tuple[bool, Pictures]]],
+    workers: list[BaseProcess],
+    began: float,
 ) -> int:
-    """Train, validate, and write the files."""
+    """Train, validate, and write the files. `drawn` returns the pictures that are ready."""
     folder, device, batch = arguments.folder, torch.device(arguments.device), arguments.batch
     torch.set_num_threads(1)
     torch.manual_seed(arguments.seed)
     torch.backends.cudnn.benchmark = True
     store = Store(arguments.store, device)
     validation: list[Tensor] = []
-    while store.count < FIRST_PICTURES * len(workers) or len(validation) < arguments.validation:
+    while store.count < max(FIRST_PICTURES * len(workers), arguments.first) or len(validation) < arguments.validation:
         time.sleep(0.05)
-        for validates, pictures in received(to, workers):
+        for validates, pictures in drawn():
             if validates:
                 validation.append(torch.from_numpy(pictures))
             else:
@@ -381,9 +450,9 @@ def train(
         for group in optimiser.param_groups:
             group["lr"] = rate
         if step % 8 == 0:
-            for _, pictures in received(to, workers):
+            for _, pictures in drawn():
                 store.add(pictures)
-        batch_pictures, cover = store.batch(batch, chance, arguments.plain)
+        batch_pictures, cover = store.batch(batch, chance, arguments.plain, arguments.grey)
         logits, coarse = network(features(batch_pictures).contiguous(memory_format=torch.channels_last))
         loss = loss_of(logits, cover) + COARSE * loss_of(coarse, avg_pool2d(cover, 8))
         optimiser.zero_grad()
@@ -409,6 +478,8 @@ def train(
     for worker in workers:
         worker.terminate()
     kept.append(averaged.module.state_dict())
+    saved = [{name: halved(value) for name, value in state.items()} for state in kept[SAVED_EVERY - 1 :: SAVED_EVERY]]
+    torch.save(saved, folder / "kept.pt")
     candidates = {}
     for count in LAST_CHECKPOINTS:
         if count <= len(kept):
@@ -419,7 +490,7 @@ def train(
     options = {
         name: value
         for name, value in vars(arguments).items()
-        if name not in ("folder", "recordings", "export", "start")
+        if name not in ("folder", "recordings", "export", "draw", "start", "pictures")
     }
     summary = {
         "options": options | {"with_photographs": arguments.recordings is not None},

@@ -9,7 +9,8 @@ import torch
 from benchmarks.tool_network.bodies import Canvas
 from benchmarks.tool_network.flexible import accessory, hollow_organ, narrow_band
 from benchmarks.tool_network.network import INPUTS, ToolNetwork, features
-from benchmarks.tool_network.train import INPUT_PX, Store, altered, export, reduced
+from benchmarks.tool_network.tissue import dark, glare, pale
+from benchmarks.tool_network.train import INPUT_PX, Store, altered, export, from_files, reduced
 from gsplat_core.endoscope import tool_network
 
 
@@ -70,3 +71,26 @@ def test_opencv_computes_what_the_network_computes(tmp_path):
         wanted = network(planes).numpy()
     assert wanted.shape == (1, 1, INPUT_PX[0] // 2, INPUT_PX[1] // 2)
     np.testing.assert_allclose(loaded.forward(), wanted, atol=1e-3 * float(np.abs(wanted).max()))
+
+
+def test_trainings_read_each_finished_file_of_a_folder_once(tmp_path):
+    pictures = np.full((2, 128, 160, 4), 7, np.uint8)
+    for name in ("training_000_000000", "validation_000_000000", "training_001_000003.part"):
+        np.save(tmp_path / f"{name}.npy", pictures)
+    read: set[str] = set()
+    first = list(from_files(tmp_path, read))
+    assert [validates for validates, _ in first] == [False, True]
+    np.testing.assert_array_equal(first[0][1], pictures)
+    assert not list(from_files(tmp_path, read))
+    np.save(tmp_path / "training_001_000003.npy", pictures)
+    assert [validates for validates, _ in from_files(tmp_path, read)] == [False]
+
+
+def test_pale_dark_and_glaring_tissue_stays_a_picture():
+    """Pale tissue has less colour than before, black regions are darker, and highlights are brighter."""
+    red = np.broadcast_to(np.float32([0.6, 0.15, 0.1]), (96, 120, 3)).copy()
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        assert np.ptp(pale(rng, red).mean((0, 1))) < np.ptp(red[0, 0])
+        assert dark(rng, red).min() < 0.5 * red.max() and (dark(rng, red) <= red + 0.1).all()
+        assert (glare(rng, red) >= red - 1e-6).all()
