@@ -2,14 +2,15 @@
 
 One JSON line per recording, on one core: `iou` (tool class, mean and minimum over the frames with a tool, if the recording has masks), `recall`, `found_share` (share of
 pixels called tool: false ones if there is no tool), `withheld` (frames that the gate withheld) and processor time per frame. With --copies also for altered copies of
-the first recording: tint, brightness, noise, smoke, size.
+the first recording: tint, brightness, noise, smoke, size. With --inside only pixels in the field of view count, for masks that include the surround of a round view.
 
 With --annotations, RECORDING is the folder of all recordings, and the frames in `tool_annotations.json` are measured: outlines of tools that were drawn by hand. Clips
 and threads that stay in the body are no tools. `unsure` regions are left out. `missed` are tools of more than 2 % of the picture of which less than 30 % is found;
 `false_share` is the share of tissue called tool. The frames before an annotated one are given to the detector first.
 
-Usage: python benchmarks/tool_mask.py RECORDING... [--frames 200] [--method builtin|classical|onnx:PATH|trained:FOLDER]
-    [--copies | --annotations]
+Usage: python benchmarks/tool_mask.py RECORDING... [--frames 200] [--method builtin|full_view|classical|onnx:PATH|trained:FOLDER]
+    [--inside] [--copies | --annotations]
+`full_view` is the network of `builtin` for pictures without a round view, used for all.
 FOLDER is the output of `tool_network/train.py`.
 A picture file is a recording of one frame.
 """
@@ -31,8 +32,8 @@ from numpy.typing import NDArray
 
 from gsplat_core.endoscope.onnx_tools import OnnxToolFinder
 from gsplat_core.endoscope.out_of_body import BodyGate
-from gsplat_core.endoscope.tool_network import NetworkToolFinder
-from gsplat_core.endoscope.tools import ToolFinder
+from gsplat_core.endoscope.tool_network import NETWORK, NetworkToolFinder, round_view
+from gsplat_core.endoscope.tools import ToolFinder, field_of_view
 from gsplat_core.io.recordings import open_recording
 from operators.tool_mask import MaskFinder
 
@@ -45,11 +46,14 @@ def main() -> int:
     parser.add_argument("recordings", type=Path, nargs="+")
     parser.add_argument("--frames", type=int, default=200)
     parser.add_argument("--method", default="builtin")
+    parser.add_argument("--inside", action="store_true")
     parser.add_argument("--copies", action="store_true")
     parser.add_argument("--annotations", action="store_true")
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     finder: MaskFinder = ToolFinder() if arguments.method == "classical" else NetworkToolFinder()
+    if arguments.method == "full_view":
+        finder = NetworkToolFinder(NETWORK)
     if arguments.method.startswith("trained:"):
         trained = Path(arguments.method.removeprefix("trained:"))
         training = json.loads((trained / "training.json").read_text())
@@ -61,7 +65,10 @@ def main() -> int:
         report_annotated(arguments.recordings[0], finder)
         return 0
     for path in arguments.recordings:
-        report(path.name if path.is_file() else path.resolve().name, measured(path, arguments.frames, finder))
+        report(
+            path.name if path.is_file() else path.resolve().name,
+            measured(path, arguments.frames, finder, inside=arguments.inside),
+        )
     for name, change in (changes() if arguments.copies else {}).items():
         path = arguments.recordings[0]
         report(f"{path.resolve().name}, {name}", measured(path, arguments.frames, finder, change))
@@ -79,11 +86,13 @@ def frames(path: Path) -> Iterator[tuple[Image, Image | None]]:
         yield frame.image, frame.mask
 
 
-def measured(path: Path, count: int, finder: MaskFinder, change: Change = lambda image: image) -> dict[str, object]:
-    """Return the figures of one recording."""
+def measured(
+    path: Path, count: int, finder: MaskFinder, change: Change = lambda image: image, inside: bool = False
+) -> dict[str, object]:
+    """Return the figures of one recording. `inside` leaves out pixels outside of the field of view."""
     finder.reset()
     gate = BodyGate()
-    ious, recalls, shares, find_ms, judge_ms, withheld = [], [], [], [], [], 0
+    ious, recalls, shares, find_ms, judge_ms, withheld, round_views = [], [], [], [], [], 0, 0
     for image, mask in islice(frames(path), count):
         image = change(image)
         start = time.thread_time()
@@ -92,21 +101,31 @@ def measured(path: Path, count: int, finder: MaskFinder, change: Change = lambda
         withheld += gate.judge(image) is not None
         judge_ms.append(1e3 * (time.thread_time() - middle))
         find_ms.append(1e3 * (middle - start))
+        view = field_of_view(np.asarray(image.max(axis=2))) > 0 if inside else np.ones_like(found)
+        found &= view
+        round_views += round_view(image)
         shares.append(float(found.mean()))
         # A mask with the field of view's border in it is no tool mask; the synthetic recordings' and `masks/` are.
         if mask is not None and (mask == 0).any() and has_tool_masks(path):
             tool = cv2.resize(mask, image.shape[1::-1], interpolation=cv2.INTER_NEAREST) == 0
+            tool &= view
+            if inside and tool.mean() < RIM:
+                continue
             ious.append(float((found & tool).sum() / (found | tool).sum()))
             recalls.append(float((found & tool).sum() / tool.sum()))
     figures: dict[str, object] = {"frames": len(shares), "found_share": round(float(np.mean(shares)), 4)}
     if ious:
         figures |= {"iou": round(float(np.mean(ious)), 3), "iou_min": round(min(ious), 3)}
         figures["recall"] = round(float(np.mean(recalls)), 3)
-    figures |= {"withheld": withheld, "find_ms_p50": round(float(np.median(find_ms)), 2)}
+    figures |= {"round_views": round_views, "withheld": withheld, "find_ms_p50": round(float(np.median(find_ms)), 2)}
     return figures | {
         "find_ms_p95": round(float(np.quantile(find_ms, 0.95)), 2),
         "judge_ms_p50": round(float(np.median(judge_ms)), 2),
     }
+
+
+RIM = 0.003
+"""Share of the picture below which masked pixels in the field of view count as its rim, not as a tool."""
 
 
 def has_tool_masks(path: Path) -> bool:

@@ -1,10 +1,12 @@
-"""Tool segmentation by a small convolutional network that was trained on drawn pictures.
+"""Tool segmentation by small convolutional networks that were trained on drawn pictures.
 
-`benchmarks/tool_network/` draws the pictures and trains the network.
+Pictures with a round or octagonal view, as of flexible endoscopes, have a network of their own. `benchmarks/tool_network/` draws the pictures
+and trains the networks.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -17,6 +19,13 @@ from gsplat_core.endoscope.tools import SMALLEST_PX, field_of_view, size_of
 NETWORK = Path(__file__).with_name("tool_network.onnx")
 INPUT_PX = (96, 80)
 """Width and height of the network's input; pictures of any aspect are resized to it."""
+ROUND_NETWORK = Path(__file__).with_name("tool_network_round.onnx")
+"""Network of pictures whose view is round or octagonal."""
+ROUND_INPUT_PX, ROUND_INPUTS = (128, 96), 8
+CORNER, DARK_CORNER = 1 / 16, 0.75
+"""Side of the corners of a picture, as a share of its sides, and the share of a corner that is dark if the view is round. A patient's name or
+the time may be printed over the rest.
+"""
 LOGARITHMS = np.log(np.arange(256, dtype=np.float32) / 255 + np.float32(0.06))
 """Logarithm of a byte in 0..1, with an offset because ratios are noise where it is dark. As in training."""
 SURROUND = 16
@@ -34,20 +43,32 @@ BORDER: NDArray[np.uint8] = np.ones((7, 7), np.uint8)
 """Structuring element by which a view is eroded to find its border, three pixels wide."""
 
 
+@dataclass(frozen=True)
+class _Network:
+    """Loaded network and its input."""
+
+    network: cv2.dnn.Net
+    input_px: tuple[int, int]
+    """Width and height."""
+    inputs: int
+    """Number of planes."""
+
+
 class NetworkToolFinder:
     """Tool segmentation of single pictures on the CPU. Deterministic, without state between pictures."""
 
     def __init__(self, network: Path | None = None, input_px: tuple[int, int] = INPUT_PX, inputs: int = 5) -> None:
-        """Load the network. Raises cv2.error if OpenCV cannot.
+        """Load the networks. Raises cv2.error if OpenCV cannot.
 
         Args:
-            network: file written by `benchmarks/tool_network/train.py`; None for the one of this package.
+            network: file written by `benchmarks/tool_network/train.py`, for all pictures; None for the two of this package.
             input_px: width and height of its input.
             inputs: number of planes of its input, 5 or 8.
         """
-        self._network = cv2.dnn.readNetFromONNX(str(network or NETWORK))
-        self._input_px = input_px
-        self._inputs = inputs
+        self._network = _Network(cv2.dnn.readNetFromONNX(str(network or NETWORK)), input_px, inputs)
+        self._round = self._network
+        if network is None:
+            self._round = _Network(cv2.dnn.readNetFromONNX(str(ROUND_NETWORK)), ROUND_INPUT_PX, ROUND_INPUTS)
 
     def reset(self) -> None:
         """Do nothing, since no state is kept between pictures."""
@@ -62,10 +83,14 @@ class NetworkToolFinder:
         tissue = np.ones((height, width), np.uint8)
         if min(height, width) < SMALLEST_PX:
             return tissue
-        small = averaged(image, self._input_px)
-        planes = features(small, self._inputs)
-        self._network.setInput(planes)
-        smoothed = along_edges(self._network.forward()[0, 0], planes[0])
+        chosen = self._network
+        small = averaged(image, chosen.input_px)
+        if self._round is not chosen and round_view(small):
+            chosen = self._round
+            small = averaged(image, chosen.input_px)
+        planes = features(small, chosen.inputs)
+        chosen.network.setInput(planes)
+        smoothed = along_edges(chosen.network.forward()[0, 0], planes[0])
         levels = (smoothed * np.float32(127 / CERTAIN) + 128).clip(0, 255).astype(np.uint8)
         view = field_of_view(lowest_and_highest(small)[1])
         levels *= view
@@ -75,6 +100,16 @@ class NetworkToolFinder:
         return tissue
 
 
+def round_view(small: NDArray[np.uint8]) -> bool:
+    """Return true if all four corners of a picture, RGB uint8 [h, w, 3], are dark, as around a round or octagonal view."""
+    height, width = (max(1, round(CORNER * side)) for side in small.shape[:2])
+    for rows in (slice(height), slice(-height, None)):
+        for columns in (slice(width), slice(-width, None)):
+            if (small[rows, columns].max(axis=2) < SURROUND).mean() < DARK_CORNER:
+                return False
+    return True
+
+
 def along_edges(logits: NDArray[np.float32], planes: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return logits [h, w], limited to ±`CERTAIN`, with the edges of the picture.
 
@@ -82,7 +117,7 @@ def along_edges(logits: NDArray[np.float32], planes: NDArray[np.float32]) -> NDA
 
     Args:
         logits: output of the network, [h / 2, w / 2].
-        planes: `features` of the picture, [5, h, w].
+        planes: `features` of the picture, [5 or 8, h, w].
     """
     height, width = planes.shape[1:]
     coarse = np.empty((height, width), np.float32)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from gsplat_core.endoscope.tool_network import NetworkToolFinder, remove_inner_regions
+from gsplat_core.endoscope.tool_network import NETWORK, NetworkToolFinder, remove_inner_regions, round_view
 from gsplat_core.errors import InvalidInput
 
 
@@ -78,3 +78,37 @@ def test_small_regions_inside_the_view_are_no_tools():
     wanted[inside] = 0
     remove_inner_regions(levels, view)
     np.testing.assert_array_equal(levels, wanted)
+
+
+def in_round_view(image):
+    """The picture with a black surround, and its view (1 inside)."""
+    height, width = image.shape[:2]
+    y, x = np.mgrid[0:height, 0:width]
+    inside = (x - width / 2) ** 2 + (y - height / 2) ** 2 < (0.55 * height) ** 2
+    return image * inside[..., None].astype(np.uint8), inside
+
+
+def test_a_round_view_has_four_dark_corners():
+    image, _ = in_round_view(tissue(96, 128))
+    assert round_view(image)
+    assert not round_view(tissue(96, 128))
+    printed = image.copy()
+    printed[0, :6] = 200
+    assert round_view(printed)
+    printed[:6, :8] = 200
+    assert not round_view(printed)
+
+
+def test_pictures_with_a_round_view_have_a_network_of_their_own(finder):
+    """It finds the instrument inside of the view, and differs from the other network."""
+    image, rod = with_rod(256, 320)
+    image, inside = in_round_view(image)
+    found = finder.find(image) == 0
+    rod = (rod == 1) & inside
+    assert (found & rod).sum() / (found | rod).sum() > 0.6
+    assert not found[~inside].any()
+    assert (found != (NetworkToolFinder(NETWORK).find(image) == 0)).any()
+
+
+def test_nothing_is_found_on_plain_tissue_in_a_round_view(finder):
+    assert finder.find(in_round_view(tissue(256, 320))[0]).all()
