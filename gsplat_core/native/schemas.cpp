@@ -113,6 +113,10 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "Tensor flatten_ids, Tensor? backgrounds, Tensor? masks, int width, int height, int tile_size, Tensor alphas, Tensor last, "
       "Tensor v_colors, Tensor v_alphas, bool absgrad, float max_alpha=0.99) -> (Tensor v_means2d, Tensor v_conics, "
       "Tensor v_colors, Tensor v_opacities, Tensor v_backgrounds, Tensor v_means2d_abs)");
+  // Colours [N, 3] of one picture's splats after `steps` corrections by its residual, for the CPU (correct_colours.h).
+  m.def(
+      "correct_colours(Tensor means2d, Tensor conics, Tensor colors, Tensor opacities, Tensor isect_offsets, Tensor flatten_ids, "
+      "Tensor image, Tensor mask, int steps, float relaxation, float least_weight, float max_alpha=0.99) -> Tensor");
 
   // Coefficients [N, 10] of the depth along the rays of a pinhole camera (ray_blending.h), and the shortest axes [N, 3] in
   // camera axes, towards the camera.

@@ -5,6 +5,7 @@ They are the reference for tests of the compiled ops.
 
 from gsplat_core.reference.adam import adam_step
 from gsplat_core.reference.compositing import rasterize_to_pixels
+from gsplat_core.reference.correct_colours import correct_colours
 from gsplat_core.reference.covariance import quat_scale_to_covar_preci
 from gsplat_core.reference.deformation import (
     basis_field,
@@ -48,6 +49,7 @@ __all__ = [
     "basis_field_move_to_",
     "blend_flow",
     "blend_rays",
+    "correct_colours",
     "fit_disparities",
     "frame_loss",
     "fully_fused_projection",

@@ -117,19 +117,24 @@ class ColoredSplats(NamedTuple):
     nearness: Tensor
 
 
+Recoloring = Callable[[ColoredSplats, Tensor, Tensor], Tensor]
+"""Function that returns other channels of splats, given their `isect_offsets` and `flatten_ids`."""
+
+
 def render_splats(
     ops: StepOperations,
     geometry: Geometry,
     coloring: Coloring | None,
     backgrounds: Tensor | None,
     settings: RenderSettings,
+    recoloring: Recoloring | None = None,
 ) -> RenderedSplats:
     """Project, colour, bin into tiles and blend; shapes must have been checked.
 
     Without `coloring` only depth is rendered.
     """
     splats = project_splats(ops, geometry, coloring, settings)
-    return blend_splats(ops, splats, backgrounds, settings, geometry.viewmats.shape[:-2])
+    return blend_splats(ops, splats, backgrounds, settings, geometry.viewmats.shape[:-2], recoloring)
 
 
 def project_splats(
@@ -175,8 +180,9 @@ def blend_splats(
     backgrounds: Tensor | None,
     settings: RenderSettings,
     image_dims: Sequence[int],
+    recoloring: Recoloring | None = None,
 ) -> RenderedSplats:
-    """Bin splats into the tiles of pictures [..., C] and blend them."""
+    """Bin splats into the tiles of pictures [..., C] and blend them, with other channels if `recoloring` is given."""
     rows, channels, opacities, nearness = splats
     packing: dict[str, Any] = {}
     if isinstance(rows, PackedProjection):
@@ -190,6 +196,8 @@ def blend_splats(
         rows.means2d, rows.radii, nearness, grid, conics=rows.conics, opacities=opacities, **packing
     )
     isect_offsets = isect_offsets.reshape(*image_dims, *reversed(settings.tile_grid))
+    if recoloring is not None:
+        channels = recoloring(splats, isect_offsets, flatten_ids)
     image, alphas, *rest = ops.rasterize_to_pixels(
         rows.means2d, rows.conics, channels, opacities, settings.width, settings.height, settings.tile_size, isect_offsets,
         flatten_ids, backgrounds=backgrounds, packed=bool(packing), absgrad=settings.absgrad,

@@ -64,6 +64,10 @@ class LiveTraining:
     with a learning rate, if the field has temporal colours. On a GPU this requires spherical harmonics of degree 0, and
     depth is compared only in some rehearsal steps (`DEPTH_EVERY`).
     """
+    corrections_before: int = 0
+    """Number of further colour corrections at the start of each step on the newest frame, on the CPU. They cost less
+    than the correction of the step, because the geometry and therefore the blending weights are those of the step.
+    """
 
     def __post_init__(self) -> None:
         for name in ("first_rate", "last_rate"):
@@ -77,6 +81,8 @@ class LiveTraining:
             raise InvalidSetting(
                 f"colour_relaxation is {self.colour_relaxation}; it must be at least 0 and below {MOST_RELAXATION:g}"
             )
+        if not 0 <= self.corrections_before <= 100:
+            raise InvalidSetting(f"corrections_before is {self.corrections_before}; it must be between 0 and 100")
 
     def rate_at(self, step: int) -> float:
         """Return the factor of the learning rates in a frame's step, counted from 0."""
@@ -220,6 +226,11 @@ class NewestFirstSchedule(Schedule):
         """
         super().__init__(device)
         check_colours(live.colour_relaxation, config, device)
+        if live.corrections_before and device.type != "cpu":
+            raise InvalidSetting(
+                f"corrections_before is {live.corrections_before} on {device}: colours are corrected in advance on the"
+                " CPU only; set it to 0"
+            )
         self._live = live
         self._rehearsing = StepsInFlight(device, most=REHEARSED_IN_FLIGHT)
         self._rehearsed = 0
@@ -232,7 +243,8 @@ class NewestFirstSchedule(Schedule):
         loss = None
         while spending.allows_step(by_turns=observation.right_eye is not None):
             rate = 1.0 if first else self._live.rate_at(spending.made)
-            loss = step(observation.by_turns(spending.turn), rate, self._live.colour_relaxation)
+            eye = observation.by_turns(spending.turn)
+            loss = step(eye, rate, self._live.colour_relaxation, self._live.corrections_before)
             spending.step_made(self._in_flight.queued() if budget.is_timed else 0)
         if loss is None:
             return ObserveReport(observation.seq, 0, None, step.gaussians.count, spending.ending)

@@ -30,7 +30,7 @@ LIVE_MOST_GAUSSIANS = 100_000
 LIVE_PIXELS_PER_GAUSSIAN = 13
 """Pixels per initial Gaussian on a GPU, for pictures larger than usual."""
 LIVE_TRAINING = {
-    "cpu": LiveTraining(first_rate=2.0, last_rate=1.5, rate_steps=2, colour_relaxation=1.5),
+    "cpu": LiveTraining(first_rate=2.0, last_rate=1.5, rate_steps=2, colour_relaxation=1.5, corrections_before=4),
     "cuda": LiveTraining(colour_relaxation=1.5),
 }
 LIVE_SQUARED_ERROR = {"cpu": True, "cuda": False}

@@ -14,17 +14,18 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gsplat_core.ops.correct_colours.correct_colours import correct_colours
 from gsplat_core.ops.image_loss.image_loss import STEEP_AS_L1, image_loss
 from gsplat_core.ops.projection.projection import fully_fused_projection
 from gsplat_core.ops.spherical_harmonics.spherical_harmonics import spherical_harmonics
 from gsplat_core.ops.tiles.tiles import bin_splats
-from gsplat_core.rendering.pipeline import Geometry, RenderedSplats, StepOperations, render_splats
+from gsplat_core.rendering.pipeline import ColoredSplats, Geometry, RenderedSplats, StepOperations, render_splats
 from gsplat_core.rendering.rasterization import RenderOutput
 from gsplat_core.rendering.settings import EPS2D, RenderSettings
 from gsplat_core.scene.cameras import CAMERA_MODELS
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
 from gsplat_core.training.observations import Observation
-from gsplat_core.training.steps.colour_correction import colour_correction
+from gsplat_core.training.steps.colour_correction import LEAST_WEIGHT_PX, colour_correction
 
 LEFT, RIGHT = "sh", "right_sh"
 """Tensor names of the eyes' colours in `Gaussians`. The right eye sees the sum of both."""
@@ -80,7 +81,11 @@ class Compared(NamedTuple):
 
 @torch.no_grad()
 def loss_and_gradients(
-    gaussians: Gaussians, observation: Observation, weights: LossWeights, colour_relaxation: float = 0.0
+    gaussians: Gaussians,
+    observation: Observation,
+    weights: LossWeights,
+    colour_relaxation: float = 0.0,
+    corrections_before: int = 0,
 ) -> Compared:
     """Compute the loss against an observation and its gradients.
 
@@ -91,6 +96,8 @@ def loss_and_gradients(
         observation: target.
         weights: weights of the loss terms.
         colour_relaxation: above 0, the same passes also compute the colour correction (`colour_correction`).
+        corrections_before: number of corrections before the comparison, on the CPU. Loss and gradients are then those of
+            the corrected colours, and the returned correction includes all.
     """
     camera = observation.camera
     viewmat, intrinsics = (matrix[None] for matrix in camera.matrices(gaussians.device))
@@ -101,8 +108,22 @@ def loss_and_gradients(
         render_mode="RGB+D" if use_depth else "RGB", camera_model=camera.model,
     )  # fmt: skip
     geometry = Geometry(gaussians.means, None, gaussians.quats, scales, opacities, viewmat, intrinsics)
-    unclamped, directions = _colours(gaussians, camera.position)
-    splats = render_splats(_STEPS, geometry, lambda dense: (unclamped.clamp(min=0)[None], dense), None, settings)
+    initial, directions = _colours(gaussians, camera.position)
+    unclamped = initial
+
+    def corrected(coloured: ColoredSplats, offsets: Tensor, ids: Tensor) -> Tensor:
+        nonlocal unclamped
+        rows = coloured.rows
+        unclamped = correct_colours(
+            rows.means2d[0], rows.conics[0], initial, coloured.opacities[0], offsets[0], ids, observation.image,
+            observation.mask, steps=corrections_before, relaxation=colour_relaxation, least_weight=LEAST_WEIGHT_PX,
+        )  # fmt: skip
+        return torch.cat([unclamped.clamp(min=0)[None], coloured.channels[..., 3:]], -1)
+
+    recolouring = corrected if colour_relaxation > 0 and corrections_before else None
+    splats = render_splats(
+        _STEPS, geometry, lambda dense: (initial.clamp(min=0)[None], dense), None, settings, recolouring
+    )
 
     loss, v_picture, v_alphas = _loss_of_picture(splats, observation, weights, use_depth)
     tissue = (observation.mask != 0).float() if colour_relaxation > 0 else None
@@ -127,7 +148,8 @@ def loss_and_gradients(
             residuals = v_channels[:, :3] * (-3 * STEEP_AS_L1 * tissue.sum())
         else:
             residuals = v_channels[:, -4:-1].contiguous()
-        colour_change = colour_correction(unclamped, residuals, v_channels[:, -1], colour_relaxation) / SH_C0
+        last = colour_correction(unclamped, residuals, v_channels[:, -1], colour_relaxation)
+        colour_change = (unclamped - initial + last) / SH_C0
         v_sh[:, 0] = 0
     gradients = {
         "means": v_means,

@@ -215,7 +215,13 @@ class TrainingStep:
             AutogradTraining(field, self._field_rates) if kind.training is None else kind.training(field)
         )
 
-    def __call__(self, observation: Observation, rate_scale: float = 1.0, colour_relaxation: float = 0.0) -> Tensor:
+    def __call__(
+        self,
+        observation: Observation,
+        rate_scale: float = 1.0,
+        colour_relaxation: float = 0.0,
+        corrections_before: int = 0,
+    ) -> Tensor:
         """Train on one observation.
 
         Args:
@@ -224,6 +230,7 @@ class TrainingStep:
             colour_relaxation: above 0, colours at the observation's time are corrected (`colour_correction`) instead of
                 trained; for a field without temporal colours, those of all times. A captured step then compares depth only
                 along rays.
+            corrections_before: number of corrections before the comparison, see `loss_and_gradients`; CPU only.
 
         Returns:
             Loss before the update, [] on the device. A captured step is only queued; reading the loss or `settle` waits
@@ -242,7 +249,7 @@ class TrainingStep:
         if self._pictures is not None:
             compared = self._pictures(seen, observation, self._weights, losses, rate_scale)
         else:
-            compared = loss_and_gradients(seen, observation, self._weights, relaxation)
+            compared = loss_and_gradients(seen, observation, self._weights, relaxation, corrections_before)
             if self._losses:
                 compared = with_losses(compared, seen, losses)
         self.screen = compared.screen if self._keeps_screen else None

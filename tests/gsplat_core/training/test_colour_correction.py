@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -50,6 +52,27 @@ def test_equals_plain_torch(make_gaussians, assert_near, sh_degree, depth_weight
     weights = LossWeights(depth=depth_weight, squared=True)
     compared = loss_and_gradients(gaussians, seen, weights, 1.5)
     assert_near(compared.colour_change, by_autograd(gaussians, seen, 1.5), of_largest=1e-4)
+
+
+@pytest.mark.parametrize("sh_degree", [0, 2])
+@pytest.mark.parametrize("weights", [SQUARED, LossWeights(0.1, 0.5)])
+def test_corrections_before_equal_the_same_number_of_separate_corrections(
+    make_gaussians, assert_near, sh_degree, weights
+):
+    gaussians, seen = make_gaussians(60, sh_degree), observation()
+    together = loss_and_gradients(gaussians, seen, weights, 1.5, corrections_before=3)
+    corrected = gaussians
+    for _ in range(3):
+        change = loss_and_gradients(corrected, seen, weights, 1.5).colour_change
+        sh = corrected.sh.clone()
+        sh[:, 0] += change
+        corrected = replace(corrected, sh=sh)
+    last = loss_and_gradients(corrected, seen, weights, 1.5)
+    assert together.loss == pytest.approx(float(last.loss), rel=1e-4)
+    assert float(last.loss) < 0.95 * float(loss_and_gradients(gaussians, seen, weights).loss)
+    assert_near(together.colour_change, corrected.sh[:, 0] - gaussians.sh[:, 0] + last.colour_change, of_largest=1e-3)
+    for name, gradient in last.gradients.items():
+        assert_near(together.gradients[name], gradient, of_largest=2e-3)
 
 
 @pytest.mark.parametrize("sh_degree", [0, 2])

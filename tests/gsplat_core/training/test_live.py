@@ -15,6 +15,7 @@ from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.metrics import psnr_tissue_db
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.schedule import LiveTraining
+from gsplat_core.training.steps import photometric
 from gsplat_core.training.steps.step import TrainingStep
 
 WIDTH, HEIGHT = 48, 40
@@ -153,6 +154,21 @@ def test_settings_out_of_range_are_refused(wrong):
         LiveTraining(**wrong)
 
 
+def test_colours_are_not_corrected_in_advance_on_a_gpu():
+    with pytest.raises(InvalidSetting, match=r"corrections_before is 2 on cuda.*set it to 0"):
+        Reconstructor(ReconstructorConfig(), CAMERA, live=LiveTraining(corrections_before=2), device="cuda")
+
+
+@pytest.mark.parametrize(("corrections", "relaxation"), [(3, 1.5), (3, 0.0), (0, 1.5)])
+def test_only_steps_on_the_newest_frame_correct_colours_in_advance(monkeypatch, corrections, relaxation):
+    found = []
+    monkeypatch.setattr(
+        photometric, "correct_colours", lambda *given, **options: (found.append(options["steps"]), given[2])[1]
+    )
+    run(reconstructor(colour_relaxation=relaxation, corrections_before=corrections), [(2, 2), (1, 3)])
+    assert found == ([corrections] * 3 if corrections and relaxation else [])
+
+
 def test_colours_that_depend_on_the_view_are_not_corrected_on_a_gpu():
     with pytest.raises(InvalidSetting, match="set sh_degree or colour_relaxation to 0"):
         Reconstructor(ReconstructorConfig(sh_degree=1), CAMERA, live=LiveTraining(colour_relaxation=1.0), device="cuda")
@@ -249,9 +265,9 @@ def steps_taken(monkeypatch):
     taken = []
     plain = TrainingStep.__call__
 
-    def recorded(self, observation, rate_scale=1.0, colour_relaxation=0.0):
+    def recorded(self, observation, rate_scale=1.0, colour_relaxation=0.0, corrections_before=0):
         taken.append((observation.seq, rate_scale, colour_relaxation))
-        return plain(self, observation, rate_scale, colour_relaxation)
+        return plain(self, observation, rate_scale, colour_relaxation, corrections_before)
 
     monkeypatch.setattr(TrainingStep, "__call__", recorded)
     return taken

@@ -35,7 +35,7 @@ def test_limits_are_taken(given):
 
 @pytest.mark.parametrize(
     ("name", "value"), [("first_rate", 0.0), ("last_rate", 100.1), ("rate_steps", 0), ("recent_share", -0.01), ("recent_share", 1.01),
-                        ("colour_relaxation", -0.01)],
+                        ("colour_relaxation", -0.01), ("corrections_before", -1), ("corrections_before", 101)],
 )  # fmt: skip
 def test_what_is_beyond_is_refused(name, value):
     with pytest.raises(InvalidSetting, match=name):
@@ -49,7 +49,7 @@ class TimedStep:
         self.now_s = self.takes_s = 0.0
         self.gaussians = SimpleNamespace(count=1)
 
-    def __call__(self, observation, rate, relaxation):
+    def __call__(self, observation, rate, relaxation, corrections):
         self.now_s += self.takes_s
         return torch.zeros(())
 
