@@ -95,7 +95,7 @@ MIN_SIDE_PX = 64
 """Minimum side of a working size, in pixels."""
 FIRST_PIXELS = 320 * 256
 """Number of pixels of the first measurement, for larger streams."""
-SHARE_OF_INTERVAL = 0.9
+SHARE_OF_INTERVAL = 0.8
 """Largest share of the frame interval that the latency of a frame may take."""
 MOST_MEASUREMENTS = 6
 NEIGHBOURS = 2
