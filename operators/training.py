@@ -57,9 +57,9 @@ class TrainingCounts:
     rehearsed: int = 0
     """Number of rehearsal steps, which train on earlier frames of the training window."""
     withheld: dict[str, int] = field(default_factory=dict)
-    """Number of frames excluded from memory and scores (withheld or damaged), by reason."""
+    """Number of withheld and damaged frames, by reason; the model may have followed some of them."""
     withheld_now: dict[str, int] = field(default_factory=dict)
-    """Number of frames excluded from memory and scores since the last one that was not, by reason."""
+    """Number of withheld and damaged frames since the last usable one, by reason."""
     scenes: dict[str, int] = field(default_factory=dict)
     """Number of times that the model was restarted for a new scene, by reason."""
     renewed: int = 0
@@ -86,7 +86,7 @@ class Learner:
         self.newest: Model | Snapshot | None = None
         """Last published model of the current scene; None before its first frame."""
         self.learned: Frame | None = None
-        """Newest frame that the model was trained on and keeps for rehearsal."""
+        """Newest frame that the model was trained on."""
         self._scene = 0
         """Number of the scene that the model represents."""
         self.reconstructor = make()
@@ -96,7 +96,7 @@ class Learner:
         self.reconstructor, self.newest = self._make(), None
 
     def accepts(self, frame: Frame) -> bool:
-        """Return True if a frame can be trained on and kept. Counts the reason if not."""
+        """Return True if a frame is usable. Counts the reason if not."""
         reason = frame.unusable
         if reason is None:
             self.counts.withheld_now = {}
@@ -139,14 +139,11 @@ class Learner:
         self.newest = None
 
     def observe(self, frame: Frame, *, budget: Budget | None = None, train: bool) -> Reconstruction:
-        """Process the next frame, train on it if `train` is True, and publish the model.
-
-        The model keeps the frame for rehearsal and growth only if the frame is usable.
-        """
-        usable = frame.unusable is None
-        report = self.reconstructor.observe(frame, budget=budget, train=train, keep=usable)
+        """Process the next frame, train on it if `train` is True, and publish the model."""
+        doubtful = frame.unusable is not None
+        report = self.reconstructor.observe(frame, budget=budget, train=train, doubtful=doubtful)
         if train:
-            self.learned = frame if usable else self.learned
+            self.learned = frame
             self.counts.frames += 1
             self.counts.steps += report.steps
         self._record(lambda: Observed(seq=frame.seq, steps=report.steps, train=train))
@@ -157,7 +154,7 @@ class Learner:
             trained=train,
             steps=report.steps,
             arriving_loss=report.arriving_loss,
-            content=frame if train or usable else self.learned,
+            content=self.learned if doubtful else frame,
         )
 
     def take_depth(self, frame: Frame, late: LateDepth | None = None) -> bool:
@@ -309,7 +306,7 @@ class UntilDisplay(Training):
             self._depth.offer(frame)
         budget = self._clock.budget(frame, first=first, behind=behind)
         shown = learner.observe(frame, budget=budget, train=usable or frame.is_followed)
-        if usable:
+        if shown.trained:
             # The initialisation of a scene already covers its first frame.
             self._since_grown = 0 if first else self._since_grown + 1
         published_ns = self._clock.now_ns()

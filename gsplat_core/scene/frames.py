@@ -78,10 +78,8 @@ class Frame:
     exposure: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """Gain of red, green and blue relative to the scene's colours at the start of the stream."""
     withheld: str | None = None
-    """Reason for withholding the frame from memory and scores ("blur", "out of body"); None to train on it and keep it.
-
-    The model follows some of these frames for their display (`is_followed`).
-    """
+    """Reason for withholding the frame from training and scores ("blur", "out of body"); None for a usable frame. A live
+    model is trained on some of them all the same (`is_followed`)."""
     new_scene: str | None = None
     """Reason for a scene change at this frame ("cut", "resized"); None if the scene continues."""
     scene: int = 0
@@ -98,7 +96,7 @@ class Frame:
 
     @property
     def is_followed(self) -> bool:
-        """True if the model follows the frame for its display, although it is withheld from memory and scores.
+        """True if a model that is displayed frame by frame is trained on the frame although it is withheld.
 
         Blur and doubt about a cut last a few frames. A display that waits for them to end shows tissue that has moved on.
         """

@@ -97,7 +97,7 @@ class Reconstructor:
         self._motion = Following(config, at_once=live is None or config.start_from_motion)
         self._start_here: StartOnDevice | None = None
         self._slots, self._version = SnapshotSlots(self.device, rows=self._fixed_rows), 0
-        self._first_time_s = self._last_time_s = self._learned_s = self._kept_s = 0.0
+        self._first_time_s = self._last_time_s = self._learned_s = self._certain_s = 0.0
         self._depth_source: DepthSource | None = None
         self.depth_doubts: Mapping[str, int] = {}
         """Reasons for frames without depth in the last `fit`, each with its number of frames; for moving cameras."""
@@ -150,7 +150,7 @@ class Reconstructor:
         budget: Budget | None = None,
         steps: int | None = None,
         train: bool = True,
-        keep: bool = True,
+        doubtful: bool = False,
     ) -> ObserveReport:
         """Process the next frame in order and train on it.
 
@@ -159,8 +159,7 @@ class Reconstructor:
             budget: training budget of the frame; None for the configured number of steps.
             steps: shorthand for `budget=Budget.of_steps(steps)`.
             train: False only advances the time.
-            keep: False trains for the frame's own time only: it is neither rehearsed, nor used for growth or placement,
-                nor part of the state in which the scene is left.
+            doubtful: the frame may not belong to the scene. If the scene ends with it, the state before it is left.
 
         Raises:
             InvalidInput: if the first frame is not trained on, if time runs backwards, or if the
@@ -192,21 +191,17 @@ class Reconstructor:
         self._learned_s = observation.time_s
         self._depth_source = DepthSource.after(self._depth_source, frame)
         self._motion.observe(step, frame, observation, first=first)
-        if keep:
-            self._keep(step, frame, observation, first=first)
-        if budget is None:
-            budget = Budget.of_steps(self.config.first_frame_steps if first else self.config.steps_per_frame)
-        return self._schedule.train(step, self._window, observation, budget, first=first)
-
-    def _keep(self, step: TrainingStep, frame: Frame, observation: Observation, *, first: bool) -> None:
-        """Add a frame to the training window, and create Gaussians for tissue that it reveals."""
-        self._kept_s = observation.time_s
+        if not doubtful:
+            self._certain_s = observation.time_s
         self._window.add(observation)
         self._placement.apply(step, frame, observation)
         if self._growth is None:
             self._covering.cover(step, frame, observation, first=first)
         elif not first:
             self._growth.prepare(step, frame, observation, self._motion)
+        if budget is None:
+            budget = Budget.of_steps(self.config.first_frame_steps if first else self.config.steps_per_frame)
+        return self._schedule.train(step, self._window, observation, budget, first=first)
 
     def take_depth(self, frame: Frame, late: LateDepth | None = None) -> bool:
         """Use the depth of a frame that was trained on before its depth was available, for
@@ -277,7 +272,7 @@ class Reconstructor:
             True if the frame shows a scene that was left before.
         """
         if self._step is not None and not anew:
-            self._left.leave(self._step, self._window.newest, self._kept_s)
+            self._left.leave(self._step, self._window.newest, self._certain_s)
         self._end_scene()
         if (frame.width_px, frame.height_px) != (self.camera.width_px, self.camera.height_px):
             self.camera = self.camera.resized(frame.width_px, frame.height_px)

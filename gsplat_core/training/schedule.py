@@ -168,8 +168,7 @@ class WindowSchedule(Schedule):
                 if budget.is_timed and not jump:
                     jump = self._is_jump(first_loss, first)
                 count = spending.planned()
-                alone = jump or window.newest.seq != observation.seq  # a frame that is not kept is not in the window
-                plan = [observation] * count if alone else window.schedule(count)[::-1]
+                plan = [observation] * count if jump else window.schedule(count)[::-1]
             loss = step(plan.pop().by_turns(spending.turn))
             first_loss = first_loss or HostCopy(loss)
             spending.step_made(self._in_flight.queued() if budget.is_timed else 0)

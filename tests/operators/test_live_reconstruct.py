@@ -22,13 +22,13 @@ class FakeReconstructor:
 
     def __init__(self, make_model, camera):
         self.calls, self.version, self.make_model = [], 0, make_model
-        self.gone, self.kept = set(), {}
+        self.gone, self.doubtful = set(), {}
         self.camera, self.device, self.step_ns = camera, torch.device("cpu"), 1e6
         self.eyes = SimpleNamespace(trained="both")
 
-    def observe(self, frame, *, budget, train, keep):
+    def observe(self, frame, *, budget, train, doubtful):
         self.calls.append(("observe", frame.seq, train))
-        self.kept[frame.seq] = keep
+        self.doubtful[frame.seq] = doubtful
         return SimpleNamespace(steps=3 if train else 0, arriving_loss=None)
 
     def publish(self):
@@ -127,11 +127,11 @@ def test_a_withheld_frame_is_shown_with_what_was_learned_before(live, one_by_one
 
 
 @pytest.mark.parametrize("reason", ["blur", "cut in doubt"])
-def test_a_frame_that_may_mislead_is_followed_but_not_kept(live, one_by_one, reason):
+def test_a_frame_that_may_mislead_is_followed_without_depth(live, one_by_one, reason):
     shown = one_by_one((0, {}), (1, {}), (2, {"withheld": reason}), (3, {}))
     assert [(each.trained, each.content.seq) for each in shown] == [(True, 0), (True, 1), (True, 2), (True, 3)]
-    assert live.fake.kept == {0: True, 1: True, 2: False, 3: True}
-    assert live.fake.seqs("grow") == [1, 3] and live.depth.offered == [0, 1, 3]
+    assert live.fake.doubtful == {0: False, 1: False, 2: True, 3: False}
+    assert live.fake.seqs("grow") == [1, 2, 3] and live.depth.offered == [0, 1, 3]
     assert live.operator.counts.withheld == {reason: 1}
 
 

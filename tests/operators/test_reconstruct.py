@@ -27,7 +27,7 @@ class FakeReconstructor:
         self.version = 0
         self.make_model = make_model
 
-    def observe(self, frame, *, budget=None, train=True, keep=True):
+    def observe(self, frame, *, budget=None, train=True, doubtful=False):
         self.calls.append(("observe", frame.seq, train))
         return SimpleNamespace(
             seq=frame.seq,

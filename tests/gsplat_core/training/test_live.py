@@ -304,45 +304,10 @@ def test_late_depth_is_taken_of_the_newest_30_frames(newer, is_taken):
     assert (source is not None and "stereo" in str(source).lower()) == is_taken
 
 
-def shown_db(made, frame):
-    """PSNR of the picture that the model shows at the frame's time."""
-    return psnr_tissue_db(made.snapshot().render(frame.time_s).image, frame.image)
-
-
-def test_a_frame_that_is_not_kept_is_followed_at_its_own_time_only():
-    """It improves its own picture, and is neither rehearsed nor used for growth."""
-    kept, followed = reconstructor(), reconstructor()
-    for made in (kept, followed):
-        made.observe(frame_at(0), budget=Budget.of_steps(10))
-    other = Frame(1, 33_000_000, 255 - frame_at(1).image)
-    before_db = shown_db(followed, other)
-    followed.observe(other, budget=Budget.of_steps(8), keep=False)
-    assert shown_db(followed, other) > before_db + 1
-    assert followed.kept()["window_frames"] == 1 and followed.gaussians == kept.gaussians
-    kept.observe(other, budget=Budget.of_steps(8))
-    assert kept.kept()["window_frames"] == 2
-    for made in (kept, followed):
-        made.rehearse(30)
-    assert shown_db(followed, frame_at(0)) > shown_db(kept, frame_at(0))
-
-
-@pytest.mark.parametrize("live", [None, LiveTraining()])
-def test_without_a_clock_a_frame_that_is_not_kept_gets_all_its_steps(live):
-    config = ReconstructorConfig(gaussians=120, max_gaussians=240, window_frames=8)
-    made = Reconstructor(config, CAMERA, live=live)
-    made.observe(frame_at(0), steps=10)
-    made.observe(frame_at(1), steps=4)
-    other = Frame(2, 66_000_000, 255 - frame_at(2).image)
-    before_db = shown_db(made, other)
-    report = made.observe(other, steps=20, keep=False)
-    assert report.steps >= 20 and shown_db(made, other) > before_db + 1
-    assert made.kept()["window_frames"] == 2
-
-
-def test_a_scene_is_left_as_it_was_at_the_last_frame_that_was_kept():
+def test_a_scene_is_left_as_it_was_before_a_doubtful_frame():
     left = reconstructor()
     left.observe(frame_at(0), budget=Budget.of_steps(10))
-    left.observe(Frame(1, 10_000_000_000, 255 - frame_at(1).image), budget=Budget.of_steps(8), keep=False)
+    left.observe(Frame(1, 10_000_000_000, 255 - frame_at(1).image), budget=Budget.of_steps(8), doubtful=True)
     left.begin_scene(Frame(2, 10_033_000_000, np.full((HEIGHT, WIDTH, 3), 90, np.uint8)))
     (place,) = left._left.places._left
     assert place.left_s == 0.0
