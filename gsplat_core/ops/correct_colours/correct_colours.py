@@ -27,8 +27,7 @@ def correct_colours(
 ) -> Tensor:
     """Move each colour `steps` times by the weighted mean of the residual over the pixels that show it (SIRT, Gilbert 1972).
 
-    The blending weights are computed once. A step is about ten times as fast as blending and its gradient. The result
-    does not depend on the number of threads.
+    The blending weights are computed once. The result does not depend on the number of threads.
 
     Args:
         means2d: means [N, 2] in pixels.
