@@ -1,6 +1,6 @@
 """Visual odometry of a complete recording with bundle adjustment over key frames.
 
-Tissue corners are tracked (`tracks`), excluding tools. The scene starts as a plane in front of a static camera. Each
+Tissue corners are tracked (`reference_tracks`), excluding tools. The scene starts as a plane in front of a static camera. Each
 frame's camera starts at the previous pose and is optimised until the points fit. Bundle adjustment over all key
 frames so far runs at the third key frame and whenever their number has grown by a third. Small motions in front of a
 near-planar scene need no other initialisation (Yu and Gallup, "3D Reconstruction from Accidental Motion", 2014), and
@@ -23,7 +23,8 @@ from torch import Tensor
 
 from gsplat_core.endoscope.highlights import without_highlights
 from gsplat_core.errors import InvalidInput
-from gsplat_core.geometry.tracks import FeatureTracks, Observations
+from gsplat_core.geometry.reference_tracks import ReferenceTracks
+from gsplat_core.geometry.tracks import Observations
 from gsplat_core.poses.breathing import BreathingTrajectory, Sightings, breathing_trajectory
 from gsplat_core.poses.bundle import Bundle, adjust, errors_px
 from gsplat_core.scene.cameras import Camera
@@ -103,7 +104,7 @@ def trajectory_of(frames: Iterable[Frame], camera: Camera, *, separate_breathing
         raise InvalidInput(
             f"poses are estimated for pinhole cameras, this one is {camera.model}: undistort the pictures"
         )
-    tracks, count = FeatureTracks(), 0
+    tracks, count = ReferenceTracks(), 0
     times_s = []
     for count, frame in enumerate(frames, start=1):
         if count > MOST_FRAMES:

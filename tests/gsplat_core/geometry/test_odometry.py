@@ -10,6 +10,7 @@ import torch
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.evaluation.trajectory import evaluate_trajectory
+from gsplat_core.geometry.reference_tracks import ReferenceTracks
 from gsplat_core.geometry.tracks import FeatureTracks
 from gsplat_core.io.recordings.synthetic.rendered import RenderedRecording, RenderSettings, render_recording
 from gsplat_core.io.recordings.synthetic.tissue import Tissue, Tug
@@ -51,7 +52,7 @@ def test_the_way_of_a_moving_scope_is_found(rigid, found):
 
 def test_the_error_of_a_static_scope_is_the_spread_of_the_tracks(rigid, found):
     """In pixels, from the tracked points themselves; by the scope's motion it is many times the reprojection error."""
-    tracks = FeatureTracks()
+    tracks = ReferenceTracks()
     for frame in rigid:
         tracks.follow(frame.image, followed_part(frame))
     seen = tracks.observations(LEAST_SEEN)
