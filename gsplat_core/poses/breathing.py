@@ -1,13 +1,13 @@
 """Scope trajectory in front of breathing tissue, estimated together with the periodic motion of the tissue.
 
 Poses estimated for static tissue contain its breathing. This module searches for breathing and heart frequencies that
-explain the observations better. It then optimises cameras, points and periodic motion together (`moving_bundle`). A
-prior of the scope's trajectory (`TrajectoryPrior`) is re-estimated as the trajectory improves.
+explain the observations better. It then optimises cameras, points, periodic motion and its phase in each frame together
+(`moving_bundle`). A prior of the scope's trajectory (`TrajectoryPrior`) is re-estimated as the trajectory improves.
 
-The prior attributes to the tissue the part of a motion at the breathing frequency that a smooth trajectory does not
-have. `separability` tests the result at neighbouring frequencies, half a cycle per recording away, where the tissue has
-no motion. Any motion attributed to the tissue there is scope motion. An error of the same size is expected at the
-breathing frequency. A scope that moves nearly as fast as the tissue breathes shows at both neighbours.
+The prior attributes to the tissue the part of a motion with the phases of breathing that a smooth trajectory does not
+have. `separability` tests the result with phases that are faster or slower by half a cycle per recording, with which the
+tissue has no motion. Any motion attributed to the tissue there is scope motion. An error of the same size is expected
+with the phases of breathing. A scope that moves nearly as fast as the tissue breathes shows at both neighbours.
 
 There is no result if no frequency explains the observations clearly better, if the recording shows less than one and a
 half breaths, or if the scope itself moves nearly as fast as the tissue.
@@ -28,11 +28,14 @@ from gsplat_core.poses.moving_bundle import (
     MOST_NODES,
     PLACES,
     MovingBundle,
+    Rhythm,
     SurfaceField,
     TrajectoryPrior,
     adjust,
     coordinates,
     learned_from,
+    waves_of,
+    with_rhythm,
     with_waves,
 )
 from gsplat_core.poses.se3 import exp, inverse, log
@@ -49,14 +52,9 @@ STEP_CYCLES = 0.25
 SPREAD = 0.007
 """Cauchy scale of ray errors (x / z)."""
 ROUNDS = 2
-UNEXPLAINED = 1.0
-"""Mean robust cost per observation below which the static model is sufficient. Observations with
-only the expected noise cost 0.5 to 1.
-"""
 BREATHES, BEATS = 0.75, 0.94
-"""Largest accepted ratio of the cost with a frequency to the reference cost. The reference of
-breathing is the static model. The reference of the heart is the median over all tried heart
-frequencies, because any extra frequency lowers the cost a little.
+"""Largest accepted ratio of the cost with all frequencies to that of the static model, and of the cost with a heart
+frequency to the median over all tried heart frequencies, because any extra frequency lowers the cost a little.
 """
 
 
@@ -71,8 +69,7 @@ class _Try:
 
 def waves(times_s: Tensor, frequencies_hz: Sequence[float]) -> Tensor:
     """Return cosine and sine of each frequency at each time, [T, 2 F]."""
-    angles = 2 * torch.pi * times_s[:, None] * torch.tensor(frequencies_hz, dtype=times_s.dtype)
-    return torch.stack([angles.cos(), angles.sin()], 2).flatten(1)
+    return waves_of(2 * torch.pi * times_s[:, None] * torch.tensor(frequencies_hz, dtype=times_s.dtype))
 
 
 @one_thread()
@@ -91,71 +88,40 @@ def frequencies_of(start: MovingBundle, times_s: Tensor, fastest_hz: float = HEA
     length_s = float(times_s[-1] - times_s[0])
     step = STEP_CYCLES / length_s
     still, cost = adjust(start, SPREAD, 3 * ROUNDS)
-    slowest = max(BREATHING_HZ[0], FEWEST_TRIED / length_s)
-    breaths = [
-        _tried(still, times_s, (hz,), ROUNDS) for hz in _frequency_grid(slowest, min(BREATHING_HZ[1], fastest_hz), step)
-    ]
-    if cost < UNEXPLAINED * len(start.point) or not breaths or (best := _best(breaths)).cost > BREATHES * cost:
-        return ()
-    if best.hz[0] * length_s < LEAST_CYCLES:
+    slow = _frequency_grid(max(BREATHING_HZ[0], FEWEST_TRIED / length_s), min(BREATHING_HZ[1], fastest_hz), step)
+    breaths = [_tried(still, times_s, (hz,), ROUNDS) for hz in slow]
+    best = _breath_of(breaths, length_s)
+    if best is None:
         return ()
     # One step per heart frequency is enough, since the bundle is already adjusted for breathing.
     beats = [
         _tried(best.bundle, times_s, (*best.hz, hz), 1)
         for hz in _frequency_grid(HEART_HZ[0], min(HEART_HZ[1], fastest_hz), 2 * step)
     ]
-    alone = _tried(best.bundle, times_s, best.hz, 1)
     usual = float(np.median([each.cost for each in beats])) if beats else 0.0
-    best = _best([alone, *(each for each in _local_minima(beats) if each.cost < BEATS * usual)])
-    bundle, hz = best.bundle, best.hz
-    for part in (1.0, 0.5, 0.25, 0.125):
-        bundle, hz = sharpened(bundle, times_s, hz, part * STEP_CYCLES, SPREAD)
-    return hz
+    beats = [each for each in _local_minima(beats) if each.cost < BEATS * usual]
+    if beats:
+        # A strong heartbeat hides the frequency of weak breathing.
+        both = _best(beats)
+        breaths = [_tried(both.bundle, times_s, (hz, both.hz[1]), ROUNDS) for hz in slow]
+        best = _breath_of(breaths, length_s) or both
+    slower = _best(breaths).hz[0] * length_s < LEAST_CYCLES
+    return best.hz if best.cost < BREATHES * cost and not slower else ()
 
 
-def sharpened(
-    bundle: MovingBundle,
-    times_s: Tensor,
-    hz: tuple[float, ...],
-    cycles: float,
-    spread: float,
-    prior: TrajectoryPrior | None = None,
-) -> tuple[MovingBundle, tuple[float, ...]]:
-    """Refine each frequency in turn by comparing it with its neighbours at ± `cycles`.
-
-    Args:
-        bundle: bundle adjusted with the frequencies `hz`.
-        times_s: float64 [T], time of each camera in seconds.
-        hz: frequencies to refine, in Hz.
-        cycles: distance of the neighbours, in cycles over the recording.
-        spread: Cauchy scale of ray errors.
-        prior: prior of the scope's trajectory.
-
-    Returns:
-        The bundle after one adjustment step per frequency, and the refined frequencies in Hz.
-    """
-    part = cycles / float(times_s[-1] - times_s[0])
-    for which in range(len(hz)):
-        around = [_changed(hz, which, change) for change in (-part, 0.0, part)]
-        best = _best([_tried(bundle, times_s, each, 1, spread, prior) for each in around])
-        bundle, hz = best.bundle, best.hz
-    return bundle, hz
-
-
-def _tried(
-    start: MovingBundle,
-    times_s: Tensor,
-    hz: tuple[float, ...],
-    rounds: int,
-    spread: float = SPREAD,
-    prior: TrajectoryPrior | None = None,
-) -> _Try:
+def _tried(start: MovingBundle, times_s: Tensor, hz: tuple[float, ...], rounds: int) -> _Try:
     """Adjust a bundle with the frequencies `hz`. The start bundle contains all of their waves, or all but the last."""
-    return _Try(hz, *adjust(with_waves(start, waves(times_s, hz)), spread, rounds, prior))
+    return _Try(hz, *adjust(with_waves(start, waves(times_s, hz)), SPREAD, rounds))
 
 
 def _best(tries: Sequence[_Try]) -> _Try:
     return min(tries, key=lambda each: each.cost)
+
+
+def _breath_of(breaths: Sequence[_Try], length_s: float) -> _Try | None:
+    """Return the best local minimum over the breathing frequency with at least `LEAST_CYCLES`, or None."""
+    found = [each for each in _local_minima(breaths) if each.hz[0] * length_s >= LEAST_CYCLES]
+    return _best(found) if found else None
 
 
 def _local_minima(tries: Sequence[_Try]) -> list[_Try]:
@@ -170,12 +136,8 @@ def _frequency_grid(slowest: float, fastest: float, step: float) -> list[float]:
     return [float(hz) for hz in np.arange(slowest, fastest, step)]
 
 
-def _changed(hz: tuple[float, ...], which: int, change: float) -> tuple[float, ...]:
-    return tuple(each + change * (number == which) for number, each in enumerate(hz))
-
-
 BESIDE_CYCLES = 0.5
-"""Distance of the neighbouring frequencies, in cycles over the recording."""
+"""Distance of the neighbours of the breathing phase, in cycles over the recording."""
 CLEARLY = 2.0
 """Smallest accepted ratio of the motion attributed to the tissue to that at the neighbouring frequencies. Below it the
 separated poses may be worse than the static ones.
@@ -183,7 +145,7 @@ separated poses may be worse than the static ones.
 
 
 @one_thread()
-def separability(before: Tensor, poses: Tensor, times_s: Tensor, hz: Sequence[float]) -> tuple[bool, float]:
+def separability(before: Tensor, poses: Tensor, times_s: Tensor, phases: Tensor) -> tuple[bool, float]:
     """Return whether poses without breathing motion are more reliable than those for static tissue, and the possible
     error.
 
@@ -191,24 +153,23 @@ def separability(before: Tensor, poses: Tensor, times_s: Tensor, hz: Sequence[fl
         before: poses estimated for static tissue [C, 4, 4].
         poses: poses after separating the breathing [C, 4, 4].
         times_s: times in seconds [C].
-        hz: breathing frequency, and heart frequency if found.
+        phases: phases of breathing, and of the heart if found, in radians [C, F].
 
     Returns:
         True if `poses` are more reliable than `before`, and the root mean square scope motion that
             may be attributed to the tissue.
     """
-    length_s = float(times_s[-1] - times_s[0])
-    apart = BESIDE_CYCLES / length_s
-    beside = [(hz[0] + change, *hz[1:]) for change in (-apart, apart)]
+    apart = 2 * torch.pi * BESIDE_CYCLES * (times_s - times_s[0]) / (times_s[-1] - times_s[0])
+    beside = [torch.cat([phases[:, :1] + change[:, None], phases[:, 1:]], 1) for change in (-apart, apart)]
     mistaken = min(_given_to_tissue(poses, poses, times_s, each) for each in beside)
-    return _given_to_tissue(before, poses, times_s, hz) > CLEARLY * mistaken, mistaken
+    return _given_to_tissue(before, poses, times_s, phases) > CLEARLY * mistaken, mistaken
 
 
-def _given_to_tissue(poses: Tensor, like: Tensor, times_s: Tensor, hz: Sequence[float]) -> float:
-    """Return the root mean square motion at the first frequency that a trajectory with the prior of `like` does not
+def _given_to_tissue(poses: Tensor, like: Tensor, times_s: Tensor, phases: Tensor) -> float:
+    """Return the root mean square motion with the first phase that a trajectory with the prior of `like` does not
     explain.
     """
-    swings = waves(times_s, hz)
+    swings = waves_of(phases)
     prior = learned_from(like, times_s, swings)
     y, _ = coordinates(poses)
     part = torch.stack([_line(prior, swings, y[:, axis], axis) for axis in range(PLACES.stop)], 1)
@@ -216,35 +177,27 @@ def _given_to_tissue(poses: Tensor, like: Tensor, times_s: Tensor, hz: Sequence[
 
 
 def _line(prior: TrajectoryPrior, swings: Tensor, y: Tensor, axis: int) -> Tensor:
-    """Return the first frequency's part of a coordinate [C] by generalised least squares."""
+    """Return the first phase's part of a coordinate [C] by generalised least squares."""
     pushed = swings.T @ prior.precision[axis]
     return swings[:, :2] @ torch.linalg.solve(pushed @ swings, pushed @ y)[:2]
 
 
-EVERY_S = 0.4
-"""Average time between the frames that are used, in seconds."""
+EVERY_S = 0.2
+"""Average time between the frames that are used, in seconds; longer if they would be more than `MOST_FRAMES`."""
 FEWEST_FRAMES, MOST_FRAMES = 40, 150
-LONGEST_S = MOST_FRAMES * EVERY_S
-POINTS, LEAST_SEEN = 600, 5
+LONGEST_S = 60.0
+POINTS, LEAST_SEEN = 400, 5
 """Number of points used, most often observed first, and the least number of observations of each."""
 FEWEST_POINTS = 60
 NEAREST, FARTHEST = 0.5, 2.0
 """Range of accepted initial depths relative to the median depth. Points outside it start at the median depth."""
 FINEST = 0.0017
-STAGES = (
-    (0.014, 3, 0.0),
-    (0.007, 3, 0.06),
-    (0.0035, 3, 0.04),
-    (FINEST, 3, 0.03),
-    (FINEST, 3, 0.02),
-    (FINEST, 3, 0.015),
-    *((FINEST, 4, 0.0),) * 9,
-)
-"""Optimisation stages: Cauchy scale of ray errors (x / z), number of steps, and the frequency spacing in cycles over
-the recording for the refinement that follows (0 = none). The trajectory prior is re-estimated before each stage.
+STAGES = ((0.014, 8), (0.007, 8), (0.0035, 8), *((FINEST, 8),) * 6)
+"""Optimisation stages: Cauchy scale of ray errors (x / z) and number of steps. The trajectory prior is re-estimated
+before each stage.
 """
-FEW_POINTS, FEW_FRAMES, FEW_NODES = 200, 40, 16
-"""Size of the reduced problem on which frequencies are searched."""
+FEW_POINTS, FEW_FRAMES, FEW_NODES = 200, 100, 16
+"""Size of the reduced problem on which frequencies are searched. With fewer frames, their rate looks like a heart rate."""
 SAMPLED = 0.4
 """Highest frequency searched, as a share of the frame rate."""
 LEAST_SHARED, PLACE_ROUNDS = 24, 10
@@ -283,7 +236,7 @@ class BreathingTrajectory:
     points: Tensor
     """Rest positions of the points used, [P, 3]."""
     frequencies_hz: tuple[float, ...]
-    """Breathing frequency, or breathing and heart frequencies."""
+    """Mean breathing frequency, or mean breathing and heart frequencies."""
     uncertain: float
     """Root mean square share of the trajectory that may be tissue motion instead of scope motion,
     in units of the median depth.
@@ -308,7 +261,7 @@ def breathing_trajectory(sightings: Sightings, placed: Tensor) -> BreathingTraje
     if not LEAST_CYCLES / BREATHING_HZ[1] <= length_s <= LONGEST_S or len(known) < FEWEST_FRAMES:
         return None
     frames = _some(known, max(FEWEST_FRAMES, min(MOST_FRAMES, round(length_s / EVERY_S) + 1)))
-    few = _some(frames, FEW_FRAMES)
+    few = _some(known, FEW_FRAMES)
     fewer = _bundle(sightings, few, FEW_POINTS, FEW_NODES)
     if fewer is None:
         return None
@@ -317,11 +270,13 @@ def breathing_trajectory(sightings: Sightings, placed: Tensor) -> BreathingTraje
     start = _bundle(sightings, frames, POINTS, MOST_NODES)
     if not frequencies_hz or start is None:
         return None
-    found, frequencies_hz, prior = refined(start[0], sightings.times_s[frames], frequencies_hz)
-    separable, mistaken = separability(start[0].poses, found.poses, sightings.times_s[frames], frequencies_hz)
+    found, rhythm, prior = refined(start[0], sightings.times_s[frames], frequencies_hz)
+    separable, mistaken = separability(start[0].poses, found.poses, sightings.times_s[frames], rhythm.phases)
     if not separable:
         return None
-    poses = _all_placed(sightings, frames, found, start[1], frequencies_hz)
+    poses = _all_placed(sightings, frames, found, start[1], rhythm)
+    turns = (rhythm.phases[-1] - rhythm.phases[0]) / (2 * torch.pi)
+    frequencies_hz = tuple((turns / (sightings.times_s[frames[-1]] - sightings.times_s[frames[0]])).tolist())
     error = float(found.off().norm(dim=1).median())
     return BreathingTrajectory(poses, found.rest, frequencies_hz, max(prior.uncertain, mistaken), error)
 
@@ -329,25 +284,24 @@ def breathing_trajectory(sightings: Sightings, placed: Tensor) -> BreathingTraje
 @one_thread()
 def refined(
     start: MovingBundle, times_s: Tensor, frequencies_hz: tuple[float, ...]
-) -> tuple[MovingBundle, tuple[float, ...], TrajectoryPrior]:
-    """Optimise cameras, tissue and periodic motion from a static start.
+) -> tuple[MovingBundle, Rhythm, TrajectoryPrior]:
+    """Optimise cameras, tissue, periodic motion and its phases from a static start.
 
     Args:
         start: static bundle.
         times_s: float64 [T], time of each camera in seconds.
-        frequencies_hz: start values of the frequencies.
+        frequencies_hz: mean frequencies.
 
     Returns:
-        The adjusted bundle, the refined frequencies in Hz, and the trajectory prior learned from the result.
+        The adjusted bundle, its phases, and the trajectory prior learned from the result.
     """
-    bundle, hz = with_waves(start, waves(times_s, frequencies_hz)), frequencies_hz
-    for spread, rounds, cycles in STAGES:
+    bundle = with_rhythm(start, Rhythm.steady(times_s, frequencies_hz))
+    for spread, rounds in STAGES:
         prior = learned_from(bundle.poses, times_s, bundle.waves)
         bundle, _ = adjust(bundle, spread, rounds, prior)
-        if cycles:
-            bundle, hz = sharpened(bundle, times_s, hz, cycles, spread, prior)
         bundle = _with_new_nodes(bundle)
-    return bundle, hz, learned_from(bundle.poses, times_s, bundle.waves)
+    assert bundle.rhythm is not None
+    return bundle, bundle.rhythm, learned_from(bundle.poses, times_s, bundle.waves)
 
 
 def _some(frames: Tensor, most: int) -> Tensor:
@@ -412,11 +366,9 @@ def _with_new_nodes(bundle: MovingBundle) -> MovingBundle:
     return replace(bundle, field=field, amplitudes=amplitudes, influence=field.influence(bundle.rest))
 
 
-def _all_placed(
-    sightings: Sightings, frames: Tensor, found: MovingBundle, numbers: Tensor, frequencies_hz: Sequence[float]
-) -> Tensor:
-    """Return poses of all frames. Frames between the adjusted ones are interpolated and then
-    aligned to the moving points.
+def _all_placed(sightings: Sightings, frames: Tensor, found: MovingBundle, numbers: Tensor, rhythm: Rhythm) -> Tensor:
+    """Return poses of all frames. Poses and phases of frames between the adjusted ones are interpolated, and the poses
+    then aligned to the moving points.
     """
     poses = _between(frames, found.poses, len(sightings.times_s))
     chosen = torch.isin(sightings.point, numbers) & ~torch.isin(sightings.frame, frames)
@@ -424,9 +376,8 @@ def _all_placed(
     chosen &= shared[sightings.frame] >= LEAST_SHARED
     rest = torch.searchsorted(numbers, sightings.point[chosen])
     amplitudes_at = torch.einsum("pm,mjb->pjb", found.influence, found.amplitudes)
-    moved = torch.einsum(
-        "kjb,kb->kj", amplitudes_at[rest], waves(sightings.times_s, frequencies_hz)[sightings.frame[chosen]]
-    )
+    swings = waves_of(_interpolated(sightings.times_s, sightings.times_s[frames], rhythm.phases))
+    moved = torch.einsum("kjb,kb->kj", amplitudes_at[rest], swings[sightings.frame[chosen]])
     at = torch.arange(len(rest))
     between = Bundle(poses, found.rest[rest] + moved, sightings.frame[chosen], at, sightings.rays[chosen], 1 / FINEST)
     fixed = shared < LEAST_SHARED
@@ -446,3 +397,9 @@ def _between(frames: Tensor, poses: Tensor, count: int) -> Tensor:
     share = ((number - first) / (second - first)).clamp(0, 1)[:, None].double()
     start = poses[after - 1]
     return exp(share * log(poses[after] @ inverse(start))) @ start
+
+
+def _interpolated(times_s: Tensor, known_s: Tensor, phases: Tensor) -> Tensor:
+    """Interpolate phases [C, F] at the known times [C] linearly at other times [N]."""
+    columns = [np.interp(times_s.numpy(), known_s.numpy(), each.numpy()) for each in phases.T]
+    return torch.from_numpy(np.stack(columns, 1))

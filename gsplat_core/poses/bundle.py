@@ -32,7 +32,11 @@ EASIER, HARDER = 5, 8
 
 
 def descend(
-    start: State, step: Callable[[State, float], State], cost_of: Callable[[State], float], rounds: int
+    start: State,
+    step: Callable[[State, float], State],
+    cost_of: Callable[[State], float],
+    rounds: int,
+    damping: float = FIRST_DAMPING,
 ) -> tuple[State, float]:
     """Minimise a cost with damped steps.
 
@@ -41,11 +45,12 @@ def descend(
         step: returns the state after one step with the given damping.
         cost_of: returns the cost of a state.
         rounds: maximum number of steps, including rejected ones.
+        damping: damping of the first step.
 
     Returns:
         The best state and its cost, which is at most that of the start.
     """
-    state, cost, damping = start, cost_of(start), FIRST_DAMPING
+    state, cost = start, cost_of(start)
     for _ in range(rounds):
         tried = step(state, damping)
         new_cost = cost_of(tried)

@@ -1,8 +1,9 @@
 """Bundle adjustment of cameras in front of periodically moving tissue.
 
-The position of a point is its rest position plus the sum over waves w(t) of w(t) times a vector. Cameras, rest
-positions and vectors are estimated together by Levenberg-Marquardt with Cauchy weights, with rest positions eliminated
-(Schur complement). The unit of length is the tissue's median distance.
+The position of a point is its rest position plus the sum over waves w(t) of w(t) times a vector. Waves are the cosines
+and sines of phases. Breathing pauses, has unequal halves and a changing rate, so the phase of each frame is estimated
+too (`Rhythm`). Cameras, phases, rest positions and vectors are estimated together by Levenberg-Marquardt with Cauchy
+weights, with rest positions eliminated (Schur complement). The unit of length is the tissue's median distance.
 
 The vectors vary smoothly over the surface and are given at nodes among its points (`SurfaceField`). Their prior is a
 Gaussian random field with a linear part, which includes rigid motion, and a local part with a correlation length
@@ -17,12 +18,13 @@ uncertainty decreases with the length of the recording.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from gsplat_core.poses.bundle import descend, diagonal_of, ray_derivatives, summed
+from gsplat_core.poses.bundle import FIRST_DAMPING, descend, diagonal_of, ray_derivatives, summed
 from gsplat_core.poses.se3 import exp, hat, log
 from gsplat_core.threads import one_thread
 
@@ -154,7 +156,7 @@ LENGTH = 0.3
 """Correlation length of the local part of the motion field, in the same units."""
 APART = 0.13
 """Smallest distance between nodes; larger if it would give more than `MOST_NODES`."""
-MOST_NODES = 48
+MOST_NODES = 32
 JITTER = 1e-6
 """Diagonal regularisation as a share of the mean variance."""
 
@@ -216,6 +218,79 @@ HELD = 1e3
 """Stiffness with which the tissue's common rigid motion is held constant if there is no trajectory prior."""
 
 
+RATE, RATE_PERIODS = (0.5, 0.03), (1 / 6, 2.0)
+"""Breathing and heart: relative standard deviation of the rate, and its correlation time in mean periods."""
+PHASE = 1.0
+"""Prior standard deviation of a phase from that of the mean rate, in radians."""
+OFFSET = 0.05
+"""Prior standard deviation of the mean phase difference, in radians. The vectors contain any other offset."""
+
+
+@dataclass(frozen=True)
+class Rhythm:
+    """Phases of the waves, and their Gaussian prior: a random walk around the phase of a constant rate."""
+
+    phases: Tensor
+    """Phases in radians [C, F]."""
+    expected: Tensor
+    """Phases of a constant rate in radians [C, F]."""
+    precision: Tensor
+    """Precision matrices of the differences [F, C, C]."""
+
+    @classmethod
+    def steady(cls, times_s: Tensor, frequencies_hz: Sequence[float]) -> Rhythm:
+        """Start at constant rates: breathing, and the heart if there are two frequencies.
+
+        Args:
+            times_s: float64 [C], time of each camera in seconds.
+            frequencies_hz: mean frequencies in Hz.
+        """
+        count, hz = len(times_s), torch.tensor(frequencies_hz, dtype=torch.float64)
+        expected = 2 * torch.pi * times_s[:, None] * hz
+        step = torch.eye(count, dtype=torch.float64).diff(dim=0)
+        level = torch.eye(count, dtype=torch.float64) / (count * PHASE**2) + 1 / (count * OFFSET) ** 2
+        precision = []
+        for rate, deviation, periods in zip(hz.tolist(), RATE, RATE_PERIODS, strict=False):
+            variance = (2 * torch.pi * rate * deviation) ** 2 * times_s.diff() * periods / rate
+            precision.append(level + step.T @ (step / variance[:, None]))
+        return cls(expected, expected, torch.stack(precision))
+
+    @property
+    def waves(self) -> Tensor:
+        """Cosine and sine of each phase, [C, 2 F]."""
+        return waves_of(self.phases)
+
+    @property
+    def slopes(self) -> Tensor:
+        """Derivatives of the waves by their phase, [C, F, 2]."""
+        return torch.stack([-self.phases.sin(), self.phases.cos()], 2)
+
+    def pull(self) -> Tensor:
+        """Return the gradient of the negative log prior by the phases, [C, F]."""
+        return torch.einsum("fcd,df->cf", self.precision, self.phases - self.expected)
+
+    def cost(self) -> float:
+        """Return the negative log prior, up to a constant."""
+        return 0.5 * float(((self.phases - self.expected) * self.pull()).sum())
+
+    def moved(self, change: Tensor) -> Rhythm:
+        """Change the phases [C, F] by at most `MOST_TURN`."""
+        return replace(self, phases=self.phases + change.clamp(-MOST_TURN, MOST_TURN))
+
+
+def waves_of(phases: Tensor) -> Tensor:
+    """Return cosine and sine of each phase [C, F] as [C, 2 F]."""
+    return torch.stack([phases.cos(), phases.sin()], 2).flatten(1)
+
+
+WEAK_DAMPING = 1e-6
+"""Damping of the first step with a prior of the trajectory. Scope motion that could be tissue motion changes only the
+cost of the prior, so a larger damping nearly stops it.
+"""
+MOST_TURN = 0.7
+"""Largest change of a phase in one step, in radians."""
+
+
 @dataclass(frozen=True)
 class MovingBundle:
     """Cameras, moving points and observations; all float64."""
@@ -238,6 +313,8 @@ class MovingBundle:
     """Weight of each node's vector at each point, [P, M]."""
     field: SurfaceField
     """Nodes and prior of the motion field."""
+    rhythm: Rhythm | None = None
+    """Phases of the waves; None if the waves are given."""
 
     def places(self) -> Tensor:
         """Return the world position of the point at each observation, [K, 3]."""
@@ -253,14 +330,19 @@ def with_waves(bundle: MovingBundle, waves: Tensor) -> MovingBundle:
     """Replace the waves [C, B]. Vectors of additional waves start at zero."""
     amplitudes = torch.zeros(len(bundle.field.nodes), 3, waves.shape[1], dtype=torch.float64)
     amplitudes[:, :, : bundle.amplitudes.shape[2]] = bundle.amplitudes
-    return replace(bundle, waves=waves, amplitudes=amplitudes)
+    return replace(bundle, waves=waves, amplitudes=amplitudes, rhythm=None)
+
+
+def with_rhythm(bundle: MovingBundle, rhythm: Rhythm) -> MovingBundle:
+    """Replace the waves by those of phases that are estimated."""
+    return replace(with_waves(bundle, rhythm.waves), rhythm=rhythm)
 
 
 @one_thread()
 def adjust(
     bundle: MovingBundle, spread: float, rounds: int, prior: TrajectoryPrior | None = None
 ) -> tuple[MovingBundle, float]:
-    """Adjust cameras, rest positions and motion vectors to minimise the robust cost.
+    """Adjust cameras, phases, rest positions and motion vectors to minimise the robust cost.
 
     Args:
         bundle: start values.
@@ -272,7 +354,8 @@ def adjust(
         The adjusted bundle and its cost, which is at most that of the start.
     """
     step = lambda bundle, damping: _in_unit(_step(bundle, spread, damping, prior))
-    return descend(bundle, step, lambda bundle: _cost(bundle, spread, prior), rounds)
+    damping = FIRST_DAMPING if prior is None else WEAK_DAMPING
+    return descend(bundle, step, lambda bundle: _cost(bundle, spread, prior), rounds, damping)
 
 
 def _cost(bundle: MovingBundle, spread: float, prior: TrajectoryPrior | None) -> float:
@@ -281,7 +364,8 @@ def _cost(bundle: MovingBundle, spread: float, prior: TrajectoryPrior | None) ->
     depth = bundle.rest[:, 2]
     relief = 0.5 * ((depth - depth.median()) / RELIEF).square().sum()
     motion = 0.5 * torch.einsum("mjb,mn,njb->", bundle.amplitudes, bundle.field.stiffness, bundle.amplitudes)
-    return float(seen + relief + motion) + (prior.cost(bundle.poses) if prior is not None else 0.0)
+    rhythm = bundle.rhythm.cost() if bundle.rhythm is not None else 0.0
+    return float(seen + relief + motion) + rhythm + (prior.cost(bundle.poses) if prior is not None else 0.0)
 
 
 def _in_unit(bundle: MovingBundle) -> MovingBundle:
@@ -310,46 +394,62 @@ class _Places:
     slope: Tensor
     """Gradients of the cost by the rest positions, [P, 3]."""
     by_camera: Tensor
-    """Hessian blocks of camera poses and rest positions, [C, P, 6, 3]."""
+    """Hessian blocks of the unknowns of a frame (twist and phases) and rest positions, [C, P, D, 3]."""
     by_amplitude: Tensor
     """Hessian blocks of rest positions and motion amplitudes, [P, 3, 3 B]."""
 
 
 def _step(bundle: MovingBundle, spread: float, damping: float, prior: TrajectoryPrior | None) -> MovingBundle:
-    """Compute one damped step. Unknowns are the twists of all cameras but the first, then
+    """Compute one damped step. Unknowns are the twists and phases of all cameras without the first twist, then
     amplitudes in the order (axis, wave, node).
     """
     residual, local, rotation = _residuals(bundle)
     weight = 1 / (SIGMA**2 * (1 + (residual / spread).square().sum(1)))
     by_local, by_rotation = ray_derivatives(local)
-    by_pose, by_place = torch.cat([by_local, by_local @ by_rotation], 2), by_local @ rotation
-    weighted = (by_pose * weight[:, None, None]).transpose(1, 2)
-    cameras, count = len(bundle.poses), len(bundle.rest)
-    H = summed(weighted @ by_pose, bundle.camera, cameras)
+    by_place = by_local @ rotation
+    by_frame = torch.cat([by_local, by_local @ by_rotation], 2)
+    rhythm = bundle.rhythm
+    if rhythm is not None:
+        at_points = torch.einsum("pm,mjb->pjb", bundle.influence, bundle.amplitudes).unflatten(2, (-1, 2))
+        by_phase = torch.einsum("kjfw,kfw->kjf", at_points[bundle.point], rhythm.slopes[bundle.camera])
+        by_frame = torch.cat([by_frame, by_place @ by_phase], 2)
+    weighted = (by_frame * weight[:, None, None]).transpose(1, 2)
+    cameras, count, size = len(bundle.poses), len(bundle.rest), by_frame.shape[2]
+    H = summed(weighted @ by_frame, bundle.camera, cameras)
     g = summed((weighted @ residual[:, :, None])[:, :, 0], bundle.camera, cameras)
     H = H + damping * diagonal_of(H)
     index = bundle.camera * count + bundle.point
-    by_camera = summed(weighted @ by_place, index, cameras * count).view(cameras, count, 6, 3)
+    by_camera = summed(weighted @ by_place, index, cameras * count).view(cameras, count, size, 3)
     weighted = (by_place * weight[:, None, None]).transpose(1, 2)
     square, pull = weighted @ by_place, (weighted @ residual[:, :, None])[:, :, 0]
     places = _eliminated(bundle, square, pull, by_camera, damping)
     eliminated = torch.einsum("cpij,pjk->cpik", by_camera, places.inverse)
-    flat = lambda blocks: blocks.permute(0, 2, 1, 3).reshape(6 * cameras, 3 * count)
-    S = torch.block_diag(*H) - flat(eliminated) @ flat(by_camera).T
-    right = (g - torch.einsum("cpij,pj->ci", eliminated, places.slope)).reshape(-1)
+    flat = lambda blocks: blocks.permute(0, 2, 1, 3).reshape(size * cameras, 3 * count)
+    S = (torch.block_diag(*H) - flat(eliminated) @ flat(by_camera).T).view(cameras, size, cameras, size)
+    right = g - torch.einsum("cpij,pj->ci", eliminated, places.slope)
     if prior is not None:
         more, slope = prior.terms(bundle.poses)
-        S, right = S + more, right + slope
+        S[:, :6, :, :6] += more.view(cameras, 6, cameras, 6)
+        right[:, :6] += slope.view(cameras, 6)
+    if rhythm is not None:
+        for which, precision in enumerate(rhythm.precision, start=6):
+            S[:, which, :, which] += precision
+        right[:, 6:] += rhythm.pull()
     cross_terms, own_terms, slopes = _amplitude_terms(bundle, square, pull, places, eliminated, held=prior is None)
+    S = S.reshape(size * cameras, size * cameras)
     whole = torch.cat([torch.cat([S, cross_terms], 1), torch.cat([cross_terms.T, own_terms], 1)])[6:, 6:]
-    found = -torch.linalg.solve(whole, torch.cat([right, slopes])[6:])
-    twist = torch.cat([torch.zeros(6, dtype=found.dtype), found[: 6 * cameras - 6]]).view(cameras, 6)
-    change = found[6 * cameras - 6 :].view(3, bundle.waves.shape[1], bundle.influence.shape[1]).permute(2, 0, 1)
+    found = -torch.linalg.solve(whole, torch.cat([right.reshape(-1), slopes])[6:])
+    found = torch.cat([torch.zeros(6, dtype=found.dtype), found])
+    by_frames = found[: size * cameras].view(cameras, size)
+    change = found[size * cameras :].view(3, bundle.waves.shape[1], bundle.influence.shape[1]).permute(2, 0, 1)
     at_points = torch.einsum("pm,mjb->pjb", bundle.influence, change).flatten(1)
-    moved = places.slope + torch.einsum("cpij,ci->pj", by_camera, twist)
+    moved = places.slope + torch.einsum("cpij,ci->pj", by_camera, by_frames)
     moved = moved + torch.einsum("pia,pa->pi", places.by_amplitude, at_points)
     rest = bundle.rest - (places.inverse @ moved[:, :, None])[:, :, 0]
-    return replace(bundle, poses=exp(twist) @ bundle.poses, rest=rest, amplitudes=bundle.amplitudes + change)
+    found_bundle = replace(
+        bundle, poses=exp(by_frames[:, :6]) @ bundle.poses, rest=rest, amplitudes=bundle.amplitudes + change
+    )
+    return found_bundle if rhythm is None else with_rhythm(found_bundle, rhythm.moved(by_frames[:, 6:]))
 
 
 def _eliminated(bundle: MovingBundle, square: Tensor, pull: Tensor, by_camera: Tensor, damping: float) -> _Places:
@@ -366,11 +466,11 @@ def _eliminated(bundle: MovingBundle, square: Tensor, pull: Tensor, by_camera: T
 def _amplitude_terms(
     bundle: MovingBundle, square: Tensor, pull: Tensor, places: _Places, eliminated: Tensor, *, held: bool
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the Hessian blocks of amplitudes and cameras [6 C, n] and of the amplitudes [n, n], and the amplitudes'
+    """Return the Hessian blocks of amplitudes and frames [D C, n] and of the amplitudes [n, n], and the amplitudes'
     gradient [n], after eliminating the rest positions.
     """
     count, waves = len(bundle.rest), bundle.waves[bundle.camera]
-    cameras, wave_count, nodes = len(bundle.poses), waves.shape[1], bundle.influence.shape[1]
+    frame_terms, wave_count, nodes = len(bundle.poses) * eliminated.shape[2], waves.shape[1], bundle.influence.shape[1]
     size = 3 * wave_count
     pairs = square[:, :, None, :, None] * (waves[:, :, None] * waves[:, None, :])[:, None, :, None, :]
     own = summed(pairs.reshape(len(pairs), size, size), bundle.point, count)
@@ -382,10 +482,10 @@ def _amplitude_terms(
     by_camera = (places.by_camera.permute(0, 2, 3, 1) @ influence)[:, :, :, None, :] * bundle.waves[
         :, None, None, :, None
     ]
-    cross = by_camera.reshape(6 * cameras, size, nodes)
+    cross = by_camera.reshape(frame_terms, size, nodes)
     for term in range(size):
         through = torch.einsum("cpij,pj->cip", eliminated, places.by_amplitude[:, :, term])
-        cross[:, term] -= through.reshape(6 * cameras, count) @ influence
+        cross[:, term] -= through.reshape(frame_terms, count) @ influence
     whole = torch.zeros(size, nodes, size, nodes, dtype=own.dtype)
     for row in range(size):
         for column in range(row, size):
@@ -396,7 +496,7 @@ def _amplitude_terms(
     slopes = slopes + torch.einsum("mn,njb->jbm", bundle.field.stiffness, bundle.amplitudes).reshape(size, nodes)
     if held and wave_count:
         whole = whole + _rigid(bundle, wave_count)
-    return cross.reshape(6 * cameras, size * nodes), whole.reshape(size * nodes, size * nodes), slopes.reshape(-1)
+    return cross.reshape(frame_terms, size * nodes), whole.reshape(size * nodes, size * nodes), slopes.reshape(-1)
 
 
 def _rigid(bundle: MovingBundle, wave_count: int) -> Tensor:

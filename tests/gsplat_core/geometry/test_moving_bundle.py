@@ -11,7 +11,7 @@ import torch
 from gsplat_core.poses.breathing import waves
 from gsplat_core.poses.bundle import Bundle, errors_px
 from gsplat_core.poses.bundle import adjust as adjust_still
-from gsplat_core.poses.moving_bundle import _cost, _step, adjust, learned_from, with_waves
+from gsplat_core.poses.moving_bundle import Rhythm, _cost, _step, adjust, learned_from, with_rhythm, with_waves
 from gsplat_core.poses.se3 import exp
 from tests.gsplat_core.geometry.breathing_points import BREATHING_HZ, HEART_HZ
 from tests.gsplat_core.geometry.breathing_sightings import bundle_of, seen_for
@@ -96,3 +96,41 @@ def test_the_cost_is_the_negative_logarithm_of_the_likelihood_and_the_priors():
     rays[7] += torch.tensor([0.003, -0.004], dtype=torch.float64)
     off = 0.5 * (0.004 / 0.002) ** 2 * torch.log1p(torch.tensor((0.005 / 0.004) ** 2, dtype=torch.float64))
     assert adjust(replace(moving, rays=rays), 0.004, 0)[1] == pytest.approx(float(relief + motion + off), rel=1e-9)
+
+
+def warped(times_s: torch.Tensor, most: float = 0.4) -> Rhythm:
+    """Phases of breathing and heart whose breathing is early or late by at most some radians."""
+    rhythm = Rhythm.steady(times_s, (BREATHING_HZ, HEART_HZ))
+    late = most * torch.sin(2 * torch.pi * 0.15 * times_s)
+    return replace(rhythm, phases=rhythm.phases + torch.stack([late, 0 * late], 1))
+
+
+def test_phases_are_estimated_with_everything_else():
+    """From phases of a constant rate that are off by up to 0.4 rad."""
+    bundle, times_s = breathing(noise_px=0.2)
+    way = learned_from(bundle.poses, times_s, bundle.waves)
+    off = lambda rhythm: float((rhythm.phases[:, 0] - 2 * torch.pi * BREATHING_HZ * times_s).diff().abs().mean())
+    started = with_rhythm(adjust(bundle, 0.004, 8, way)[0], warped(times_s))
+    found, _ = adjust(started, 0.004, 20, way)
+    assert found.rhythm is not None and off(found.rhythm) < 0.4 * off(warped(times_s))
+    torch.testing.assert_close(found.waves, found.rhythm.waves)
+
+
+def test_a_step_with_phases_goes_down_the_slope():
+    bundle, times_s = breathing(5.0, noise_px=0.5)
+    way = learned_from(bundle.poses, times_s, bundle.waves)
+    start = with_rhythm(adjust(bundle, 1.0, 8, way)[0], warped(times_s, 0.05))
+    begin, end = _cost(start, 1.0, way), _cost(_step(start, 1.0, 1e-9, way), 1.0, way)
+    again = _cost(_step(_step(start, 1.0, 1e-9, way), 1.0, 1e-9, way), 1.0, way)
+    assert end < begin and end - again < 0.1 * (begin - end)
+
+
+def test_the_cost_of_phases_is_that_of_a_random_walk():
+    """Breathing deviates from its rate by half, for a sixth of a breath; the phase by 1 rad, in the mean by 0.05 rad."""
+    times_s = torch.tensor([0.0, 0.3, 0.5, 1.1], dtype=torch.float64)
+    steady = Rhythm.steady(times_s, (0.4,))
+    assert steady.cost() == 0
+    change = torch.tensor([0.2, -0.1, 0.3, 0.05], dtype=torch.float64)
+    variance = (2 * torch.pi * 0.4 * 0.5) ** 2 * times_s.diff() / 6 / 0.4
+    expected = 0.5 * ((change.diff() ** 2 / variance).sum() + (change**2).mean() + (change.mean() / 0.05) ** 2)
+    assert steady.moved(change[:, None]).cost() == pytest.approx(float(expected), rel=1e-9)

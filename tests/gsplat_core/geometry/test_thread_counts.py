@@ -8,7 +8,7 @@ import torch
 
 from gsplat_core.poses import bundle, moving_bundle
 from gsplat_core.poses.breathing import _bundle, refined, separability, waves
-from gsplat_core.poses.moving_bundle import SurfaceField, learned_from
+from gsplat_core.poses.moving_bundle import Rhythm, SurfaceField, learned_from
 from tests.gsplat_core.geometry.breathing_points import BREATHING_HZ, HEART_HZ
 from tests.gsplat_core.geometry.breathing_sightings import bundle_of, seen_for
 from tests.gsplat_core.geometry.test_bundle import disturbed, first_only, known_scene
@@ -71,7 +71,9 @@ def test_priors_and_fields(breathing):
     def learned():
         prior = learned_from(start.poses, sightings.times_s, start.waves)
         field = SurfaceField.over(start.rest)
-        separated = separability(start.poses, start.poses, sightings.times_s, (BREATHING_HZ,))
+        separated = separability(
+            start.poses, start.poses, sightings.times_s, Rhythm.steady(sightings.times_s, (BREATHING_HZ,)).phases
+        )
         return (
             prior.precision, prior.uncertain, prior.cost(start.poses), *prior.terms(start.poses), field.nodes,
             field.stiffness, field.influence(start.rest), separated[1],
@@ -82,12 +84,12 @@ def test_priors_and_fields(breathing):
 
 @pytest.mark.slow
 def test_the_trajectory_before_breathing_tissue(breathing, monkeypatch):
-    monkeypatch.setattr("gsplat_core.poses.breathing.STAGES", ((0.007, 2, 0.06),))
+    monkeypatch.setattr("gsplat_core.poses.breathing.STAGES", ((0.007, 2),))
     _, sightings = breathing
 
     def found():
         start, numbers = _bundle(sightings, torch.arange(len(sightings.times_s)), 300, 30)
-        end, hz, prior = refined(start, sightings.times_s, (BREATHING_HZ, HEART_HZ))
-        return end.poses, end.rest, end.amplitudes, numbers, np.array(hz), prior.precision
+        end, rhythm, prior = refined(start, sightings.times_s, (BREATHING_HZ, HEART_HZ))
+        return end.poses, end.rest, end.amplitudes, numbers, rhythm.phases, prior.precision
 
     check(found)

@@ -35,38 +35,42 @@ def refined(poses: torch.Tensor, hz: tuple[float, ...]) -> torch.Tensor:
     return poses
 
 
+def phases(*hz: float) -> torch.Tensor:
+    return 2 * torch.pi * TIMES_S[:, None] * torch.tensor(hz, dtype=torch.float64)
+
+
 def sways(fastest_hz: float) -> list[tuple[float, float, int]]:
     return [(fastest_hz, 0.1, 0), (0.19, 0.06, 1), (0.15, 0.08, 2)]
 
 
 def test_breathing_that_is_faster_than_the_way_is_told():
     way, breathing = sways(0.22), (0.33, 0.03, 0)
-    separable, mistaken = separability(both := poses(*way, breathing), refined(both, (0.33,)), TIMES_S, (0.33,))
+    separable, mistaken = separability(both := poses(*way, breathing), refined(both, (0.33,)), TIMES_S, phases(0.33))
     assert separable and mistaken < 0.01
 
 
 @pytest.mark.parametrize("gap_hz", [0.027, -0.027])
 def test_a_scope_that_sways_nearly_as_fast_is_not_told_from_breathing(gap_hz):
     way, breathing = sways(0.25 + gap_hz), (0.25, 0.01, 0)
-    separable, mistaken = separability(both := poses(*way, breathing), refined(both, (0.25,)), TIMES_S, (0.25,))
+    separable, mistaken = separability(both := poses(*way, breathing), refined(both, (0.25,)), TIMES_S, phases(0.25))
     assert not separable and mistaken > 0.01
 
 
 def test_much_breathing_is_taken_away_even_there():
     """Poses that keep it would be off by more."""
     way, breathing = sways(0.22), (0.25, 0.4, 0)
-    separable, mistaken = separability(both := poses(*way, breathing), refined(both, (0.25,)), TIMES_S, (0.25,))
+    separable, mistaken = separability(both := poses(*way, breathing), refined(both, (0.25,)), TIMES_S, phases(0.25))
     assert separable and mistaken > 0.005
 
 
 def test_other_frequencies_stay_where_they_are():
     way, lines = sways(0.22), [(0.33, 0.03, 0), (1.1, 0.02, 1)]
-    separable, _ = separability(both := poses(*way, *lines), refined(both, (0.33, 1.1)), TIMES_S, (0.33, 1.1))
+    separable, _ = separability(both := poses(*way, *lines), refined(both, (0.33, 1.1)), TIMES_S, phases(0.33, 1.1))
     assert separable
 
 
 def test_a_way_that_swings_nearly_as_fast_shows_on_both_sides():
     """Slow scope motion raises only the side below the breathing frequency, so breathing is still separable."""
     way, breathing = sways(0.27), (0.33, 0.03, 0)
-    separable, mistaken = separability(both := poses(*way, breathing), refined(both, (0.33,)), TIMES_S, (0.33,))
+    separable, mistaken = separability(both := poses(*way, breathing), refined(both, (0.33,)), TIMES_S, phases(0.33))
     assert separable and mistaken < 0.005
