@@ -81,7 +81,9 @@ class FittedModel:
         """Ignore the scene change; the model covers all scenes."""
         return False
 
-    def observe(self, frame: Frame, *, budget: Budget | None = None, train: bool = True) -> ObserveReport:
+    def observe(
+        self, frame: Frame, *, budget: Budget | None = None, train: bool = True, doubtful: bool = False
+    ) -> ObserveReport:
         """Return a report without training steps."""
         return ObserveReport(frame.seq, 0, None, self.model.gaussians.count)
 
