@@ -88,9 +88,9 @@ class ReconstructOp(Operator):
     """Trains on each frame, then publishes the model, so that a frame's picture includes its own
     training.
 
-    Withheld and damaged frames are passed on with the current model and not trained on. A new scene
-    (`Frame.new_scene`, a changed scene number or picture size) starts a new model. Unusable frames
-    before the first model of a scene are dropped.
+    Withheld and damaged frames are passed on with the current model and not trained on, except those that the model
+    follows (`Frame.is_followed`). A new scene (`Frame.new_scene`, a changed scene number or picture size) starts a new
+    model. Unusable frames before the first model of a scene are dropped.
 
     Inputs:
         frame: `Frame`.

@@ -247,7 +247,7 @@ class EveryFrame(Training):
         """Add notes on frames without training to the outcome of the run."""
         if counts.withheld:
             reasons = ", ".join(f"{reason}: {count}" for reason, count in sorted(counts.withheld.items()))
-            outcome.note(f"{sum(counts.withheld.values())} frames were neither trained on nor scored ({reasons})")
+            outcome.note(f"{sum(counts.withheld.values())} frames were withheld and not scored ({reasons})")
         if counts.scenes:
             reasons = ", ".join(f"{reason}: {count}" for reason, count in sorted(counts.scenes.items()))
             outcome.note(

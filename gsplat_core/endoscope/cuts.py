@@ -196,7 +196,7 @@ class SceneVerdict:
     "resized" or "frame rate". None for the same scene.
     """
     in_doubt: bool = False
-    """True for an unmatched frame; the next frame decides whether it was a cut. Such a frame is not trained on."""
+    """True for an unmatched frame; the next frame decides whether it was a cut."""
 
 
 class CutDetector:

@@ -550,7 +550,7 @@ def _counts(live: LiveFacts) -> str:
         "Not on the screen in time": f"{live.not_on_screen:,} frames",
         "States, entered": _listed(live.states),
         "Passed over": _listed(live.dropped),
-        "Withheld from training": _listed(live.withheld),
+        "Withheld": _listed(live.withheld),
         "New scenes": _listed(live.scenes),
         **{f"Found by {stage}": _listed(found) for stage, found in live.analysis.items()},
         "Too fast to be scored": f"{live.unscored:,} frames",

@@ -103,7 +103,7 @@ def test_withheld_frames_are_shown_and_a_cut_begins_a_scene_without_a_clock(fram
     outcome = OutcomeBuilder()
     operator.contribute(outcome)
     assert outcome.notes == (
-        "4 frames were neither trained on nor scored (black: 1, damaged: 1, smoke: 2)",
+        "4 frames were withheld and not scored (black: 1, damaged: 1, smoke: 2)",
         "the frames show 2 scenes (begun by a frame that was not used: 1); the saved model is that of the last one",
     )
 

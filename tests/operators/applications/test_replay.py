@@ -224,4 +224,4 @@ def test_a_black_picture_is_withheld_as_in_a_live_stream(tiny, tmp_path):
     training, quality = outcome.find(TrainingCounts), outcome.find(QualityResult)
     assert training.withheld == {"black": 1} and training.frames == 3
     assert (quality.frames, quality.trained.count) == (4, 3)
-    assert any("neither trained on nor scored (black: 1)" in note for note in outcome.notes)
+    assert any("withheld and not scored (black: 1)" in note for note in outcome.notes)
