@@ -97,7 +97,9 @@ class Reconstructor:
         self._motion = Following(config, at_once=live is None or config.start_from_motion)
         self._start_here: StartOnDevice | None = None
         self._slots, self._version = SnapshotSlots(self.device, rows=self._fixed_rows), 0
-        self._first_time_s = self._last_time_s = self._learned_s = self._certain_s = 0.0
+        self._first_time_s = self._last_time_s = self._learned_s = 0.0
+        self._certain: Observation | None = None
+        """Newest observation of the scene that is not doubtful."""
         self._depth_source: DepthSource | None = None
         self.depth_doubts: Mapping[str, int] = {}
         """Reasons for frames without depth in the last `fit`, each with its number of frames; for moving cameras."""
@@ -191,8 +193,8 @@ class Reconstructor:
         self._learned_s = observation.time_s
         self._depth_source = DepthSource.after(self._depth_source, frame)
         self._motion.observe(step, frame, observation, first=first)
-        if not doubtful:
-            self._certain_s = observation.time_s
+        if first or not doubtful:
+            self._certain = observation
         self._window.add(observation)
         self._placement.apply(step, frame, observation)
         if self._growth is None:
@@ -272,7 +274,9 @@ class Reconstructor:
             True if the frame shows a scene that was left before.
         """
         if self._step is not None and not anew:
-            self._left.leave(self._step, self._window.newest, self._certain_s)
+            # A doubtful frame may be the newest of the window, and shows the next scene if this one ends with it.
+            last = self._certain or self._window.newest
+            self._left.leave(self._step, last, last.time_s)
         self._end_scene()
         if (frame.width_px, frame.height_px) != (self.camera.width_px, self.camera.height_px):
             self.camera = self.camera.resized(frame.width_px, frame.height_px)
@@ -287,7 +291,7 @@ class Reconstructor:
     def _end_scene(self) -> None:
         self._schedule.settle(self._step)
         self._left.keep_memory(self._step)
-        self._step = None
+        self._step = self._certain = None
         self._schedule.forget()
         self._motion.forget()
         self._covering.forget()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -305,9 +307,13 @@ def test_late_depth_is_taken_of_the_newest_30_frames(newer, is_taken):
 
 
 def test_a_scene_is_left_as_it_was_before_a_doubtful_frame():
+    """The next scene is not taken for the left one, although the left scene was trained on its first frame."""
     left = reconstructor()
+    other = Frame(1, 33_000_000, np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8))
     left.observe(frame_at(0), budget=Budget.of_steps(10))
-    left.observe(Frame(1, 10_000_000_000, 255 - frame_at(1).image), budget=Budget.of_steps(8), doubtful=True)
-    left.begin_scene(Frame(2, 10_033_000_000, np.full((HEIGHT, WIDTH, 3), 90, np.uint8)))
+    left.observe(other, budget=Budget.of_steps(8), doubtful=True)
+    assert not left.begin_scene(dataclasses.replace(other, seq=2, pts_ns=66_000_000))
     (place,) = left._left.places._left
     assert place.left_s == 0.0
+    left.observe(dataclasses.replace(other, seq=2, pts_ns=66_000_000), budget=Budget.of_steps(8))
+    assert left.begin_scene(dataclasses.replace(frame_at(0), seq=3, pts_ns=99_000_000))
