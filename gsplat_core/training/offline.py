@@ -1,7 +1,7 @@
-"""Training on all frames of a recording: frame order, decay of learning rates, and smoothing of motion in time and
-space.
+"""Training on all frames of a recording: frame order, decay of learning rates, smoothing of motion in time and space,
+and correction of colours at the end.
 
-Both kinds of smoothing are limited by how evenly the pictures change (`steadiness`).
+Smoothing and correction are limited by how evenly the pictures change (`steadiness`).
 """
 
 from __future__ import annotations
@@ -73,6 +73,19 @@ RIGIDITY = 1.0
 """Strength of spatial smoothing: share of the way of a Gaussian's motion to its neighbours' mean per pass over all frames,
 scaled by the learning rates' factor. It is reduced for fast motion by the root of `steadiness`.
 """
+
+CORRECTION = 1.0
+"""Relaxation of the colour corrections at the end of training, multiplied by `steadiness`.
+
+A correction at the time of one frame also changes the colours of its neighbours in time.
+"""
+CORRECT_FROM = 0.5
+"""Share of the steps after which colours are corrected instead of trained, with a relaxation that grows from 0."""
+
+
+def correction_at(share: float) -> float:
+    """Return the factor of the relaxation of colour corrections after this share of the steps."""
+    return max(0.0, (share - CORRECT_FROM) / (1 - CORRECT_FROM))
 
 
 def rate_at(share: float) -> float:
@@ -182,6 +195,7 @@ class OfflineTraining:
         # `steadiness` is a ratio of squares; differences between neighbouring motions scale with
         # its root.
         self._smoothing, self._rigidity = SMOOTHING * steady, RIGIDITY * math.sqrt(steady)
+        self._correction = CORRECTION * steady if step.has_colours_in_time else 0.0
         self._random = np.random.default_rng(seed)
         self._order: list[int] = []
         self._rate = 1.0
@@ -197,14 +211,26 @@ class OfflineTraining:
         for number in range(steps):
             if strategy.before_step(number, self._rate):
                 self._neighbours = None
-            self._rate = rate_at(number / steps)
-            loss = self._step(self._next(), rate_scale=self._rate)
+            share = number / steps
+            self._rate = rate_at(share)
+            observation = self._next()
+            loss = self._step(observation, self._rate, self._relaxation(number, share, observation))
             if (number + 1) % SMOOTH_EVERY == 0:
                 self._smooth()
             if progress is not None:
                 progress(number + 1, loss)
         self._step.settle(self._observations[-1], rate_scale=self._rate)
         return loss
+
+    def _relaxation(self, number: int, share: float, observation: Observation) -> float:
+        """Return the relaxation of a step; 0 for a step that trains colours instead of correcting them.
+
+        A correction by the right eye would change all times. A captured step that corrects colours compares no depth,
+        so every second step of frames with depth trains.
+        """
+        if observation.of_right or (observation.depth is not None and number % 2):
+            return 0.0
+        return self._correction * correction_at(share)
 
     def _next(self) -> Observation:
         """Return the next observation in a random order of all."""

@@ -286,6 +286,12 @@ class TrainingStep:
             self._adam.second_moments["means"][:count].div_(each.square())
 
     @property
+    def has_colours_in_time(self) -> bool:
+        """True if the colours of one time can be corrected without those of other times (`colour_correction`)."""
+        view_dependent = self.gaussians.device.type == "cuda" and self.gaussians.sh_degree > 0
+        return self.capabilities.add_colours is not None and self._pictures is None and not view_dependent
+
+    @property
     def steps(self) -> int:
         """Number of steps on this scene."""
         return self._adam.steps

@@ -74,9 +74,9 @@ def test_every_frame_is_trained_on_equally_often(tissue_video, camera, monkeypat
     seen = Counter()
     take = TrainingStep.__call__
 
-    def counted(self, observation, rate_scale=1.0):
+    def counted(self, observation, *others):
         seen[observation.seq] += 1
-        return take(self, observation, rate_scale)
+        return take(self, observation, *others)
 
     monkeypatch.setattr(TrainingStep, "__call__", counted)
     fitted(camera, tissue_video(5), 15)
@@ -109,6 +109,62 @@ def test_smoothing_never_goes_beyond_the_neighbours(tissue_video, camera, monkey
     assert max(amounts) == MOST_AT_ONCE
     fitted(camera, tissue_video(2), 100, SMOOTHING=0.0)
     assert len(amounts) == 100 // SMOOTH_EVERY
+
+
+def relaxations(camera, frames, steps, monkeypatch, config=CONFIG):
+    """Train and return the relaxation of every step with its observation."""
+    found, usual = [], TrainingStep.__call__
+
+    def step(self, observation, rate_scale=1.0, colour_relaxation=0.0, **others):
+        found.append((colour_relaxation, observation))
+        return usual(self, observation, rate_scale, colour_relaxation, **others)
+
+    monkeypatch.setattr(TrainingStep, "__call__", step)
+    fitted(camera, frames, steps, config)
+    return found
+
+
+def test_colours_are_corrected_ever_more_in_the_second_half(tissue_video, camera, monkeypatch):
+    # Equal frames are as steady as frames can be.
+    still = [frame.with_fields(image=tissue_video(1)[0].image) for frame in tissue_video(4)]
+    values = [value for value, _ in relaxations(camera, still, 40, monkeypatch)]
+    assert values[:21] == [0.0] * 21
+    assert values[21:] == pytest.approx([number / 20 for number in range(1, 20)])
+
+
+def test_colours_of_unsteady_frames_are_corrected_less(tissue_video, camera, monkeypatch):
+    dark = [frame.with_fields(image=frame.image // (1 + frame.seq % 2)) for frame in tissue_video(4)]
+    values = [value for value, _ in relaxations(camera, dark, 40, monkeypatch)]
+    assert 0 < values[-1] < 0.1
+
+
+def test_a_field_without_colours_in_time_trains_them_to_the_end(tissue_video, camera, monkeypatch):
+    config = dataclasses.replace(CONFIG, field="hexplane")
+    still = [frame.with_fields(image=tissue_video(1)[0].image) for frame in tissue_video(2)]
+    assert {value for value, _ in relaxations(camera, still, 6, monkeypatch, config)} == {0.0}
+
+
+def test_every_second_step_of_frames_with_depth_trains_colours(tissue_video, camera, monkeypatch):
+    shape = tissue_video(1)[0].image.shape[:2]
+    still = [
+        frame.with_fields(image=tissue_video(1)[0].image, depth=np.full(shape, 90.0, np.float32))
+        for frame in tissue_video(4)
+    ]
+    values = [value for value, _ in relaxations(camera, still, 40, monkeypatch)]
+    assert all(values[22::2])
+    assert not any(values[21::2])
+
+
+def test_correction_of_colours_fits_detail_that_training_has_not_reached(tissue_video, camera):
+    def error(correction):
+        learning, _ = fitted(camera, frames, 40, CORRECTION=correction)
+        pictures = [
+            torch.from_numpy(learning.picture(frame) * 255) - torch.from_numpy(frame.image).float() for frame in frames
+        ]
+        return float(torch.stack(pictures).square().mean())
+
+    frames = [frame.with_fields(image=tissue_video(1)[0].image) for frame in tissue_video(4)]
+    assert error(1.0) < 0.9 * error(0.0)
 
 
 def test_neighbours_move_more_alike_the_more_rigid_tissue_is(tissue_video, camera):
