@@ -294,7 +294,7 @@ class OfflineSection(Section):
             "Time limit of the training if its steps are chosen automatically",
             ("reconstruct",),
             unit="min",
-            null="0.8 on a GPU, 10 on a CPU",
+            null="0.75 on a GPU, 10 on a CPU",
             gt=0,
             le=100_000,
         ),

@@ -1,7 +1,7 @@
 """Training on all frames of a recording: frame order, decay of learning rates, smoothing of motion in time and space,
 and correction of colours at the end.
 
-Smoothing and correction are limited by how evenly the pictures change (`steadiness`).
+Smoothing and correction depend on how evenly the pictures change (`steadiness`).
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ scaled by the learning rates' factor. It is reduced for fast motion by the root 
 """
 
 CORRECTION = 1.0
-"""Relaxation of the colour corrections at the end of training, multiplied by `steadiness`.
+"""Relaxation of the colour corrections at the end of training, if `steadiness` is 1; other frames are not corrected.
 
 A correction at the time of one frame also changes the colours of its neighbours in time.
 """
@@ -195,7 +195,7 @@ class OfflineTraining:
         # `steadiness` is a ratio of squares; differences between neighbouring motions scale with
         # its root.
         self._smoothing, self._rigidity = SMOOTHING * steady, RIGIDITY * math.sqrt(steady)
-        self._correction = CORRECTION * steady if step.has_colours_in_time else 0.0
+        self._correction = CORRECTION if steady == 1 and step.has_colours_in_time else 0.0
         self._random = np.random.default_rng(seed)
         self._order: list[int] = []
         self._rate = 1.0

@@ -59,7 +59,7 @@ from operators.sources.derived import PosedSource
 from operators.sources.source import FrameSource
 from operators.storage import storage_errors
 
-MINUTES_ON_GPU, MINUTES_ON_CPU = 0.8, 10.0
+MINUTES_ON_GPU, MINUTES_ON_CPU = 0.75, 10.0
 """Time limits of a training with an automatic number of steps, in minutes."""
 ALTERNATIVE_SHARE = 0.1
 """Share of the time limit from which a first trial is too long to try other inputs."""
