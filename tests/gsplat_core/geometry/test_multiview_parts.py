@@ -8,7 +8,11 @@ import numpy as np
 import pytest
 
 from gsplat_core.depth import multiview
-from gsplat_core.depth.multiview import chosen_views
+from gsplat_core.depth.maps import DepthMap
+from gsplat_core.depth.multiview import ParallaxDepth, chosen_views
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.depth_origin import PARALLAX
+from gsplat_core.scene.frames import Frame
 
 
 def view(x, turn=0.0):
@@ -62,3 +66,39 @@ def test_patches_below_fourteen_of_ten_thousand_pixels_are_speckles(side, is_kep
     labels[20 : 20 + side, 20 : 20 + side], confidence[20 : 20 + side, 20 : 20 + side] = 14.0, 0.9
     found = multiview._without_speckles(labels, confidence)
     assert found[20, 20] == pytest.approx(0.9 if is_kept else 0.2) and found[0, 0] == 0
+
+
+@pytest.mark.parametrize("is_right", [True, False])
+def test_the_first_depth_of_a_stream_waits_for_a_second_that_agrees(monkeypatch, is_right):
+    """The scope slides by 1 per frame before waves. A second depth that is deep where the first is high contradicts it."""
+    waves = 60 + 15 * np.sin(np.arange(64, dtype=np.float32) / 6)
+    seen = iter([waves, waves if is_right else 120 - waves])
+
+    def depth_of_view(view, others, size):
+        return DepthMap(np.tile(next(seen), (size[0], 1)), np.ones(size, np.float32), PARALLAX, metric=False)
+
+    monkeypatch.setattr(multiview, "depth_of_view", depth_of_view)
+    image = np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)
+    estimator, found = ParallaxDepth(), []
+    for seq in range(3):
+        pose = np.eye(4)
+        pose[0, 3] = -float(seq)
+        camera = Camera.from_focal(60.0, 64, 48, pose)
+        found.append(estimator.estimate(Frame(seq, seq * 250_000_000, image, pose=pose), camera))
+    assert found[:2] == [None, None] and found[2] is not None
+    assert (found[2].doubt is None) == is_right and found[2].confidence.any() == is_right
+
+
+@pytest.mark.parametrize("doubt", [None, "too dark"])
+def test_depth_without_confidence_is_doubted_and_a_doubt_stays(monkeypatch, doubt):
+    def depth_of_view(view, others, size):
+        return DepthMap(np.full(size, 60, np.float32), np.zeros(size, np.float32), PARALLAX, metric=False, doubt=doubt)
+
+    monkeypatch.setattr(multiview, "depth_of_view", depth_of_view)
+    image = np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)
+    estimator = ParallaxDepth()
+    for seq in range(2):
+        pose = np.eye(4)
+        pose[0, 3] = -float(seq)
+        found = estimator.estimate(Frame(seq, seq, image, pose=pose), Camera.from_focal(60.0, 64, 48, pose))
+    assert found is not None and found.doubt == (doubt or multiview.DEFORMS)
