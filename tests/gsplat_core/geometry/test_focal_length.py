@@ -8,6 +8,7 @@ import torch
 
 from gsplat_core.geometry.tracks import Observations
 from gsplat_core.poses import focal_length
+from gsplat_core.poses.bundle import Bundle
 from gsplat_core.poses.focal_length import (
     LEAST_POINTS,
     LONGEST,
@@ -125,3 +126,39 @@ def test_another_focal_length_leaves_the_rest_of_a_camera():
     other = with_focal_length(camera, 300.0)
     assert (other.K[0, 0], other.K[1, 1]) == (300, 300) and np.array_equal(other.K[:, 2], camera.K[:, 2])
     assert np.array_equal(other.world_to_camera, camera.world_to_camera) and camera.K[0, 0] == 288
+
+
+def test_the_best_candidate_is_refined_from_its_nearest_neighbours():
+    """Expected value: the minimum of a parabola in log focal length, between candidates a factor of 1.5 apart."""
+    starts = []
+
+    def tried(focal_px, near):
+        starts.append((focal_px, near.bundle))
+        return focal_length._Try(focal_px, np.log(focal_px / 330.0) ** 2)
+
+    tries = {
+        focal_px: focal_length._Try(focal_px, np.log(focal_px / 330.0) ** 2) for focal_px in (160.0, 240, 360, 540)
+    }
+    known = set(tries)
+    focal_length._refine(tries, tried)
+    best_px = min(tries, key=lambda focal_px: tries[focal_px].cost)
+    assert best_px == pytest.approx(330, rel=0.02) and len(starts) > 0
+    for focal_px, start_px in starts:
+        assert max(focal_px / start_px, start_px / focal_px) == min(
+            max(focal_px / each, each / focal_px) for each in known
+        )
+        known.add(focal_px)
+
+
+def test_a_point_before_the_lens_is_an_outlier_however_far_the_scope_was_moved():
+    """All rays are exact. The scope was withdrawn by 40, so that the scene is 60 away and one point is 1 away."""
+    points = torch.tensor([[1.0, 2, 20], [-3, 1, 21], [2, -2, 19], [0.01, 0.01, -39]], dtype=torch.float64)
+    poses = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
+    poses[:, 2, 3] = 40
+    poses[:, 0, 3] = torch.tensor([-0.1, 0, 0.1])
+    camera, point = torch.arange(3).repeat_interleave(4), torch.arange(4).repeat(3)
+    local = points[point] + poses[camera, :3, 3]
+    bundle = Bundle(poses, points, camera, point, local[:, :2] / local[:, 2:], 288.0)
+    kept = focal_length._without_outliers(bundle, 3.0)
+    assert torch.equal(kept.points, points[:3])
+    assert kept.point.tolist() == [0, 1, 2] * 3 and kept.camera.tolist() == [0] * 3 + [1] * 3 + [2] * 3
