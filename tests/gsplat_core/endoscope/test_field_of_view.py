@@ -209,3 +209,13 @@ def test_no_picture_of_any_size_raises(height, width, seed):
             image[:, : rng.integers(0, width)] = 0
             mask = view.observe(image)
             assert mask is None or mask.shape == (height, width)
+
+
+@pytest.mark.parametrize(("windows", "is_taken"), [(1, False), (2, False), (3, True)])
+def test_a_smaller_field_is_accepted_after_three_windows(monkeypatch, windows, is_taken):
+    monkeypatch.setattr(field_of_view, "WINDOW_FRAMES", 2)
+    large, small = disc(radius=120), disc(radius=80)
+    # The first frame is a window of its own, and the window after a change still contains frames before it.
+    found = masks([*seen_through(large, count=3), *seen_through(small, count=1 + 2 * windows)])
+    assert overlap(found[2], large) > 0.92
+    assert overlap(found[-1], small if is_taken else large) > 0.9

@@ -6,7 +6,15 @@ import cv2
 import numpy as np
 import pytest
 
-from gsplat_core.endoscope.tool_network import NETWORK, NetworkToolFinder, remove_inner_regions, round_view
+from gsplat_core.endoscope.tool_network import (
+    NETWORK,
+    ROUND_INPUT_PX,
+    ROUND_INPUTS,
+    ROUND_NETWORK,
+    NetworkToolFinder,
+    remove_inner_regions,
+    round_view,
+)
 from gsplat_core.errors import InvalidInput
 
 
@@ -112,3 +120,13 @@ def test_pictures_with_a_round_view_have_a_network_of_their_own(finder):
 
 def test_nothing_is_found_on_plain_tissue_in_a_round_view(finder):
     assert finder.find(in_round_view(tissue(256, 320))[0]).all()
+
+
+def test_round_views_and_full_pictures_each_have_their_own_network(finder):
+    full, _ = with_rod(256, 320)
+    around = in_round_view(full)[0]
+    only_full = NetworkToolFinder(NETWORK)
+    only_round = NetworkToolFinder(ROUND_NETWORK, ROUND_INPUT_PX, ROUND_INPUTS)
+    np.testing.assert_array_equal(finder.find(full), only_full.find(full))
+    np.testing.assert_array_equal(finder.find(around), only_round.find(around))
+    assert (only_full.find(around) != only_round.find(around)).any()
