@@ -179,3 +179,15 @@ def test_a_look_every_three_tenths_of_a_second(elapsed_s, is_new):
     first = estimator.estimate(frame, CAMERA)
     second = estimator.estimate(Frame(1, round(elapsed_s * 1e9), picture(bowl())), CAMERA)
     assert (second is not first) == is_new
+
+
+def test_a_moved_scope_gets_a_new_answer_and_one_at_rest_keeps_its_own(monkeypatch):
+    answers = iter("abc")
+    monkeypatch.setattr(LightDepth, "_look", lambda self, frame, camera: next(answers))
+    monkeypatch.setattr(LightDepth, "_resized", lambda self, frame: False)
+    estimator, moved = LightDepth(), np.eye(4)
+    moved[2, 3] = 1.0
+    image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    cameras = [CAMERA, CAMERA, CAMERA.with_pose(moved), CAMERA.with_pose(moved.copy()), CAMERA]
+    found = [estimator.estimate(Frame(seq, seq, image), camera) for seq, camera in enumerate(cameras)]
+    assert found == ["a", "a", "b", "b", "c"]

@@ -8,9 +8,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from gsplat_core.depth.maps import DepthMap, doubted
 from gsplat_core.experimental import breathing_depth
 from gsplat_core.experimental.breathing_depth import OTHERWISE, TOO_FEW, TOO_SHORT, MovingTissue, Pull
 from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.depth_origin import PARALLAX
 from gsplat_core.scene.frames import Frame
 
 FOCAL_PX = 100.0
@@ -201,3 +203,29 @@ def test_there_is_no_depth_outside_of_the_windows(monkeypatch, time_s, is_known)
     found = tissue(monkeypatch, [window_of(), TOO_SHORT], {2.0: (50.0, 0.8)}, [frame])
     assert found.doubts == (TOO_SHORT,)
     assert found.depth_of(0).doubt == (None if is_known else TOO_SHORT)
+
+
+@pytest.mark.parametrize(("most_pixels", "looked_at"), [(10**6, [0, 1, 2, 3, 4]), (3 * 48, [0, 2, 4]), (1, [0])])
+def test_frames_with_depth_are_spread_from_the_first_to_the_last(monkeypatch, most_pixels, looked_at):
+    """Pictures have 48 pixels. The third frame is rejected, and its reason is counted."""
+    size, asked = (6, 8), []
+
+    class Tissue:
+        def __init__(self, frames, cameras):
+            pass
+
+        def depth_of(self, number):
+            asked.append(number)
+            if number == 2:
+                return doubted(size, PARALLAX, "it moves")
+            return DepthMap(np.full(size, 5.0 + number, np.float32), np.ones(size, np.float32), PARALLAX, metric=False)
+
+    monkeypatch.setattr(breathing_depth, "MovingTissue", Tissue)
+    monkeypatch.setattr(breathing_depth, "MOST_PIXELS", most_pixels)
+    frames = [Frame(seq, seq, np.zeros((*size, 3), np.uint8)) for seq in range(5)]
+    found = breathing_depth.BreathingDepth().of_recording(frames, [Camera.from_focal(8.0, 8, 6)] * 5)
+    assert asked == looked_at
+    for number, frame in enumerate(found.frames):
+        assert (frame.depth is not None) == (number in looked_at and number != 2)
+        assert frame.depth is None or frame.depth[0, 0] == 5 + number
+    assert found.doubts == ({"it moves": 1} if 2 in looked_at else {})
