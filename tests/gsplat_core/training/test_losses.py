@@ -86,6 +86,7 @@ def test_weights_are_those_given_or_the_defaults(small_opacities):
     ("losses", "message"),
     [
         (("small",), "unknown loss 'small'.*photometric"),
+        (("small:0.5",), "unknown loss 'small'.*photometric"),
         (("depth:2",), "depth is always compared and weighed by depth_weight"),
         (("small_opacities", "small_opacities:1"), "twice.*small_opacities:2"),
         (("small_opacities:-1",), "positive number"),

@@ -11,6 +11,7 @@ import torch
 from gsplat_core.deformation import FIELDS, BasisField, HexPlaneField
 from gsplat_core.io.recordings.synthetic.scene import SyntheticScene
 from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.config import LearningRates, ReconstructorConfig
 from gsplat_core.training.metrics import psnr_tissue_db
@@ -297,3 +298,22 @@ def test_another_scene_is_not_compared_with_the_loss_of_the_one_before():
 
     assert steps(new_scene=False)[0] == 10
     assert steps(new_scene=True) == [2, 2]
+
+
+def test_only_offline_training_knows_all_frames(monkeypatch, make_frame, camera):
+    """The weights of a scene depend on this. Stereo depth counts ten times as much offline as online."""
+    weights = []
+    usual = ReconstructorConfig.starting_from
+
+    def starting_from(config, frame, all_known):
+        chosen = usual(config, frame, all_known)
+        weights.append(chosen.depth_weight / config.depth_weight)
+        return chosen
+
+    monkeypatch.setattr(ReconstructorConfig, "starting_from", starting_from)
+    plane = np.full((40, 48), 60.0, np.float32)
+    frame = make_frame(depth=plane, depth_confidence=np.ones_like(plane), depth_origin=DEPTH_ORIGINS["stereo"])
+    config = dataclasses.replace(CONFIG, gaussians=40, first_frame_steps=1)
+    Reconstructor(config, camera).fit([frame], 1)
+    Reconstructor(config, camera).observe(frame)
+    assert weights == pytest.approx([10, 1])
