@@ -231,3 +231,16 @@ def test_the_outcome_has_what_came_and_what_was_found(estimator, frame, compute)
 def test_another_name_is_refused():
     with pytest.raises(InvalidSetting, match="depth is 'sonar'; choose auto"):
         BackgroundDepth("sonar", CAMERA)
+
+
+def test_a_small_share_of_a_core_leaves_the_next_frame_waiting_and_a_stop_does_not_wait(estimator, frame):
+    beside = BackgroundDepth("gated", CAMERA, share=1e-9)  # microseconds of work are followed by hours of rest
+    beside.start()
+    beside.offer(frame(0))
+    at_work(estimator)
+    estimator.gate.release(2)
+    assert taken(beside).seq == 0
+    beside.offer(frame(1))
+    assert not estimator.begun.acquire(timeout=0.2)
+    beside.stop()
+    assert [each.seq for each in estimator.asked] == [0]

@@ -11,7 +11,7 @@ import torch
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.bundle import save_bundle
-from operators.applications.render import render_model
+from operators.applications.render import render_model, render_picture
 from operators.errors import DeviceMissing, OutputError, OutputFolderInUse
 
 
@@ -94,3 +94,11 @@ def test_nothing_is_written_where_it_does_not_belong(bundle, tmp_path):
     (tmp_path / "folder.mp4").mkdir()
     with pytest.raises(OutputError, match="is a folder"):
         render_model(bundle, tmp_path / "folder.mp4")
+
+
+def test_an_unknown_renderer_is_refused_before_the_model_is_read(tmp_path):
+    with pytest.raises(InvalidSetting, match="sculptor"):
+        render_model(tmp_path / "missing", tmp_path / "images", renderer="sculptor")
+    assert not (tmp_path / "images").exists()
+    with pytest.raises(InvalidSetting, match="sculptor"):
+        render_picture(tmp_path / "missing", renderer="sculptor")

@@ -154,3 +154,18 @@ def test_what_cannot_be_is_refused(runtime):
         folder_of(runtime.path, "nobody")
     with MessageServer("127.0.0.1", 0)._listener as taken, pytest.raises(OutputError, match="cannot be listened on"):
         MessageServer("127.0.0.1", taken.getsockname()[1])
+
+
+def test_a_closed_server_has_ended_its_thread(monkeypatch):
+    ended = []
+
+    def accept(server):
+        usual(server)
+        time.sleep(0.05)
+        ended.append(server)
+
+    usual = MessageServer._accept
+    monkeypatch.setattr(MessageServer, "_accept", accept)
+    server = MessageServer("127.0.0.1", 0)
+    server.close()
+    assert ended == [server]
