@@ -143,7 +143,7 @@ class _Odometry:
         self._points = torch.zeros(number, 3, dtype=torch.float64)
         self._known = torch.zeros(number, dtype=torch.bool)
         self._bounds = torch.searchsorted(self._frame, torch.arange(count + 1))
-        apart = min(FARTHEST_APART, max(1, -(-count // KEY_FRAMES)))
+        apart = min(FARTHEST_APART, -(-count // KEY_FRAMES))
         self._is_key = torch.zeros(count, dtype=torch.bool)
         self._is_key[::apart] = True
         self._is_key[-1] = True
