@@ -11,7 +11,7 @@ import torch
 from gsplat_core.errors import InvalidInput
 from gsplat_core.evaluation.trajectory import evaluate_trajectory
 from gsplat_core.geometry.reference_tracks import ReferenceTracks
-from gsplat_core.geometry.tracks import FeatureTracks
+from gsplat_core.geometry.tracks import FeatureTracks, Observations
 from gsplat_core.io.recordings.synthetic.rendered import RenderedRecording, RenderSettings, render_recording
 from gsplat_core.io.recordings.synthetic.tissue import Tissue, Tug
 from gsplat_core.poses.odometry import LEAST_SEEN, Trajectory, followed_part, trajectory_of
@@ -91,6 +91,40 @@ def test_a_frame_that_shows_nothing_is_said(rigid):
     others = [index for index in range(COUNT) if index != 6]
     whole = replace(found, poses=found.poses[others])
     assert off_share(whole, [frames[index] for index in others]) < 0.03, "points are found again behind it"
+
+
+@pytest.mark.parametrize("left", [0, 1, 3])
+def test_the_way_goes_on_where_hardly_a_point_is_left(left, monkeypatch):
+    """From frame 6 on other points are seen, and only `left` of the first ones, too few for a pose."""
+    K = np.array([[200.0, 0, 128], [0, 200, 96], [0, 0, 1]])
+    points = np.random.default_rng(0).uniform([-0.7, -0.5, 0.8], [0.7, 0.5, 1.2], (120, 3))
+    at = np.stack([0.02 * np.arange(12), 0.01 * np.sin(np.arange(12)), np.zeros(12)], 1)
+    sightings = [
+        (frame, number)
+        for frame in range(12)
+        for number in (range(60) if frame < 6 else [*range(left), *range(60, 120)])
+    ]
+    frame, number = np.ascontiguousarray(np.array(sightings).T)
+    local = points[number] - at[frame]
+    seen = Observations(frame, number, local[:, :2] / local[:, 2:] * 200 + K[:2, 2])
+    monkeypatch.setattr(ReferenceTracks, "observations", lambda self, least: seen)
+    grey = np.full((192, 256, 3), 128, np.uint8)
+    found = trajectory_of([Frame(index, index, grey) for index in range(12)], Camera(K, 256, 192))
+    assert found.lost == (6,)
+    for part in (slice(0, 6), slice(7, 12)):
+        step, true = (np.linalg.norm(np.diff(each[part], axis=0), axis=1) for each in (found.poses[:, :3, 3], at))
+        np.testing.assert_allclose(step / true, np.full(len(true), step[0] / true[0]), rtol=0.02)
+
+
+def test_a_point_of_four_frames_may_be_hidden_in_one(rigid):
+    """Each frame hides another quarter of the picture, so no point is seen in all of them."""
+    frames = list(rigid)[:4]
+    for index, frame in enumerate(frames):
+        mask = np.ones(frame.image.shape[:2], np.uint8)
+        np.array_split(np.array_split(mask, 2)[index // 2], 2, axis=1)[index % 2][:] = 0
+        frames[index] = frame.with_fields(mask=mask)
+    found = trajectory_of(frames, rigid.camera)
+    assert found.lost == () and len(found.points) >= 24
 
 
 def test_after_another_scene_nothing_is_placed_by_the_old_points(rigid):
