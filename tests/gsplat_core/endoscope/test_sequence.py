@@ -191,6 +191,18 @@ def test_a_grey_lower_part_is_a_tear():
     assert faults(with_changed(texture(1, 20), 12, grey_below))[12] == "torn"
 
 
+@pytest.mark.parametrize(("deviation", "fault"), [(3, "torn"), (6, None)])
+def test_a_lower_part_that_is_grey_but_for_coding_errors_is_a_tear(deviation, fault):
+    """A colour may deviate by 3 levels."""
+
+    def change(image, before):
+        half = image[len(image) // 2 :]
+        half[:] = 128 + np.random.default_rng(0).integers(-deviation, deviation + 1, half.shape)
+        return image
+
+    assert faults(with_changed(texture(1, 20), 12, change))[12] == fault
+
+
 @pytest.mark.parametrize(("lit", "fault"), [(0.02, "black"), (0.05, None)])
 def test_a_black_picture_may_have_a_few_lit_pixels(lit, fault, monkeypatch):
     monkeypatch.setattr(sequence, "ONE_COLOUR_LEVELS", 0)
