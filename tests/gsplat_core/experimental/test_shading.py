@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from gsplat_core.experimental.shading import SmallPicture, shading_in
+from gsplat_core.experimental.shading import SmallPicture, log_diffuse, shading_in
 from gsplat_core.scene.frames import Frame
 
 
@@ -54,3 +54,14 @@ def test_diffuse_brightness_is_the_logarithm_of_the_light_that_the_camera_record
     assert found is not None
     seen = found.brightness[:, :18].mean() - found.brightness[:, 22:].mean()
     assert seen == pytest.approx(np.log(dimmer), abs=0.02)
+
+
+@pytest.mark.parametrize("tissue", [(0.6, 0.25, 0.2), (0.3, 0.1, 0.05)])
+def test_the_diffuse_light_is_the_excess_of_red_and_free_of_reflections(tissue: tuple[float, float, float]) -> None:
+    """A reflection adds as much to each channel. The unit of light is the recorded one of dim light."""
+    light, reflection = np.array(tissue), 0.05
+    image = np.zeros((64, 80, 3), np.uint8)
+    image[:, :40], image[:, 40:] = recorded(light), recorded(light + reflection)
+    found, known = log_diffuse(SmallPicture.of(Frame(0, 0, image)))
+    assert known.all()
+    np.testing.assert_allclose(found, np.log(light[0] - (light[1] + light[2]) / 2), atol=0.03)
