@@ -116,3 +116,39 @@ def test_large_pictures_are_reduced_and_positions_are_not():
     both = np.intersect1d(seen.point[seen.frame == 0], seen.point[seen.frame == 3])
     first, last = (seen.pixels[(seen.frame == frame) & np.isin(seen.point, both)] for frame in (0, 3))
     np.testing.assert_allclose(np.median(first - last, axis=0), [12.0, 0.0], atol=0.5)
+
+
+def test_points_are_found_while_the_scope_turns_about_its_axis():
+    """By 60 degrees, so that points move by more than half of the picture's height and in all directions."""
+    tracks, centre = ReferenceTracks(), np.array([WIDTH / 2, HEIGHT / 2])
+    turns = [
+        np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        for angle in np.deg2rad(np.arange(0, 61, 6))
+    ]
+    for turn in turns:
+        shift = centre - turn @ centre + [200, 180]
+        warp = cv2.WARP_INVERSE_MAP | cv2.INTER_CUBIC
+        tracks.follow(cv2.warpAffine(wide_texture(0), np.c_[turn, shift], (WIDTH, HEIGHT), flags=warp), None)
+    seen = tracks.observations(3)
+    begin, end = (
+        dict(zip(seen.point[seen.frame == k], seen.pixels[seen.frame == k] - 0.5, strict=True)) for k in (0, 10)
+    )
+    due = {number: turns[10].T @ (at - centre) + centre for number, at in begin.items()}
+    inside = [number for number, at in due.items() if (at > 12).all() and (at < [WIDTH - 12, HEIGHT - 12]).all()]
+    found = [number for number in inside if number in end]
+    assert len(inside) > 100 and len(found) > 0.9 * len(inside)
+    assert np.median([np.linalg.norm(end[number] - due[number]) for number in found]) < 0.25
+
+
+def test_points_are_found_near_a_thread_but_not_on_it():
+    """From 3 pixels beside a thread of 2 pixels on, so that the tissue between threads is not given up."""
+    tracks, mask = ReferenceTracks(), np.ones((HEIGHT, WIDTH), np.uint8)
+    threads = np.arange(20, WIDTH - 20, 20)
+    mask[:, np.concatenate([threads, threads + 1])] = 0
+    for _ in range(4):
+        tracks.follow(view(0), mask)
+    seen = tracks.observations(3)
+    column = np.rint(seen.pixels[seen.frame == 0][:, 0] - 0.5)
+    beside = np.abs(column[:, None] - threads - 0.5).min(1) - 0.5
+    assert beside.min() > 2
+    assert np.count_nonzero(beside <= 4) > 5
