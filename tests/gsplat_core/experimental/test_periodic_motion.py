@@ -15,7 +15,15 @@ from gsplat_core.experimental.periodic_motion import (
     waves,
 )
 from gsplat_core.geometry.grid_tracks import GridTracks
-from tests.gsplat_core.geometry.breathing_points import BREATHING_HZ, HEART_HZ, places, swaying, tracks_of
+from tests.gsplat_core.geometry.breathing_points import (
+    BREATHING_HZ,
+    EXTENT,
+    FOCAL_PX,
+    HEART_HZ,
+    places,
+    swaying,
+    tracks_of,
+)
 
 TRUE = BREATHING_HZ, HEART_HZ
 
@@ -126,3 +134,19 @@ def test_points_without_observations_get_the_usual_distance_and_stay_where_they_
     usual = np.median(begun[:, 2])
     np.testing.assert_allclose(found[:20, 2], usual, rtol=1e-6)
     np.testing.assert_allclose(found[:20, :2], begun[:20, :2], rtol=1e-6, atol=1e-6)
+
+
+def test_the_motion_varies_over_the_picture_of_a_narrow_view_too() -> None:
+    """Opposite sides of the picture move in opposite directions. The view is a fifth as wide as elsewhere."""
+    times_s = np.arange(0, 4, 0.1)
+    rest, poses = places(times_s, 0.0)[0] * [0.2, 0.2, 1.0], swaying(times_s, 0.2)
+    points = np.repeat(rest[None], len(times_s), 0)
+    points[..., 0] += rest[:, 0] / 7 * np.cos(2 * np.pi * BREATHING_HZ * times_s)[:, None]
+    local = in_cameras(points, poses)
+    across, down = EXTENT
+    tracks = GridTracks(
+        local[..., :2] / local[..., 2:], np.ones(local.shape[:2], bool), poses, times_s, 5 * FOCAL_PX,
+        (across / 5, down / 5),
+    )  # fmt: skip
+    found = fitted(tracks, (BREATHING_HZ,), rest, 2).terms[:, 0, 1]
+    np.testing.assert_allclose(found, rest[:, 0] / 7, atol=0.1)
