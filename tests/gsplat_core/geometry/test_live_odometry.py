@@ -10,11 +10,11 @@ import torch
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.evaluation.trajectory import evaluate_trajectory
-from gsplat_core.geometry.stream_tracks import StreamTracks
+from gsplat_core.geometry.stream_tracks import SmallPictures, StreamTracks
 from gsplat_core.io.recordings.synthetic.rendered import RenderedRecording, RenderSettings, render_recording
 from gsplat_core.io.recordings.synthetic.tissue import Tissue, Tug
 from gsplat_core.poses import live_odometry, local_map
-from gsplat_core.poses.live_odometry import LiveOdometry
+from gsplat_core.poses.live_odometry import LiveOdometry, seen_depth
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_origin import RELATIVE_DISTANCE
 from gsplat_core.scene.frames import Frame, FrameStatus
@@ -111,6 +111,18 @@ def test_the_first_points_have_the_depth_of_their_pixels_and_its_median_in_holes
     assert 20 < known.sum() < len(known) - 20
     np.testing.assert_allclose(points[known, 2], depth[row, column][known], rtol=0.03)
     np.testing.assert_allclose(points[~known, 2], np.median(points[known, 2]), rtol=0.01)
+
+
+@pytest.mark.parametrize("side_px", [256, 100])
+def test_points_at_the_edge_have_the_depth_of_the_edge(rigid, side_px):
+    """Positions between pixels are up to a pixel outside at each edge."""
+    first = next(iter(rigid))
+    picture = SmallPictures(rigid.camera, side_px).of(first)
+    height, width = picture.grey.shape
+    depth = np.arange(first.depth.size, dtype=np.float32).reshape(first.depth.shape) + 1
+    pixels = np.array([[-0.6, -0.6], [width - 0.4, -0.6], [-0.6, height - 0.4], [width - 0.4, height - 0.4]])
+    found = seen_depth(first.with_fields(depth=depth, depth_confidence=None), picture, pixels)
+    assert np.array_equal(found, depth[[0, 0, -1, -1], [0, -1, 0, -1]])
 
 
 def test_a_frame_that_tells_nothing_stands_where_the_one_before_stood(rigid):
