@@ -10,7 +10,7 @@ an arithmetic operator or number replaced, `and` swapped with `or`, `min` with `
 negated, or a call removed. One pytest session collects the tests and runs each mutant in a fork of
 itself. There the code of the changed function is replaced in the loaded functions. Processes that
 tests start, and modules not yet imported, import the mutant in place of the module. A change outside
-functions needs a session of its own. No file of the checkout is changed.
+functions, or in one that the module itself calls, needs a session of its own. No file of the checkout is changed.
 
 Only tests that execute the changed line run, for a minute at most; `tests/executed.py` records them.
 A mutant on a line that no test executes survives. A run ends at the first failure. A test that also
@@ -101,7 +101,7 @@ class Mutant:
         kind: kind of the change.
         change: the expression before and after.
         tree: the changed module.
-        inside: whether the change is inside a function.
+        inside: whether the change is inside a function that does not run when the module is loaded.
     """
 
     path: str
@@ -202,10 +202,19 @@ def mutant_at(path: Path, index: int, number: int) -> Mutant | None:
     apply()
     ast.fix_missing_locations(tree)
     line = getattr(node, "lineno", 0)
-    inside = any(
-        each.body[0].lineno <= line <= (each.end_lineno or 0) for each in ast.walk(tree) if isinstance(each, FUNCTIONS)
-    )
+    around = {
+        each.name for each in ast.walk(tree)
+        if isinstance(each, FUNCTIONS) and each.body[0].lineno <= line <= (each.end_lineno or 0)
+    }  # fmt: skip
+    inside = bool(around) and not around & _called_on_import(tree)
     return Mutant(str(path.relative_to(ROOT)), line, kind, change, tree, inside)
+
+
+def _called_on_import(tree: ast.Module) -> set[str]:
+    """Return names of functions that statements outside functions and classes call, such as those that make tables."""
+    outside = [each for each in tree.body if not isinstance(each, (*FUNCTIONS, ast.ClassDef))]
+    calls = [node.func for each in outside for node in ast.walk(each) if isinstance(node, ast.Call)]
+    return {each.id for each in calls if isinstance(each, ast.Name)}
 
 
 def _changes(node: ast.AST) -> list[tuple[str, Callable[[], None]]]:

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from tests import executed
-from tests.mutants import changeable
+from tests import executed, mutants
+from tests.mutants import changeable, mutant_at
 
 MODULE = """
 LIMIT = 3
@@ -89,6 +89,18 @@ def test_without_a_gpu_what_runs_on_one_only_is_not_changed(tmp_path: Path) -> N
     path.write_text(GPU_MODULE, encoding="utf-8")
     _, nodes, places = changeable(path)
     assert sorted({getattr(nodes[index], "lineno", 0) for index, _ in places}) == [12, 13, 15, 17, 19, 27]
+
+
+def test_only_functions_that_loading_the_module_does_not_run_are_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "module.py"
+    path.write_text(MODULE + "\n\ndef table():\n    return LIMIT + 5\n\n\nTABLE = [table()]\n", encoding="utf-8")
+    monkeypatch.setattr(mutants, "ROOT", tmp_path)
+    found = [mutant for place in changeable(path)[2] if (mutant := mutant_at(path, *place)) is not None]
+    apart = {mutant.change.split("  =>  ")[0] for mutant in found if not mutant.inside}
+    assert apart == {"3", "5", "LIMIT + 5"}
+    assert any(mutant.change == "value * LIMIT  =>  value / LIMIT" for mutant in found if mutant.inside)
 
 
 def test_a_statement_keeps_its_key_when_other_functions_change_and_the_module_moves(tmp_path: Path) -> None:
