@@ -119,7 +119,7 @@ def test_large_pictures_are_reduced_and_positions_are_not():
 
 
 def test_points_are_found_while_the_scope_turns_about_its_axis():
-    """By 60 degrees, so that points move by more than half of the picture's height and in all directions."""
+    """A turn of 60 degrees moves points in all directions, by more than half of the picture's height."""
     tracks, centre = ReferenceTracks(), np.array([WIDTH / 2, HEIGHT / 2])
     turns = [
         np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
