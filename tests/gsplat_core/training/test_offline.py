@@ -18,6 +18,7 @@ from gsplat_core.training.offline import MOST_AT_ONCE, SMOOTH_EVERY
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.steps.step import TrainingStep
 from gsplat_core.training.strategies import streaming
+from tests.gsplat_core.training.two_eyes import LEFT, stereo_frame
 
 CONFIG = ReconstructorConfig(field="basis", gaussians=300, max_gaussians=500, squared_error=True)
 
@@ -153,6 +154,14 @@ def test_every_second_step_of_frames_with_depth_trains_colours(tissue_video, cam
     values = [value for value, _ in relaxations(camera, still, 40, monkeypatch)]
     assert all(values[22::2])
     assert not any(values[21::2])
+
+
+def test_colours_of_the_right_eye_are_trained_to_the_end(monkeypatch):
+    config = dataclasses.replace(CONFIG, eyes="both")
+    still = [dataclasses.replace(stereo_frame(0), seq=seq, pts_ns=seq * 33_000_000) for seq in range(4)]
+    found = relaxations(LEFT, still, 40, monkeypatch, config)
+    assert {value for value, one in found if one.of_right} == {0.0}
+    assert max(value for value, one in found if not one.of_right) > 0.5
 
 
 def test_correction_of_colours_fits_detail_that_training_has_not_reached(tissue_video, camera):
