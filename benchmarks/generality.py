@@ -15,6 +15,7 @@ import json
 import shlex
 import statistics
 import sys
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
@@ -118,6 +119,12 @@ def value(result: Mapping[str, Any], path: str) -> float | None:
     for key in path.split("."):
         found = found.get(key) if isinstance(found, Mapping) else None
     return float(found) if isinstance(found, int | float) else None
+
+
+def _runs(lines: Iterable[Mapping[str, Any]]) -> str:
+    """Return the number of runs of each recording, as a range if they differ."""
+    counts = Counter(line["recording"] for line in lines).values()
+    return str(max(counts)) if min(counts) == max(counts) else f"{min(counts)} to {max(counts)}"
 
 
 def cell(results: Iterable[Mapping[str, Any]], path: str, *, digits: int = 1, worst: str = "min") -> str:
@@ -226,7 +233,7 @@ def generality_text(folder: Path = FOLDER) -> str:
         "RECORDINGS` runs the default commands on every recording of a folder. A figure is the median over the runs, with the worst run in brackets. PSNR is over "
         "tissue. The displayed frame was trained on before it is shown, so its PSNR is a training error. Differences to the previous frame are of single frames after "
         "the first second. Without a GPU, live chooses the size at which the machine keeps up; in small pictures the previous frame scores more. A late frame "
-        "is one whose own picture was not on the screen when the next frame arrived. The picture of a withheld frame shows the content of an earlier one; ages of used frames leave such pictures out. Five offline runs shared the GPU and the processor, so their durations are upper bounds. On another machine, whose processors stall, ages and worst frames were worse ([live.md](live.md#hosts-whose-processors-stall)).",
+        "is one whose own picture was not on the screen when the next frame arrived. The picture of a withheld frame shows the content of an earlier one; ages of used frames leave such pictures out. On another machine, whose processors stall, ages and worst frames were worse ([live.md](live.md#hosts-whose-processors-stall)).",
     ]
     for device, lines in lines_of(folder).items():
         name = "one GPU" if device == "cuda" else "two CPU cores"
@@ -250,7 +257,7 @@ def generality_text(folder: Path = FOLDER) -> str:
             gpu = f"{about['gpu']}, " if "gpu" in about else ""
             parts.append(
                 f"Measured at commit {own[0]['commit']}, {own[0]['date']}, {gpu}{about['cores']} cores of {about['cpu']}, torch {about['torch']}; "
-                f"{max(line['run'] for line in own)} runs of `{own[0]['command']}` and the same for the other recordings."
+                f"{_runs(own)} runs of `{own[0]['command']}` and the same for the other recordings."
             )
     if len(parts) == 2:
         parts.append("Not measured yet.")
