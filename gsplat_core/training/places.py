@@ -5,7 +5,6 @@ one.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -36,8 +35,47 @@ LEAST_SHARE = 0.3
 """Smallest share of the picture that must be both tissue and covered by the left scene."""
 
 
-Look: TypeAlias = tuple[NDArray[np.float32], NDArray[np.float32]]
-"""Small picture of a scene: colours [H, W, 3] in 0..1, and opacity or share of tissue [H, W]."""
+@dataclass(frozen=True)
+class Structure:
+    """Band-pass filtered small picture, which is compared with others.
+
+    Noise, illumination, gain and offset of its channels have no effect on comparisons.
+    """
+
+    values: NDArray[np.float32]
+    """Filtered colours [H, W, 3]; only those of known pixels are meaningful."""
+    known: NDArray[np.bool_]
+    """[H, W]; True where the picture shows tissue."""
+
+    @classmethod
+    def of(cls, image: NDArray[np.float32], known: NDArray[np.bool_]) -> Structure:
+        """Filter a picture.
+
+        Args:
+            image: colours [H, W, 3] in 0..1, `COMPARED_PX` wide.
+            known: [H, W]; other pixels have no effect.
+        """
+        weight = known.astype(np.float32)
+        image = np.asarray(image, np.float32) * weight[..., None]
+        near = _blurred(image, FINE_PX) / (_blurred(weight, FINE_PX) + 1e-6)[..., None]
+        far = _blurred(image, COARSE_PX) / (_blurred(weight, COARSE_PX) + 1e-6)[..., None]
+        return cls(near - far, known)
+
+    def likeness(self, other: Structure) -> float:
+        """Return the correlation with another structure of the same size, -1 to 1, where both are known: the mean over
+        the channels. 0 if too little is known.
+        """
+        known = self.known & other.known
+        if np.count_nonzero(known) < LEAST_SHARE * known.size:
+            return 0.0
+        at = np.flatnonzero(known)
+        of_channels = []
+        for channel in range(3):
+            first, second = (each.values[..., channel].reshape(-1)[at] for each in (self, other))
+            first, second = first - first.mean(), second - second.mean()
+            norm = float(np.linalg.norm(first) * np.linalg.norm(second))
+            of_channels.append(float(first @ second) / norm if norm > 1e-6 else 0.0)
+        return float(np.mean(of_channels))
 
 
 @dataclass
@@ -50,18 +88,20 @@ class Place:
     """Camera that last observed this scene."""
     left_s: float
     """Time in seconds when the stream left this scene."""
-    _looks: dict[Camera, Look] = field(default_factory=dict, repr=False)
+    _seen: dict[Camera, Structure] = field(default_factory=dict, repr=False)
 
-    def look(self, camera: Camera) -> Look:
-        """Return the left scene `COMPARED_PX` wide. It is rendered unless the last look was from the same camera."""
-        if camera not in self._looks:
+    def structure(self, camera: Camera) -> Structure:
+        """Return the structure of the left scene from a camera. It is rendered unless the last one was from the same
+        camera.
+        """
+        if camera not in self._seen:
             with torch.no_grad():
                 output = render(self.gaussians, camera.scaled(RENDERED_PX / camera.width_px), depth=False)
             size = compared_size(camera.width_px, camera.height_px)
             pictures = (output.image.numpy(), output.alpha.numpy())
             image, alpha = (cv2.resize(picture, size, interpolation=cv2.INTER_AREA) for picture in pictures)
-            self._looks = {camera: (np.asarray(image, np.float32), np.asarray(alpha, np.float32))}
-        return self._looks[camera]
+            self._seen = {camera: Structure.of(np.asarray(image, np.float32), alpha > 0.5)}
+        return self._seen[camera]
 
 
 class Places:
@@ -74,17 +114,17 @@ class Places:
     def __len__(self) -> int:
         return len(self._left)
 
-    def leave(self, gaussians: Gaussians, camera: Camera, time_s: float, look: Look | None = None) -> None:
+    def leave(self, gaussians: Gaussians, camera: Camera, time_s: float, seen: Structure | None = None) -> None:
         """Keep a copy of a scene in host memory.
 
         Args:
             gaussians: last state of the scene.
             camera: camera that last observed the scene.
             time_s: time of the copy in seconds.
-            look: small picture of the scene from that camera; None to render it when it is needed.
+            seen: structure of a picture of the scene from that camera; None to render it when it is needed.
         """
         kept = gaussians.map(lambda tensor: tensor.detach().to("cpu", torch.float32, copy=True))
-        place = Place(kept, camera, time_s, {} if look is None else {camera: look})
+        place = Place(kept, camera, time_s, {} if seen is None else {camera: seen})
         self._left = [*self._left, place][-self._most :] if self._most else []
 
     def take(self, frame: Frame) -> Place | None:
@@ -93,20 +133,29 @@ class Places:
         Each left scene is seen from the frame's pose or, without a pose, from its last camera. The comparison ignores
         the frame's exposure and white balance.
         """
-        likeness = [self._likeness(place, frame) for place in self._left]
-        best = int(np.argmax(likeness)) if likeness else 0
-        return self._left.pop(best) if likeness and likeness[best] >= SAME_PLACE else None
+        if not self._left:
+            return None
+        shown = _shown(frame)
+        likeness = [place.structure(_seen_by(place, frame)).likeness(shown) for place in self._left]
+        best = int(np.argmax(likeness))
+        return self._left.pop(best) if likeness[best] >= SAME_PLACE else None
 
-    def _likeness(self, place: Place, frame: Frame) -> float:
-        camera = place.camera.resized(frame.width_px, frame.height_px)
-        image, alpha = place.look(camera if frame.pose is None else camera.with_pose(frame.pose))
-        size = compared_size(frame.width_px, frame.height_px)
-        shown = np.asarray(cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA), np.float32) / np.float32(255)
-        known = alpha > 0.5
-        for mask in (frame.mask, frame.loss_mask):
-            if mask is not None:
-                known &= cv2.resize((mask > 0).astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.5
-        return likeness_of(shown, image, known)
+
+def _seen_by(place: Place, frame: Frame) -> Camera:
+    """Return the camera from which a left scene is compared with a frame."""
+    camera = place.camera.resized(frame.width_px, frame.height_px)
+    return camera if frame.pose is None else camera.with_pose(frame.pose)
+
+
+def _shown(frame: Frame) -> Structure:
+    """Return the structure of the tissue in a frame."""
+    size = compared_size(frame.width_px, frame.height_px)
+    image = np.asarray(cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA), np.float32) / np.float32(255)
+    known = np.ones(image.shape[:2], bool)
+    for mask in (frame.mask, frame.loss_mask):
+        if mask is not None:
+            known &= cv2.resize((mask > 0).astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.5
+    return Structure.of(image, known)
 
 
 class LeftScenes:
@@ -135,7 +184,7 @@ class LeftScenes:
         The scene's newest observation stands for a rendering from its camera. Rendering would delay the first picture of
         the next scene by more than half a frame interval.
         """
-        self.places.leave(step.at(time_s), newest.camera, time_s, look_of(newest))
+        self.places.leave(step.at(time_s), newest.camera, time_s, structure_of(newest))
 
     def recognise(self, frame: Frame) -> bool:
         """Return True if the frame, which starts the next scene, shows a scene that the stream left before."""
@@ -163,44 +212,21 @@ class LeftScenes:
         return kept if kept.restart(gaussians, observation.time_s, observation.camera) else None
 
 
-def look_of(observation: Observation) -> Look | None:
-    """Return the small picture of an observation; None if it shows too little tissue to be compared."""
+def structure_of(observation: Observation) -> Structure | None:
+    """Return the structure of an observation's picture; None if it shows too little tissue to be compared."""
     camera = observation.camera
     planes = torch.cat([observation.image.permute(2, 0, 1) / 255, (observation.mask != 0).float()[None]])
     width, height = compared_size(camera.width_px, camera.height_px)
     small = HostCopy(interpolate(planes[None], size=(height, width), mode="area")[0].permute(1, 2, 0)).numpy()
-    tissue = np.ascontiguousarray(small[..., 3])
-    if np.count_nonzero(tissue > 0.5) < LEAST_SHARE * tissue.size:
+    tissue = small[..., 3] > 0.5
+    if np.count_nonzero(tissue) < LEAST_SHARE * tissue.size:
         return None
-    return np.ascontiguousarray(small[..., :3]), tissue
+    return Structure.of(np.ascontiguousarray(small[..., :3]), tissue)
 
 
 def compared_size(width_px: int, height_px: int) -> tuple[int, int]:
     """Return width and height at which pictures of this aspect ratio are compared."""
     return COMPARED_PX, max(1, round(COMPARED_PX * height_px / width_px))
-
-
-def likeness_of(first: NDArray[np.float32], second: NDArray[np.float32], known: NDArray[np.bool_]) -> float:
-    """Return the correlation, -1 to 1, of the structure of two pictures [H, W, 3] where `known` [H,
-    W]; 0 if too little is known.
-
-    Channels are compared separately, so gain and offset per channel have no effect.
-    """
-    if np.count_nonzero(known) < LEAST_SHARE * known.size:
-        return 0.0
-    weight = known.astype(np.float32)
-    near = _blurred(weight, FINE_PX) + 1e-6
-    far = _blurred(weight, COARSE_PX) + 1e-6
-    of_channels = []
-    for channel in range(3):
-        pair = []
-        for picture in (first, second):
-            values = picture[..., channel] * weight
-            structure = (_blurred(values, FINE_PX) / near - _blurred(values, COARSE_PX) / far)[known]
-            pair.append(structure - structure.mean())
-        norm = float(np.linalg.norm(pair[0]) * np.linalg.norm(pair[1]))
-        of_channels.append(float(pair[0] @ pair[1]) / norm if norm > 1e-6 else 0.0)
-    return float(np.mean(of_channels))
 
 
 def _blurred(plane: NDArray[np.float32], sigma_px: float) -> NDArray[np.float32]:

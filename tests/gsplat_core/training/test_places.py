@@ -14,7 +14,7 @@ from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.growth.initialisation import gaussians_from_frame
 from gsplat_core.training.metrics import psnr_tissue_db
 from gsplat_core.training.observations import Observation
-from gsplat_core.training.places import MOST_PLACES, Places, likeness_of, look_of
+from gsplat_core.training.places import MOST_PLACES, Places, Structure, structure_of
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.schedule import LiveTraining
 
@@ -77,11 +77,11 @@ def test_the_last_picture_stands_for_the_scene_where_the_camera_is_the_same():
     """Without a pose no scene is rendered: the picture decides, whatever the Gaussians are."""
     gaussians = gaussians_from_frame(frame_of(1), CAMERA, 400, sh_degree=0, default_depth_mm=60.0)
     places = Places()
-    places.leave(gaussians, CAMERA, 1.0, look_of(Observation.of(frame_of(2), CAMERA)))
+    places.leave(gaussians, CAMERA, 1.0, structure_of(Observation.of(frame_of(2), CAMERA)))
     assert places.take(frame_of(1)) is None
     assert places.take(frame_of(2)) is not None
     hidden = frame_of(2, mask=np.zeros((HEIGHT, WIDTH), np.uint8))
-    assert look_of(Observation.of(hidden, CAMERA)) is None
+    assert structure_of(Observation.of(hidden, CAMERA)) is None
 
 
 def test_a_pose_that_looks_elsewhere_does_not_show_the_place():
@@ -96,6 +96,11 @@ def test_black_white_and_mirrored_pictures_show_no_place(image):
     assert left(1, 2, 3).take(Frame(0, 0, np.ascontiguousarray(image, np.uint8))) is None
 
 
+def _structure(image, known=None):
+    known = np.ones(image.shape[:2], bool) if known is None else known
+    return Structure.of(np.asarray(image, np.float32) / 255, known)
+
+
 def mixed(likeness):
     """A picture of place 2 and of other tissue, mixed until it is as like the place as that."""
     places = left(2)
@@ -103,7 +108,7 @@ def mixed(likeness):
     for _ in range(30):
         share = (low + high) / 2
         image = np.rint(share * tissue(2) + (1 - share) * tissue(9)).astype(np.uint8)
-        if places._likeness(places._left[0], Frame(0, 0, image)) < likeness:
+        if places._left[0].structure(CAMERA).likeness(_structure(image)) < likeness:
             low = share
         else:
             high = share
@@ -127,11 +132,29 @@ def test_the_number_of_places_is_bounded():
 
 
 def test_likeness_of_too_little_is_none():
-    picture = np.asarray(tissue(1), np.float32)
     known = np.zeros((HEIGHT, WIDTH), bool)
-    assert likeness_of(picture, picture, known) == 0.0
-    known[:] = True
-    assert likeness_of(picture, picture, known) == pytest.approx(1.0)
+    whole, unknown = _structure(tissue(1)), _structure(tissue(1), known)
+    assert whole.likeness(unknown) == unknown.likeness(whole) == 0.0
+    assert whole.likeness(whole) == pytest.approx(1.0)
+    grey = _structure(np.full_like(tissue(1), 90))
+    assert whole.likeness(grey) == pytest.approx(0.0, abs=1e-3), "a picture without structure is like none"
+
+
+def test_pixels_that_are_not_known_have_no_effect():
+    """The structure of the known part is that of the picture without the other part, up to the blur across the border."""
+    known = np.ones((HEIGHT, WIDTH), bool)
+    known[:, 40:] = False
+    picture, changed = tissue(1), tissue(1)
+    changed[:, 40:] = tissue(5)[:, 40:]
+    np.testing.assert_array_equal(_structure(picture, known).values, _structure(changed, known).values)
+    assert _structure(changed, known).likeness(_structure(picture)) > 0.97
+
+
+def test_the_likeness_of_channels_is_averaged():
+    """A channel that is inverted correlates with -1."""
+    inverted = tissue(1).copy()
+    inverted[..., 0] = 255 - inverted[..., 0]
+    assert _structure(tissue(1)).likeness(_structure(inverted)) == pytest.approx(1 / 3, abs=0.01)
 
 
 def reconstructor(device="cpu"):
@@ -223,10 +246,9 @@ def test_a_cut_captures_nothing_again(gpu):
 
 @pytest.mark.parametrize(("share", "is_known"), [(0.25, False), (0.35, True)])
 def test_a_place_is_compared_where_three_tenths_of_the_picture_are_known(share, is_known):
-    picture = np.asarray(tissue(1), np.float32)
     known = np.zeros((HEIGHT, WIDTH), bool)
     known[:, : round(share * WIDTH)] = True
-    assert (likeness_of(picture, picture, known) > 0.99) == is_known
+    assert (_structure(tissue(1), known).likeness(_structure(tissue(1), known)) > 0.99) == is_known
 
 
 def test_eight_places_are_kept_and_no_more():
