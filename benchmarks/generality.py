@@ -24,6 +24,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import suite
+from host_pauses import pauses_text
 
 FOLDER = suite.LOGS / "generality"
 VIDEOS = ("left.mp4", "video.mp4")
@@ -256,7 +257,7 @@ def generality_text(folder: Path = FOLDER) -> str:
             about = own[0]["machine"]
             gpu = f"{about['gpu']}, " if "gpu" in about else ""
             parts.append(
-                f"Measured at commit {own[0]['commit']}, {own[0]['date']}, {gpu}{about['cores']} cores of {about['cpu']}, torch {about['torch']}; "
+                f"Measured at commit {own[0]['commit']}, {own[0]['date']}, {gpu}{about['cores']} cores of {about['cpu']}, torch {about['torch']}{pauses_text(about)}; "
                 f"{_runs(own)} runs of `{own[0]['command']}` and the same for the other recordings."
             )
     if len(parts) == 2:

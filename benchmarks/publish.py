@@ -26,6 +26,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent / "gsplat"))
 
 from accepted import methods_text
 from generality import generality_text
+from host_pauses import pauses_text
 from results import gsplat_text
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -88,8 +89,9 @@ class Row:
 
     Attributes:
         what: first cell.
-        log: `DEVICE/NAME` of the log.
+        log: `DEVICE/NAME` of the log, or `generality/DEVICE`.
         where: values that a result must have to be this row's; needed where a log holds results of several kinds.
+        line: values that the log line must have to be this row's; needed where a log holds several commands.
         asked: the requirement in words; empty if there is none.
         front: part of the README's table.
     """
@@ -97,6 +99,7 @@ class Row:
     what: str
     log: str
     where: Mapping[str, Any] = field(default_factory=dict)
+    line: Mapping[str, Any] = field(default_factory=dict)
     asked: str = ""
     front: bool = False
 
@@ -165,6 +168,13 @@ STREAM_COLUMNS = (
     db("worst of these frames", "retention_worst_db"),
     db("previous frame", "previous_frame_db", better=None),
 )
+ROOM_COLUMNS = (
+    db("displayed frame (training error)", "displayed_db"),
+    db("previous frame", "previous_frame_db", better=None),
+    ms("age p99 after the first second", "age_p99_ms"),
+    Column("late frames", "late", 0, better="less"),
+    Column("frames", "frames", 0),
+)
 
 
 LIVE_FRONT = (
@@ -177,7 +187,12 @@ LIVE_FRONT = (
 
 
 def kernel(log: str, work: str, asked: str = "", front: bool = False) -> Row:
-    return Row(work, f"cuda/{log}", {"work": work}, asked, front)
+    return Row(work, f"cuda/{log}", {"work": work}, asked=asked, front=front)
+
+
+def every_recording(what: str, device: str, part: str, recording: str, asked: str = "", front: bool = False) -> Row:
+    """Return the row of a recording that `generality.py` measured with the default command."""
+    return Row(what, f"generality/{device}", line={"part": part, "recording": recording}, asked=asked, front=front)
 
 
 TABLES = (
@@ -189,14 +204,14 @@ TABLES = (
         "recording",
         LIVE_COLUMNS,
         (
-            Row("`cutting`, 30 frames/s", "cuda/live_cutting", asked="42.5 dB, worst 37, p99 33 ms", front=True),
+            every_recording("`cutting`, 30 frames/s", "cuda", "live", "cutting", "42.5 dB, worst 37, p99 33 ms", True),
             Row("`cutting`, 60 frames/s", "cuda/live_cutting_60", asked="40 dB, p99 25 ms"),
-            Row("`heart`, left eye, 30 frames/s", "cuda/live_heart", asked="37 dB, worst 30", front=True),
-            Row("`sinus`, 30 frames/s", "cuda/live_sinus", asked="38 dB"),
-            Row("`resting_bowel`, 30 frames/s", "cuda/live_resting_bowel", asked="32 dB"),
-            Row("`laparoscopy`, 30 frames/s", "cuda/live_laparoscopy", front=True),
+            every_recording("`heart`, left eye, 30 frames/s", "cuda", "live", "heart", "37 dB, worst 30", True),
+            every_recording("`sinus`, 30 frames/s", "cuda", "live", "sinus", "38 dB"),
+            every_recording("`resting_bowel`, 30 frames/s", "cuda", "live", "others/resting_bowel", "32 dB"),
+            every_recording("`laparoscopy`, 30 frames/s", "cuda", "live", "others/laparoscopy", "33 dB", True),
             Row("`laparoscopy`, 60 frames/s", "cuda/live_laparoscopy_60"),
-            Row("`stereomis_like`, 30 frames/s", "cuda/live_stereomis_like"),
+            every_recording("`stereomis_like`, 30 frames/s", "cuda", "live", "others/stereomis_like", "36 dB, worst 25"),
             Row("`cutting`, HexPlane field", "cuda/live_cutting_hexplane"),
         ),
         LIVE_FRONT,
@@ -207,9 +222,9 @@ TABLES = (
         "recording",
         LIVE_COLUMNS,
         (
-            Row("`cutting`, 30 frames/s", "cpu/live_cutting", asked="34 dB, p99 150 ms", front=True),
-            Row("`heart`, left eye, 30 frames/s", "cpu/live_heart"),
-            Row("`resting_bowel`, 30 frames/s", "cpu/live_resting_bowel"),
+            every_recording("`cutting`, 30 frames/s", "cpu", "live", "cutting", "34 dB, p99 150 ms", True),
+            every_recording("`heart`, left eye, 30 frames/s", "cpu", "live", "heart"),
+            every_recording("`resting_bowel`, 30 frames/s", "cpu", "live", "others/resting_bowel"),
         ),
         LIVE_FRONT,
     ),
@@ -221,6 +236,13 @@ TABLES = (
         tuple(
             Row(f"`{name}`", f"cuda/stream_{name}", asked="36 dB") for name in ("cutting", "heart", "resting_bowel")
         ),
+    ),
+    Table(
+        "Several rooms, one GPU",
+        "Several `intrasplat live RECORDING --fps 30 --loop` at once, for 15 s (`rooms.py`). Each figure is that of the worst room of a run.",
+        "recording",
+        ROOM_COLUMNS,
+        (Row("`cutting`, four rooms", "cuda/rooms_cutting", asked="43 dB, p99 33 ms, 1 late"),),
     ),
     Table(
         "Replay",
@@ -243,11 +265,11 @@ TABLES = (
         "recording",
         OFFLINE_COLUMNS,
         (
-            Row("`cutting`", "cuda/reconstruct_cutting", front=True),
+            every_recording("`cutting`", "cuda", "offline", "cutting", front=True),
             Row("`cutting`, `--steps 16000`", "cuda/reconstruct_cutting_16000", asked="40.0 dB in 15 s"),
-            Row("`heart`, left eye", "cuda/reconstruct_heart", front=True),
-            Row("`sinus`", "cuda/reconstruct_sinus", asked="33 dB", front=True),
-            Row("`organ_still`, eight equal stereo frames", "cuda/reconstruct_organ_still", asked="48 dB"),
+            every_recording("`heart`, left eye", "cuda", "offline", "heart", front=True),
+            every_recording("`sinus`", "cuda", "offline", "sinus", "33 dB", True),
+            every_recording("`organ_still`, eight equal stereo frames", "cuda", "offline", "others/organ_still", "48 dB"),
         ),
         ("held-out frames", "neighbours' mean", "whole command"),
     ),
@@ -276,10 +298,10 @@ TABLES = (
             kernel("render", "volume1m_1080p forward+backward", "1.8 ms", front=True),
             kernel("render", "volume4m_4k forward", "1.5 ms"),
             kernel("render", "volume4m_4k forward+backward", "7 ms"),
-            Row("`rasterization()`, surgical50k_640x512 forward", "cuda/rasterization", {"work": "surgical50k_640x512 forward"}, "0.35 ms"),
-            Row("`rasterization()`, surgical50k_640x512 forward+backward", "cuda/rasterization", {"work": "surgical50k_640x512 forward+backward"}, "1.2 ms"),
-            Row("`rasterization()`, volume1m_1080p forward", "cuda/rasterization", {"work": "volume1m_1080p forward"}, "0.9 ms"),
-            Row("`rasterization()`, volume1m_1080p forward+backward", "cuda/rasterization", {"work": "volume1m_1080p forward+backward"}, "2.8 ms"),
+            Row("`rasterization()`, surgical50k_640x512 forward", "cuda/rasterization", {"work": "surgical50k_640x512 forward"}, asked="0.35 ms"),
+            Row("`rasterization()`, surgical50k_640x512 forward+backward", "cuda/rasterization", {"work": "surgical50k_640x512 forward+backward"}, asked="1.2 ms"),
+            Row("`rasterization()`, volume1m_1080p forward", "cuda/rasterization", {"work": "volume1m_1080p forward"}, asked="0.9 ms"),
+            Row("`rasterization()`, volume1m_1080p forward+backward", "cuda/rasterization", {"work": "volume1m_1080p forward+backward"}, asked="2.8 ms"),
             kernel("training", "training step, basis, 40000 Gaussians of degree 0, 640x512", "0.4 ms", front=True),
             kernel("training", "training step, small, 50000 Gaussians of degree 0, 640x512", "0.6 ms"),
             kernel("deformation", "deform, hexplane 85M, fp32, 50000 Gaussians"),
@@ -308,9 +330,14 @@ def log_lines(log: str, logs: Path = LOGS) -> list[dict[str, Any]]:
     return lines
 
 
+def lines_of(row: Row, logs: Path = LOGS) -> list[dict[str, Any]]:
+    """Return the lines of the row's log that have the values in `row.line`."""
+    return [line for line in log_lines(row.log, logs) if all(line.get(key) == value for key, value in row.line.items())]
+
+
 def results_of(row: Row, logs: Path = LOGS) -> list[dict[str, Any]]:
-    """Return the results of the row's log that have the values in `row.where`."""
-    found = [line["result"] for line in log_lines(row.log, logs) if "result" in line]
+    """Return the results of the row's lines that have the values in `row.where`."""
+    found = [line["result"] for line in lines_of(row, logs) if "result" in line]
     return [result for result in found if all(result.get(key) == value for key, value in row.where.items())]
 
 
@@ -337,13 +364,14 @@ def table_text(table: Table, logs: Path = LOGS, front: bool = False) -> str:
 
 def provenance(table: Table, logs: Path = LOGS) -> str:
     """Return a sentence for each machine and commit at which the table's figures were measured."""
-    lines = [line for log in dict.fromkeys(row.log for row in table.rows) for line in log_lines(log, logs)]
     measured: dict[str, set[str]] = {}
-    for line in lines:
+    for line in (line for row in table.rows for line in lines_of(row, logs)):
         about = line["machine"]
         gpu = f"{about['gpu']}, " if "gpu" in about else ""
         name = f"{gpu}{about['cores']} cores of {about['cpu']}, {about['instruction_set']}, torch {about['torch']}"
-        measured.setdefault(f"commit {line['commit']}, {line['date']}, {name}", set()).add(line["benchmark"])
+        measured.setdefault(f"commit {line['commit']}, {line['date']}, {name}{pauses_text(about)}", set()).add(
+            line["benchmark"]
+        )
     if len(measured) == 1:
         return f"Measured at {next(iter(measured))}."
     return " ".join(f"{', '.join(sorted(names))}: measured at {what}." for what, names in sorted(measured.items()))
@@ -351,7 +379,7 @@ def provenance(table: Table, logs: Path = LOGS) -> str:
 
 def front_gpus(table: Table, logs: Path = LOGS) -> str:
     """Return the names of the GPUs on which the README's rows of a table were measured; empty for none."""
-    machines = [line["machine"] for row in table.rows if row.front for line in log_lines(row.log, logs)]
+    machines = [line["machine"] for row in table.rows if row.front for line in lines_of(row, logs)]
     return ", ".join(sorted({machine["gpu"] for machine in machines if "gpu" in machine}))
 
 
@@ -361,7 +389,7 @@ def failures(logs: Path = LOGS) -> list[str]:
     for row in (row for table in TABLES for row in table.rows):
         found += [
             f"- {row.log}, run {line['run']}: exit code {line['exit_code']}"
-            for line in log_lines(row.log, logs)
+            for line in lines_of(row, logs)
             if "exit_code" in line
         ]
     return sorted(set(found))

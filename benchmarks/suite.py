@@ -1,13 +1,13 @@
 """Run the published benchmarks and write a log line for every result.
 
     python benchmarks/suite.py --device cpu                       # as in `make bench`
-    python benchmarks/suite.py --device cuda --minutes 9 --only live_cutting live_heart
+    python benchmarks/suite.py --device cuda --minutes 9 --only replay_cutting rooms_cutting
     python benchmarks/suite.py --device cuda --list
 
 `BENCHMARKS` defines all published benchmarks: name, command and number of runs. Each JSON line
 printed by a command becomes a line of `benchmarks/logs/DEVICE/NAME.jsonl`, with command, commit,
 machine, date and run number. `publish.py` generates RESULTS.md from these logs alone. A benchmark
-replaces its own earlier log. All benchmarks run once before any runs again, so a time limit leaves
+replaces its own earlier log. The default live and offline commands are measured by `generality.py`. All benchmarks run once before any runs again, so a time limit leaves
 at least one run of each.
 """
 
@@ -27,6 +27,10 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+from host_pauses import host_pauses
 
 ROOT = Path(__file__).resolve().parent.parent
 LOGS = ROOT / "benchmarks" / "logs"
@@ -66,31 +70,25 @@ def plain(name: str, device: str, command: str, recording: str, *options: str, r
     return Benchmark(name, shlex.join(words).replace("'", ""), device, runs)
 
 
-LIVE = {
-    "cutting": "cutting", "heart": "heart/left.mp4", "sinus": "sinus", "resting_bowel": "others/resting_bowel/video.mp4",
-    "laparoscopy": "others/laparoscopy/video.mp4", "stereomis_like": "others/stereomis_like/video.mp4",
-}  # fmt: skip
-"""Recordings of the live benchmarks, all at 30 frames/s."""
-OFFLINE = {"cutting": "cutting", "heart": "heart/left.mp4", "sinus": "sinus", "organ_still": "others/organ_still"}
-REPLAYED = {"cutting": "cutting", "sinus": "sinus", "resting_bowel": LIVE["resting_bowel"]}
+OTHERS = {name: f"others/{name}/video.mp4" for name in ("resting_bowel", "laparoscopy")}
+REPLAYED = {"cutting": "cutting", "sinus": "sinus", "resting_bowel": OTHERS["resting_bowel"]}
 
 BENCHMARKS = (
-    *(plain(f"live_{name}", "cuda", "live", path, "--fps", "30") for name, path in LIVE.items()),
     plain("live_cutting_60", "cuda", "live", "cutting", "--fps", "60"),
-    plain("live_laparoscopy_60", "cuda", "live", LIVE["laparoscopy"], "--fps", "60"),
+    plain("live_laparoscopy_60", "cuda", "live", OTHERS["laparoscopy"], "--fps", "60"),
     plain("live_cutting_hexplane", "cuda", "live", "cutting", "--field", "hexplane", runs=1),
     *(plain(f"replay_{name}", "cuda", "replay", path) for name, path in REPLAYED.items()),
     plain("replay_sinus_no_depth", "cuda", "replay", "sinus", "--depth", "none"),
-    *(plain(f"reconstruct_{name}", "cuda", "reconstruct", path) for name, path in OFFLINE.items()),
     plain("reconstruct_cutting_16000", "cuda", "reconstruct", "cutting", "--steps", "16000", runs=1),
     *(
         Benchmark(f"stream_{name}", f"benchmarks/endless.py {{recordings}}/{path} --clock --once --device cuda", "cuda")
         for name, path in {
             "cutting": "cutting",
             "heart": "heart/left.mp4",
-            "resting_bowel": LIVE["resting_bowel"],
+            "resting_bowel": OTHERS["resting_bowel"],
         }.items()
     ),
+    Benchmark("rooms_cutting", "benchmarks/rooms.py {recordings}/cutting --rooms 4 --device cuda", "cuda"),
     Benchmark("render", "benchmarks/gpu_splat.py", "cuda", runs=1),
     Benchmark("rasterization", "benchmarks/gpu_eager.py", "cuda", runs=1),
     Benchmark("training", "benchmarks/gpu_training.py", "cuda", runs=1),
@@ -98,10 +96,6 @@ BENCHMARKS = (
     plain("replay_cutting", "cpu", "replay", "cutting"),
     plain("replay_sinus", "cpu", "replay", "sinus"),
     plain("replay_cutting_hexplane", "cpu", "replay", "cutting", "--field", "hexplane", runs=1),
-    *(
-        plain(f"live_{name}", "cpu", "live", LIVE[name], "--fps", "30")
-        for name in ("cutting", "heart", "resting_bowel")
-    ),
     Benchmark("render", "benchmarks/splat_cpu.py", "cpu", runs=1),
     Benchmark("training", "benchmarks/training_cpu.py", "cpu", runs=1),
     Benchmark("deformation", "benchmarks/deformation_cpu.py", "cpu", runs=1),
@@ -152,7 +146,7 @@ def machine(device: str) -> dict[str, Any]:
     cpu = next((line.split(":")[1].strip() for line in _lines("/proc/cpuinfo") if line.startswith("model name")), "?")
     stated = {
         "cpu": cpu, "cores": len(os.sched_getaffinity(0)), "instruction_set": instruction_set(),
-        "python": platform.python_version(), "torch": torch.__version__,
+        "python": platform.python_version(), "torch": torch.__version__, "pauses": host_pauses(),
     }  # fmt: skip
     if device == "cuda":
         stated["gpu"] = torch.cuda.get_device_name(0)

@@ -59,6 +59,38 @@ def test_a_figure_is_the_median_with_the_worst_run_and_their_number(tmp_path):
     assert publish.table_text(TABLE, folder).splitlines()[-1] == "| one | 40.0 (30.0; 3) dB | 11 (20; 3) ms |"
 
 
+def test_a_row_takes_the_lines_of_its_command_alone(tmp_path):
+    (tmp_path / "generality").mkdir()
+    lines = [
+        json.dumps(LINE | {"part": part, "recording": recording, "result": {"live": {"db": db}}})
+        for part, recording, db in (("live", "a", 31.0), ("live", "b", 32.0), ("offline", "a", 33.0))
+    ]
+    (tmp_path / "generality" / "cpu.jsonl").write_text("\n".join(lines), encoding="utf-8")
+    row = publish.every_recording("one", "cpu", "live", "a")
+    assert publish.results_of(row, tmp_path) == [{"live": {"db": 31.0}}]
+    assert publish.results_of(publish.every_recording("one", "cpu", "live", "c"), tmp_path) == []
+
+
+def test_interruptions_of_the_machine_are_stated_with_its_figures(tmp_path):
+    folder = written(tmp_path, {"live": {"db": 40.0}})
+    assert "interrupted" not in publish.provenance(TABLE, folder)
+    pauses = {
+        "1": {"longest_ms": 2.4, "long_per_s": 0.0, "share": 0.001},
+        "6": {"longest_ms": 31.6, "long_per_s": 1.52, "share": 0.1},
+    }
+    line = LINE | {"machine": LINE["machine"] | {"pauses": pauses}, "result": {"live": {"db": 40.0}}}
+    (folder / "cpu" / "x.jsonl").write_text(json.dumps(line), encoding="utf-8")
+    assert (
+        "which interrupted 1 busy loop for up to 2 ms (0.0 times per second for more than 5 ms)"
+        " and 6 busy loops for up to 32 ms (1.5 times per second for more than 5 ms)"
+    ) in publish.provenance(TABLE, folder)
+
+
+def test_interruptions_are_shares_of_the_time():
+    found = script("host_pauses").interruptions(2, 0.1)
+    assert 0 <= found["share"] <= 1.5 and found["longest_ms"] >= 0 and found["long_per_s"] >= 0
+
+
 def test_another_value_in_a_log_changes_the_table(tmp_path):
     before = publish.table_text(TABLE, written(tmp_path, {"live": {"db": 40.0}}))
     assert "40.0" in before
@@ -79,7 +111,7 @@ def test_a_line_without_its_commit_is_refused(tmp_path):
 
 
 def test_every_row_is_read_from_a_log_that_the_suite_writes():
-    known = {f"{each.device}/{each.name}" for each in suite.BENCHMARKS}
+    known = {f"{each.device}/{each.name}" for each in suite.BENCHMARKS} | {"generality/cpu", "generality/cuda"}
     named = {row.log for table in publish.TABLES for row in table.rows}
     assert named <= known
 

@@ -1,0 +1,76 @@
+"""Measure for how long this machine interrupts busy loops, a lower bound for the delays of live pictures.
+
+    python benchmarks/host_pauses.py
+
+Some processes read the clock without pause, first one alone, then as many as a live stream has busy threads. On an idle machine with
+enough cores, none of them waits for more than a fraction of a millisecond.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Mapping
+from typing import Any
+
+SECONDS = 3.0
+LEAST_MS = 0.1
+"""Shortest interruption that counts, in milliseconds."""
+LONG_MS = 5.0
+"""Interruption from which a picture is noticeably late, in milliseconds."""
+STREAM_THREADS = 6
+"""Threads of a live stream that are busy at the same time: source, three for analysis, training and display."""
+
+LOOP = """
+import json, sys, time
+seconds, least_ns = float(sys.argv[1]), int(float(sys.argv[2]) * 1e6)
+last = time.perf_counter_ns()
+end, pauses = last + int(seconds * 1e9), []
+while last < end:
+    now = time.perf_counter_ns()
+    if now - last > least_ns:
+        pauses.append((now - last) / 1e6)
+    last = now
+print(json.dumps(pauses))
+"""
+
+
+def interruptions(processes: int, seconds: float = SECONDS) -> dict[str, float]:
+    """Return the interruptions of several busy loops at the same time.
+
+    Returns:
+        longest_ms: longest interruption in milliseconds. long_per_s: number of interruptions over `LONG_MS` per process
+        and second. share: share of the time in interruptions over `LEAST_MS`.
+    """
+    words = [sys.executable, "-c", LOOP, str(seconds), str(LEAST_MS)]
+    running = [subprocess.Popen(words, stdout=subprocess.PIPE, text=True) for _ in range(processes)]
+    found = [json.loads(each.communicate()[0]) for each in running]
+    every = [pause for pauses in found for pause in pauses]
+    return {
+        "longest_ms": round(max(every, default=0.0), 2),
+        "long_per_s": round(sum(pause > LONG_MS for pause in every) / (processes * seconds), 3),
+        "share": round(sum(every) / (1e3 * processes * seconds), 4),
+    }
+
+
+def host_pauses() -> dict[str, Any]:
+    """Return the interruptions of one busy loop, and of as many as a live stream has busy threads and this machine has cores."""
+    threads = min(STREAM_THREADS, len(os.sched_getaffinity(0)))
+    return {"1": interruptions(1), str(threads): interruptions(threads)}
+
+
+def pauses_text(machine: Mapping[str, Any]) -> str:
+    """Return a clause about the interruptions of a logged machine; empty if they are not logged."""
+    if "pauses" not in machine:
+        return ""
+    found = [
+        f"{threads} busy loop{'s' if threads != '1' else ''} for up to {each['longest_ms']:.0f} ms ({each['long_per_s']:.1f} times per second for more than {LONG_MS:.0f} ms)"
+        for threads, each in machine["pauses"].items()
+    ]
+    return f", which interrupted {' and '.join(found)} while it was idle"
+
+
+if __name__ == "__main__":
+    print(json.dumps(host_pauses()))

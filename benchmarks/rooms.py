@@ -1,0 +1,65 @@
+"""Run several live streams at once on one GPU, as one server does for several operating rooms.
+
+    python benchmarks/rooms.py RECORDING --rooms 4 --device cuda
+
+Each room is an `intrasplat live` of its own, which loops the recording. Prints one JSON line: the figures of every room.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+PLAIN = Path(__file__).resolve().parent / "plain.py"
+
+
+def room(figures: dict[str, Any]) -> dict[str, Any]:
+    """Return the figures of one room from the line of `plain.py`."""
+    live = figures["live"]
+    return {
+        "displayed_db": live["settled_psnr_tissue_db"],
+        "worst_db": live["worst_psnr_tissue_db"],
+        "previous_frame_db": live["previous_frame_db"],
+        "age_p99_ms": live["settled_age_p99_ms"],
+        "late": live["not_on_screen"],
+        "frames": figures["frames"]["ingested"],
+    }
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("recording")
+    parser.add_argument("--rooms", type=int, default=4)
+    parser.add_argument("--seconds", type=float, default=15.0, help="duration of each stream")
+    parser.add_argument("--device", default="cuda")
+    options = parser.parse_args()
+    words = [sys.executable, str(PLAIN), "live", options.recording, "--device", options.device, "--fps", "30", "--loop"]
+    words += ["--seconds", str(options.seconds)]
+    running = [
+        subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) for _ in range(options.rooms)
+    ]
+    ended = [(each, *each.communicate()) for each in running]
+    for process, _, errors in ended:
+        if process.returncode != 0:
+            print(errors[-2000:], file=sys.stderr)
+            return int(process.returncode)
+    rooms = [room(json.loads(text)) for _, text, _ in ended]
+    summary = {
+        "rooms": len(rooms),
+        "displayed_db": min(each["displayed_db"] for each in rooms),
+        "previous_frame_db": rooms[0]["previous_frame_db"],
+        "age_p99_ms": max(each["age_p99_ms"] for each in rooms),
+        "late": max(each["late"] for each in rooms),
+        "frames": rooms[0]["frames"],
+        "each": rooms,
+    }
+    print(json.dumps(summary))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
