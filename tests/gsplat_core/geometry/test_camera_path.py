@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 import torch
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.poses.camera_path import MOVING_SHARE, CameraPath, camera_path_of, rigid_share
+from gsplat_core.poses import camera_path
+from gsplat_core.poses.camera_path import MOVING_SHARE, CameraPath, MotionTest, camera_path_of, rigid_share
+from gsplat_core.poses.odometry import Trajectory
 from gsplat_core.poses.se3 import exp
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import Frame
 from tests.gsplat_core.geometry.moving_scope import FIRST, SIDEWAYS, depth_of_surface, video
+from tests.gsplat_core.geometry.test_tracks import wide_texture
 
 
 @pytest.fixture(scope="module")
@@ -50,3 +56,141 @@ def test_the_path_has_the_unit_of_the_depth(frames):
 def test_a_path_of_many_frames_is_left_to_the_command(frames):
     with pytest.raises(InvalidInput, match="at most 600 frames, not for 601"):
         camera_path_of([frames[0]] * 601, FIRST)
+
+
+BLANK = np.zeros((8, 12, 3), np.uint8)
+
+
+def at_times(times_s, image=BLANK) -> list[Frame]:
+    return [Frame(number, round(each * 1e9), image) for number, each in enumerate(times_s)]
+
+
+@pytest.fixture
+def compared(monkeypatch):
+    """Replace the comparison of pictures: by the numbers of two frames it returns median motion and rest."""
+    pairs, answers = [], {}
+
+    def compare(first, second):
+        pairs.append((first.seq, second.seq))
+        return answers.get(first.seq, (10.0, 1.0))
+
+    monkeypatch.setattr(camera_path, "_compared", compare)
+    return pairs, answers
+
+
+@pytest.mark.parametrize(("rate_hz", "count", "gap"), [(10, 100, 3), (30, 100, 9), (2, 100, 1), (10, 3, 2), (10, 2, 1)])
+def test_twelve_pairs_of_frames_three_tenths_of_a_second_apart_are_compared(compared, rate_hz, count, gap):
+    times_s = [number / rate_hz for number in range(count)]
+    assert rigid_share(at_times(times_s)) == pytest.approx(0.99)
+    first, second = np.array(compared[0]).T
+    assert (second - first).tolist() == [gap] * len(first)
+    assert first[0] == 0 and second[-1] == count - 1
+    assert len(first) == min(12, count - gap) and (len(first) < 12 or np.ptp(np.diff(first)) <= 1)
+
+
+def test_frames_at_one_time_and_one_frame_have_no_motion(compared):
+    assert rigid_share(at_times([2.0] * 9)) == rigid_share(at_times([2.0])) == 0.0 and compared[0] == []
+    assert rigid_share(at_times([0, 0, 0.3, 0.3, 0.6, 0.6])) > 0 and compared[0][0] == (0, 1)
+
+
+@pytest.mark.parametrize(("motion_px", "share"), [(1.55, 0.0), (1.65, 0.75)])
+def test_half_a_per_cent_of_the_longer_side_counts_as_motion(compared, motion_px, share):
+    compared[1].update({number: (motion_px, motion_px / 2) for number in range(12)})
+    compared[1][0], compared[1][1] = (99.0, 0.0), (0.1, 0.1)
+    assert rigid_share(at_times([0.3 * number for number in range(9)])) == pytest.approx(share)
+    compared[1].update(dict.fromkeys(range(12)))
+    assert rigid_share(at_times([0.3 * number for number in range(9)])) == 0.0, "no point was found again"
+
+
+def test_a_stream_is_tested_by_its_five_newest_pairs(compared):
+    pairs, answers = compared
+    answers.update({0: (10.0, 10.0), 3: (10.0, 10.0), 6: (10.0, 5.0), 9: (10.0, 0.0), 12: (10.0, 0.0), 15: (10.0, 1.0)})
+    answers[18] = None
+    test = MotionTest()
+    shares = [test.share(each) for each in at_times([0.11 * number for number in range(22)])]
+    assert pairs == [(number, number + 3) for number in range(0, 21, 3)]
+    known = {number: share for number, share in enumerate(shares) if share is not None}
+    assert known == pytest.approx({9: 0.0, 12: 0.375, 15: 0.75, 18: 0.99})
+
+
+@pytest.mark.parametrize(("gap_s", "begun"), [(0.95, False), (1.05, True)])
+def test_a_stream_begins_anew_after_a_gap_of_a_second(compared, gap_s, begun):
+    times_s = [0.31 * number for number in range(4)]
+    test = MotionTest()
+    shares = [test.share(each) for each in at_times([*times_s, *(times_s[-1] + gap_s + each for each in times_s)])]
+    known = [number for number, share in enumerate(shares) if share is not None]
+    assert known == ([3, 7] if begun else [3, 4, 5, 6, 7])
+
+
+def test_a_stream_begins_anew_with_another_size(compared):
+    test = MotionTest()
+    first, later = (at_times([start + 0.31 * number for number in range(5)]) for start in (0.0, 1.55))
+    shares = [test.share(each) for each in [*first, *(each.with_fields(image=BLANK[:6].copy()) for each in later)]]
+    assert [number for number, share in enumerate(shares) if share is not None] == [3, 4, 8, 9]
+
+
+def moved(by_px: int, side_px: int) -> np.ndarray:
+    """Return a picture of a texture that is moved to the right."""
+    whole = cv2.resize(wide_texture(0), (2 * side_px, side_px))
+    return np.ascontiguousarray(whole[: side_px * 3 // 4, side_px // 2 - by_px :][:, :side_px])
+
+
+@pytest.mark.parametrize("side_px", [640, 320, 240])
+def test_motion_is_measured_in_pictures_of_320_pixels(side_px):
+    first, second = (Frame(number, 0, moved(6 * number, side_px)) for number in range(2))
+    pair = camera_path._compared(first, second)
+    assert pair is not None
+    assert pair[0] == pytest.approx(6 * 320 / side_px, abs=0.05) and pair[1] < 0.1
+
+
+def test_what_is_masked_is_not_compared():
+    """Tissue moves by 4 pixels in the left half. The right half stands still, or is a tool."""
+    picture, image = moved(0, 320), moved(4, 320)
+    image[:, 150:] = picture[:, 150:]
+    mask = np.ones(picture.shape[:2], np.uint8)
+    mask[:, 130:] = 0
+    masked, whole = (
+        camera_path._compared(Frame(0, 0, picture, mask=each), Frame(1, 0, image)) for each in (mask, None)
+    )
+    assert masked is not None and masked[0] == pytest.approx(4, abs=0.05) and masked[1] < 0.1
+    assert whole is not None and whole[0] < 2
+
+
+@pytest.mark.parametrize(("side_px", "found"), [(40, False), (90, True)])
+def test_two_dozen_points_must_be_found_again(side_px, found):
+    mask = np.zeros((240, 320), np.uint8)
+    mask[60 : 60 + side_px, 60 : 60 + side_px] = 1
+    pair = camera_path._compared(Frame(0, 0, moved(0, 320), mask=mask), Frame(1, 0, moved(2, 320)))
+    assert (pair is not None) == found
+    assert camera_path._compared(Frame(0, 0, moved(0, 320)), Frame(1, 0, np.full((240, 320, 3), 90, np.uint8))) is None
+
+
+def measured(times: float, count: int = 40, depth_confidence: np.ndarray | None = None) -> Frame:
+    """Return a frame whose depth at `count` points of the scene is a multiple of theirs, and unknown elsewhere."""
+    depth = np.full((90, 120), np.nan, np.float32)
+    depth[30, 30 : 30 + count] = times * np.linspace(1, 2, 60, dtype=np.float32)[:count]
+    return Frame(0, 0, np.zeros((90, 120, 3), np.uint8), depth=depth, depth_confidence=depth_confidence)
+
+
+def unit_of(*frames: Frame) -> float:
+    """Return the unit of a trajectory that stands still before 60 points in one row, and others that are not shown."""
+    camera = Camera(np.array([[100.0, 0, 60], [0, 100, 45], [0, 0, 1]]), 120, 90)
+    z = np.linspace(1, 2, 60)
+    shown = np.stack([(np.arange(30, 90) + 0.5 - 60) / 100 * z, np.full(60, (30.5 - 45) / 100) * z, z], 1)
+    hidden = np.array([[0.0, 0, -1], [5, 0, 1], [-5, 0, 1], [0, 5, 1], [0, -5, 1]])
+    poses = np.stack([np.eye(4)] * len(frames))
+    return camera_path._unit(frames, Trajectory(poses, np.concatenate([shown, hidden]), 0.1, 1.0, ()), camera)
+
+
+def test_the_unit_is_the_median_over_frames_of_the_ratio_of_depths():
+    none = Frame(0, 0, np.zeros((90, 120, 3), np.uint8))
+    assert unit_of(none) == 1.0 and unit_of(none, measured(30.0)) == pytest.approx(30, rel=1e-5)
+    assert unit_of(measured(20.0), measured(90.0), measured(30.0)) == pytest.approx(30, rel=1e-5)
+    assert unit_of(measured(20.0, 24)) == pytest.approx(20, rel=1e-5) and unit_of(measured(20.0, 23)) == 1.0
+    sure = np.zeros((90, 120), np.float32)
+    sure[:, 50:] = 1
+    known = measured(20.0, 60, sure)
+    spoilt = known.depth.copy()
+    spoilt[:, :50] *= 9
+    spoilt[:, 85:] = 0
+    assert unit_of(known.with_fields(depth=spoilt)) == pytest.approx(20, rel=1e-5)

@@ -4,23 +4,19 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import pytest
 
-from gsplat_core.geometry.reference_tracks import (
-    EVERY,
-    MOST_MISSES,
-    MOST_REFERENCES,
-    ReferenceTracks,
-    local_contrast,
-)
+from gsplat_core.geometry.reference_tracks import MOST_MISSES, ReferenceTracks, local_contrast
+from gsplat_core.geometry.tracks import Observations
 from tests.gsplat_core.geometry.test_tracks import wide_texture
 
 HEIGHT, WIDTH = 150, 200
 
 
-def view(at: float, gain: float = 1.0) -> np.ndarray:
+def view(at: float, gain: float = 1.0, cell_px: int = 8) -> np.ndarray:
     """Return a picture of a texture, moved to the left by `at` pixels."""
     shift = np.array([[1, 0, -at - 20], [0, 1, -10]], np.float64)
-    moved = cv2.warpAffine(wide_texture(0), shift, (WIDTH, HEIGHT), flags=cv2.INTER_CUBIC)
+    moved = cv2.warpAffine(wide_texture(0, cell_px), shift, (WIDTH, HEIGHT), flags=cv2.INTER_CUBIC)
     return np.clip(gain * moved.astype(np.float64), 0, 255).astype(np.uint8)
 
 
@@ -69,14 +65,14 @@ def test_points_are_found_again_behind_a_tool():
     assert not ((column > 60) & (column < 130)).any()
 
 
-def test_references_are_renewed_and_limited():
-    tracks = ReferenceTracks()
-    for _ in range(EVERY * (MOST_REFERENCES + 2)):
-        tracks.follow(view(0), None)
-    seen = tracks.observations(3)
-    last = np.unique(seen.point[seen.frame == seen.frame.max()])
-    assert 0 < len(last) < len(np.unique(seen.point))
-    assert last.min() > 0, "points of the oldest reference are given up"
+def test_five_references_each_20_pictures_apart_are_found_at_once():
+    seen = followed_tracks(*[np.ascontiguousarray(view(0)[:90, :120])] * 102)
+    first = np.full(seen.point.max() + 1, 999)
+    np.minimum.at(first, seen.point, seen.frame)
+    assert np.unique(first).tolist() == [0, 20, 40, 60, 80, 100]
+    newest = seen.frame == 101
+    assert np.unique(first[seen.point[newest]]).tolist() == [20, 40, 60, 80, 100]
+    assert seen.frame[first[seen.point] == 0].max() == 100
 
 
 def test_another_scene_gets_new_points():
@@ -152,3 +148,141 @@ def test_points_are_found_near_a_thread_but_not_on_it():
     beside = np.abs(column[:, None] - threads - 0.5).min(1) - 0.5
     assert beside.min() > 2
     assert np.count_nonzero(beside <= 4) > 5
+
+
+def stripes(periods_px: dict[float, float], mean: float, shape: tuple[int, int] = (60, 300)) -> np.ndarray:
+    """Return a picture with vertical stripes: the standard deviation of the logarithm of brightness of each period."""
+    x = np.arange(shape[1])
+    bright = sum(spread * np.sqrt(2) * np.sin(2 * np.pi * x / period) for period, spread in periods_px.items())
+    levels = (mean + 8) * np.exp(bright) - 8
+    noise = np.random.default_rng(0).uniform(-0.5, 0.5, shape)  # so that rounding is no pattern
+    return np.clip(np.rint(levels + noise), 0, 255).astype(np.uint8)
+
+
+def strength(picture: np.ndarray, period_px: float) -> float:
+    """Return the standard deviation of a picture's stripes of a period in its middle two thirds."""
+    x = np.arange(50, 50 + int(200 // period_px * period_px))
+    rows = picture[10:-10, x].mean(0) - 128.0
+    return float(np.sqrt(2) * abs((rows * np.exp(-2j * np.pi * x / period_px)).mean()))
+
+
+@pytest.mark.parametrize(("spread", "share"), [(0.2, 1.0), (0.04, 2 / 5**0.5), (0.02, 0.5**0.5), (0.01, 1 / 5**0.5)])
+def test_contrast_far_above_two_per_cent_has_one_strength_and_weaker_one_less(spread, share):
+    """The squares of contrast and of noise, which is 0.02, add up."""
+    contrast = local_contrast(stripes({10: spread}, 150.0), np.ones((60, 300), bool))
+    assert strength(contrast, 10) == pytest.approx(40 * share, rel=0.1)
+
+
+def test_dark_pixels_have_less_contrast_than_their_ratio():
+    """By eight grey levels that are added before the logarithm."""
+    grey = np.tile(np.repeat(np.array([8, 9], np.uint8), 5), (60, 30))
+    contrast = local_contrast(grey, np.ones(grey.shape, bool)).astype(float)
+    spread = np.log(17 / 16) / 2
+    assert contrast[10:-10, 50:250].std() == pytest.approx(40 * spread / np.hypot(spread, 0.02), rel=0.04)
+
+
+@pytest.mark.parametrize("upright", [False, True])
+def test_brightness_that_varies_over_more_than_a_thirtieth_of_the_longer_side_is_removed(upright):
+    """A Gaussian window of 10 of 300 pixels passes a period p with the factor exp(-2 (10 pi / p)^2)."""
+    grey = stripes({60: 0.15, 10: 0.1}, 130.0)
+    usable = np.ones(grey.shape, bool)
+    contrast = local_contrast(np.ascontiguousarray(grey.T), usable.T).T if upright else local_contrast(grey, usable)
+    left = 1.5 * (1 - np.exp(-2 * (10 * np.pi / 60) ** 2))
+    assert strength(contrast, 60) / strength(contrast, 10) == pytest.approx(left, rel=0.15)
+
+
+def followed_tracks(*pictures: np.ndarray, masks: list[np.ndarray | None] | None = None) -> Observations:
+    """Return all observations of some pictures."""
+    tracks = ReferenceTracks()
+    for picture, mask in zip(pictures, masks or [None] * len(pictures), strict=True):
+        tracks.follow(picture, mask)
+    return tracks.observations(1)
+
+
+def nearest(pixels: np.ndarray) -> float:
+    return float((np.linalg.norm(pixels[:, None] - pixels[None], axis=2) + 999 * np.eye(len(pixels))).min())
+
+
+def test_a_reference_has_250_corners_a_fortieth_of_the_longer_side_and_4_pixels_apart():
+    wide = followed_tracks(wide_texture(0)).pixels
+    assert len(wide) == 250 and 16 <= nearest(wide) < 18
+    small = followed_tracks(np.ascontiguousarray(view(0)[:80, :120])).pixels
+    assert 4 <= nearest(small) < 5
+    at = small - 0.5
+    assert at.min() >= 8 and at[:, 0].max() <= 111 and at[:, 1].max() <= 71
+
+
+def test_a_picture_of_1280_pixels_is_halved_and_one_of_640_is_not():
+    """Corners are at the centres of pixels of the reduced picture."""
+    picture = wide_texture(1)
+    twice = cv2.resize(picture, (1280, 1024), interpolation=cv2.INTER_NEAREST)
+    np.testing.assert_array_equal(followed_tracks(twice).pixels, 2 * followed_tracks(picture).pixels)
+    assert (followed_tracks(picture).pixels % 1 == 0.5).all()
+
+
+@pytest.mark.parametrize(("pictures", "found"), [(15, True), (16, False)])
+def test_a_reference_is_given_up_after_it_was_missed_in_more_than_15_pictures(pictures, found):
+    blank = np.full((HEIGHT, WIDTH, 3), 90, np.uint8)
+    seen = followed_tracks(view(0), *[blank] * pictures, view(0))
+    first, last = seen.point[seen.frame == 0], seen.point[seen.frame == pictures + 1]
+    assert len(last) > 50 and np.isin(last, first).all() == found
+    assert found or not np.isin(last, first).any()
+
+
+@pytest.mark.parametrize(("share", "new"), [(0.5, False), (0.3, True)])
+def test_a_reference_of_which_less_than_four_tenths_are_found_is_renewed(share, new):
+    picture = view(0)
+    count = followed_tracks(picture).point.max() + 1
+    mask = np.ones((HEIGHT, WIDTH), np.uint8)
+    columns = np.sort(followed_tracks(picture).pixels[:, 0])
+    mask[:, int(columns[int(share * count)]) + 5 :] = 0
+    seen = followed_tracks(picture, picture, masks=[None, mask])
+    assert (seen.point.max() >= count) == new
+
+
+@pytest.mark.parametrize(("side_px", "found"), [(40, False), (50, True)])
+def test_two_dozen_corners_are_enough_for_a_reference(side_px, found):
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    mask[20 : 20 + side_px, 40 : 40 + side_px] = 1
+    count = len(followed_tracks(view(0), masks=[mask]).point)
+    assert 24 <= count < 48 if found else count == 0
+
+
+@pytest.mark.parametrize(("side_px", "found"), [(50, False), (60, True)])
+def test_two_dozen_corners_are_enough_to_find_a_reference(side_px, found):
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    mask[20 : 20 + side_px, 40 : 40 + side_px] = 1
+    seen = followed_tracks(view(0), view(0), masks=[None, mask])
+    first, second = (seen.point[seen.frame == frame] for frame in (0, 1))
+    count = np.isin(first, second).sum()
+    assert 24 <= count < 48 if found else count == 0
+
+
+def bulged(most_px: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return a picture of which a place of 45 pixels is moved to the right, and the motion of each pixel."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
+    motion = most_px * np.exp(-((x - 100) ** 2 + (y - 75) ** 2) / (2 * 45**2))
+    return cv2.remap(view(0), x - motion, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT), motion
+
+
+def test_points_are_found_where_the_tissue_moves_in_one_place():
+    seen = followed_tracks(*(bulged(each)[0] for each in (0, 2, 4, 6)))
+    first, last = (seen.of(seen.frame == frame) for frame in (0, 3))
+    last = last.of(last.point < len(first.point))
+    moved = last.pixels - first.pixels[last.point]
+    x, y = last.pixels.astype(int).T
+    assert np.abs(moved - np.stack([bulged(6)[1][y, x], np.zeros(len(x))], 1)).mean() < 0.1
+    middle = np.flatnonzero(((first.pixels - [100, 75]) ** 2).sum(1) < 20**2)
+    assert len(middle) >= 8 and np.isin(middle, last.point).mean() > 0.85
+
+
+@pytest.mark.parametrize(("move_px", "found"), [(0.5, True), (3.0, False)])
+def test_a_place_that_jumps_aside_has_no_points(move_px, found):
+    """A tool that is not in the mask moves alone, by more than a pixel off the smooth motion of the tissue."""
+    jumped = view(0).copy()
+    jumped[50:100, 75:125] = view(-move_px)[50:100, 75:125]
+    seen = followed_tracks(view(0), jumped)
+    first, second = (seen.of(seen.frame == frame) for frame in (0, 1))
+    inside = first.point[((first.pixels > [85, 60]) & (first.pixels < [115, 90])).all(1)]
+    share = np.isin(inside, second.point).mean()
+    assert len(inside) >= 5 and (share == 1 if found else share < 0.3)
