@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from gsplat_core.geometry.tracks import Observations
 from gsplat_core.poses import focal_length
-from gsplat_core.poses.bundle import Bundle
+from gsplat_core.poses.bundle import Bundle, errors_px
 from gsplat_core.poses.focal_length import (
     LEAST_POINTS,
     LONGEST,
@@ -162,3 +164,125 @@ def test_a_point_before_the_lens_is_an_outlier_however_far_the_scope_was_moved()
     kept = focal_length._without_outliers(bundle, 3.0)
     assert torch.equal(kept.points, points[:3])
     assert kept.point.tolist() == [0, 1, 2] * 3 and kept.camera.tolist() == [0] * 3 + [1] * 3 + [2] * 3
+
+
+def searched(monkeypatch, error_px, assumed_px: float) -> tuple[FocalLength, list[tuple[float, float]]]:
+    """Return the focal length found where the errors depend on it alone, and the tried ones with those they start from."""
+    tries = []
+
+    def with_focal(bundle, focal_px):
+        tries.append((focal_px, bundle.focal_px))
+        return replace(bundle, focal_px=focal_px)
+
+    monkeypatch.setattr(focal_length, "_with_focal", with_focal)
+    monkeypatch.setattr(focal_length, "_adjusted", lambda bundle, spread_px: bundle)
+    monkeypatch.setattr(
+        focal_length, "errors_px", lambda bundle: torch.full((100,), error_px(bundle.focal_px)).double()
+    )
+    start = Bundle(*(torch.zeros(0),) * 5, assumed_px)
+    return focal_length._search(start, 200.0), tries
+
+
+def bowl(steep: float):
+    """Return errors in pixels: half a pixel at 170, and more by the square of the logarithm of the ratio."""
+    return lambda focal_px: 0.5 + steep * np.log(focal_px / 170.0) ** 2
+
+
+def test_focal_lengths_are_tried_outwards_from_the_assumed_one(monkeypatch):
+    found, tries = searched(monkeypatch, bowl(3.0), assumed_px=210.0)
+    first = tries[:8]
+    asked = sorted(focal_px for focal_px, _ in first)
+    np.testing.assert_allclose(np.diff(np.log(asked)), np.log(1.6 / 0.6) / 7)
+    assert asked[0] == pytest.approx(120) and asked[-1] == pytest.approx(320)
+    longer, shorter = [each for each in asked if each >= 210], [each for each in asked if each < 210][::-1]
+    expected = [*zip(longer, [210.0, *longer], strict=False), *zip(shorter, [210.0, *shorter], strict=False)]
+    assert first == expected
+    assert len(tries) == 12 and found.assumed_px == 210
+    assert found.best_px == pytest.approx(170, rel=0.03)
+
+
+@pytest.mark.parametrize(
+    ("steep", "known", "ends"), [(3.0, True, (1.0, 1.5)), (0.11, True, (1.2, 1.5)), (0.05, False, (1.5, 2.6))]
+)
+def test_a_focal_length_is_known_if_the_plausible_ones_differ_by_less_than_half(monkeypatch, steep, known, ends):
+    """The robust cost at the ends of the range is one per cent above the least."""
+    found, _ = searched(monkeypatch, bowl(steep), assumed_px=200.0)
+    low, high = found.range_px
+    assert found.known == known and ends[0] < high / low < ends[1] and low < 170 < high
+
+
+def test_the_plausible_range_ends_where_the_cost_is_one_per_cent_higher():
+    tries = {
+        focal_px: focal_length._Try(None, cost) for focal_px, cost in ((50.0, 1.0), (100.0, 4.0), (200.0, 2.0), (400.0, 2.01), (800.0, 2.03))
+    }  # fmt: skip
+    low, high = focal_length._range(tries, 200.0)
+    assert low == pytest.approx(200 * 0.5**0.01) and high == pytest.approx(400 * 2**0.5)
+    assert focal_length._range({100.0: tries[200.0], 150.0: tries[200.0]}, 100.0) == (100.0, 150.0)
+
+
+def test_another_focal_length_shows_a_flat_scene_at_the_same_pixels():
+    random = np.random.default_rng(1)
+    points = torch.from_numpy(np.concatenate([random.uniform(-10, 10, (40, 2)), np.full((40, 1), 60.0)], 1))
+    poses = exp(torch.tensor([[0.0] * 6, [2, -1, 3, 0, 0, 0.2], [-3, 2, -4, 0, 0, -0.4]], dtype=torch.float64))
+    camera, point = torch.arange(3).repeat_interleave(40), torch.arange(40).repeat(3)
+    local = (poses[camera, :3, :3] @ points[point][:, :, None])[:, :, 0] + poses[camera, :3, 3]
+    bundle = Bundle(poses, points, camera, point, local[:, :2] / local[:, 2:], 300.0)
+    for focal_px in (200.0, 450.0):
+        other = focal_length._with_focal(bundle, focal_px)
+        assert float(errors_px(other).max()) < 1e-9
+        torch.testing.assert_close(other.rays * focal_px, bundle.rays * 300)
+        torch.testing.assert_close(other.points[:, 2], points[:, 2])
+    # A turn about a horizontal axis is about a shift of the picture, which is larger for a longer lens.
+    turned = replace(bundle, poses=exp(torch.tensor([[0.0, 0, 0, 0.02, -0.01, 0]] * 3, dtype=torch.float64)))
+    local = (turned.poses[camera, :3, :3] @ points[point][:, :, None])[:, :, 0]
+    turned = replace(turned, rays=local[:, :2] / local[:, 2:])
+    assert float(errors_px(focal_length._with_focal(turned, 450.0)).max()) < 0.3
+
+
+def test_points_are_triangulated_from_their_rays():
+    observations, trajectory = seen(orbit, 288.0)
+    poses, points = torch.from_numpy(trajectory.poses), torch.from_numpy(trajectory.points)
+    frame, number = torch.from_numpy(observations.frame), torch.from_numpy(observations.point)
+    local = (poses[frame, :3, :3] @ points[number][:, :, None])[:, :, 0] + poses[frame, :3, 3]
+    found = focal_length._triangulated(poses, frame, number, local[:, :2] / local[:, 2:], POINTS)
+    torch.testing.assert_close(found, points, atol=1e-4, rtol=0)
+
+
+def test_observations_far_off_and_points_seen_twice_are_no_start():
+    """Of 70 points, 4 are seen in two frames, and 5 in three with one observation of them 5 pixels off."""
+    observations, trajectory = seen(orbit, 288.0)
+    kept, rank = np.ones(len(observations.frame), bool), np.zeros(POINTS, int)
+    for place, number in enumerate(observations.point):
+        rank[number] += 1
+        kept[place] = rank[number] <= (2 if number < 4 else 3 if number < 9 else 99)
+    some = observations.of(kept)
+    for number in range(4, 9):
+        some.pixels[np.flatnonzero(some.point == number)[1]] += [3.0, -4.0]
+    far = np.flatnonzero((some.point == 30) & (some.frame == 5))
+    some.pixels[far] += [0.0, 5.0]
+    start = focal_length._start(some, Camera.from_focal(288.0, WIDTH, HEIGHT), trajectory)
+    assert start is not None and len(start.points) == POINTS - 9
+    assert int((start.point == 30 - 9).sum()) == (some.point == 30).sum() - 1
+    assert float(errors_px(start).max()) < 3 and float(errors_px(start).median()) < 2 * NOISE_PX
+
+
+def test_twenty_key_frames_spread_over_the_recording_are_a_start():
+    observations, trajectory = seen(lambda share: orbit(share / 5), 288.0)
+    pieces = []
+    for repeat in range(5):
+        frame = observations.frame * 5 + repeat
+        pieces.append(Observations(frame, observations.point, observations.pixels))
+    order = np.argsort(np.concatenate([each.frame for each in pieces]), kind="stable")
+    whole = Observations(*(np.concatenate([getattr(each, name) for each in pieces])[order] for name in ("frame", "point", "pixels")))  # fmt: skip
+    poses = trajectory.poses.repeat(5, 0)
+    start = focal_length._start(whole, Camera.from_focal(288.0, WIDTH, HEIGHT), replace(trajectory, poses=poses))
+    assert start is not None and len(start.poses) == 20
+    torch.testing.assert_close(start.poses[0], torch.from_numpy(poses[0]))
+
+
+@pytest.mark.parametrize(("points", "enough"), [(49, False), (50, True)])
+def test_fifty_points_are_enough_to_start(points, enough):
+    observations, trajectory = seen(lambda share: orbit(share / 3), 250.0, points)
+    assert (
+        focal_length._start(observations, Camera.from_focal(250.0, WIDTH, HEIGHT), trajectory) is not None
+    ) == enough

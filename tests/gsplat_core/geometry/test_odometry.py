@@ -14,6 +14,8 @@ from gsplat_core.geometry.reference_tracks import ReferenceTracks
 from gsplat_core.geometry.tracks import FeatureTracks, Observations
 from gsplat_core.io.recordings.synthetic.rendered import RenderedRecording, RenderSettings, render_recording
 from gsplat_core.io.recordings.synthetic.tissue import Tissue, Tug
+from gsplat_core.poses import odometry
+from gsplat_core.poses.breathing import BreathingTrajectory
 from gsplat_core.poses.odometry import LEAST_SEEN, Trajectory, followed_part, trajectory_of
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_origin import RELATIVE_DISTANCE
@@ -178,3 +180,127 @@ def test_observations_are_numbered_without_gaps():
     seen = tracks.observations(3)
     assert np.array_equal(np.unique(seen.point), np.arange(seen.point.max() + 1))
     assert (np.diff(seen.frame) >= 0).all() and torch.from_numpy(seen.point).dtype == torch.int64
+
+
+CAMERA = Camera(np.array([[200.0, 0, 128], [0, 200, 96], [0, 0, 1]]), 256, 192)
+GREY = np.full((192, 256, 3), 128, np.uint8)
+
+
+def exact(count: int, points: int = 60, seed: int = 0) -> Observations:
+    """Return exact observations of points by a scope that moves a little from frame to frame."""
+    at = np.random.default_rng(seed).uniform([-0.7, -0.5, 0.8], [0.7, 0.5, 1.2], (points, 3))
+    frame, number = (each.ravel() for each in np.meshgrid(np.arange(count), np.arange(points), indexing="ij"))
+    local = at[number] - np.stack([0.01 * frame, 0.05 * np.sin(frame), 0 * frame], 1)
+    return Observations(frame, number, local[:, :2] / local[:, 2:] * 200 + CAMERA.K[:2, 2])
+
+
+def odometry_of(seen: Observations, count: int) -> odometry._Odometry:
+    return odometry._Odometry(seen, CAMERA, [0.1 * number for number in range(count)])
+
+
+@pytest.mark.parametrize(("count", "apart"), [(10, 1), (60, 1), (61, 2), (300, 5), (600, 10), (601, 10), (1200, 10)])
+def test_key_frames_are_sixty_or_one_in_ten_and_the_last(count, apart):
+    keys = torch.nonzero(odometry_of(exact(2), count)._is_key)[:, 0].tolist()
+    assert keys == sorted({*range(0, count, apart), count - 1})
+
+
+def test_bundles_are_adjusted_when_their_key_frames_have_grown_by_a_third(monkeypatch):
+    adjusted = []
+    monkeypatch.setattr(odometry._Odometry, "_adjust", lambda self, last: adjusted.append(last + 1))
+    odometry_of(exact(40), 40).run(False)
+    assert adjusted == [3, 4, 6, 8, 11, 15, 20, 27, 36, 40]
+
+
+@pytest.mark.parametrize(("left", "lost"), [(23, (5,)), (24, ())])
+def test_two_dozen_known_points_place_a_frame(monkeypatch, left, lost):
+    seen = exact(8)
+    some = seen.of((seen.frame != 5) | (seen.point < left))
+    monkeypatch.setattr(ReferenceTracks, "observations", lambda self, least: some)
+    found = trajectory_of([Frame(index, index, GREY) for index in range(8)], CAMERA)
+    assert found.lost == lost and found.error_px < 0.01
+
+
+def test_a_new_point_has_the_median_depth_of_the_five_known_ones_nearest_to_it():
+    depths = np.array([3.0, 4.0, 5.0, 1.0, 2.0, *[9.0] * 30])
+    rays = np.concatenate([np.linspace(0.01, 0.05, 5), np.linspace(0.3, 0.5, 30)])
+    pixels = np.stack([200 * np.append(rays, 0.0) + 128, np.full(36, 96.0)], 1)
+    state = odometry_of(Observations(np.zeros(36, int), np.arange(36), pixels), 2)
+    state._poses[0, 0, 3] = 0.5
+    state._known[:35] = True
+    state._points[:35] = torch.from_numpy(np.stack([rays * depths - 0.5, 0 * rays, depths], 1))
+    state._take_up(0)
+    np.testing.assert_allclose(state._points[35], [-0.5, 0.0, 3.0], atol=1e-12)
+    assert bool(state._known.all())
+
+
+@pytest.mark.parametrize(("count", "least"), [(3, 3), (4, 3), (5, 4), (9, 4)])
+def test_a_point_must_be_seen_in_four_frames_or_three_of_a_short_recording(monkeypatch, count, least):
+    asked = []
+    seen = exact(count)
+    monkeypatch.setattr(ReferenceTracks, "observations", lambda self, least: asked.append(least) or seen)
+    trajectory_of([Frame(index, index, GREY) for index in range(count)], CAMERA)
+    assert asked == [least]
+
+
+@pytest.mark.parametrize(("points", "refused"), [(23, True), (24, False)])
+def test_seventy_two_observations_are_enough(monkeypatch, points, refused):
+    seen = exact(3, points)
+    monkeypatch.setattr(ReferenceTracks, "observations", lambda self, least: seen)
+    frames = [Frame(index, index, GREY) for index in range(3)]
+    if not refused:
+        assert len(trajectory_of(frames, CAMERA).points) == points
+        return
+    with pytest.raises(InvalidInput, match="only 69 observations of tissue could be tracked over 3 frames"):
+        trajectory_of(frames, CAMERA)
+
+
+def test_more_than_three_thousand_frames_are_refused(monkeypatch):
+    monkeypatch.setattr(ReferenceTracks, "follow", lambda self, image, mask: None)
+    monkeypatch.setattr(odometry, "followed_part", lambda frame: None)
+    frame = Frame(0, 0, GREY)
+    with pytest.raises(InvalidInput, match="at most 3000 frames at once"):
+        trajectory_of([frame] * 3001, CAMERA)
+    with pytest.raises(ValueError, match="concatenate"):  # after all frames are read
+        trajectory_of([frame] * 3000, CAMERA)
+
+
+def test_lengths_and_errors_of_breathing_have_the_units_of_the_trajectory(monkeypatch):
+    """Breathing is estimated in the first depth as the unit of length, with errors of rays."""
+    seen, given = exact(8), []
+    monkeypatch.setattr(ReferenceTracks, "observations", lambda self, least: seen)
+    poses = torch.eye(4, dtype=torch.float64).repeat(8, 1, 1)
+    poses[:, 0, 3] = torch.arange(8) / 100
+    points = torch.arange(6, dtype=torch.float64).view(2, 3)
+
+    def separated(sightings, placed):
+        given.append((sightings, placed))
+        return BreathingTrajectory(poses.clone(), points, (0.3, 1.1), 0.02, 0.004)
+
+    monkeypatch.setattr(odometry, "breathing_trajectory", separated)
+    frames = [Frame(index, index * 100_000_000, GREY) for index in range(8)]
+    found = trajectory_of(frames, CAMERA)
+    assert found.breathing is not None and found.breathing.frequencies_hz == (0.3, 1.1)
+    assert found.breathing.uncertain == pytest.approx(0.02 * RELATIVE_DISTANCE)
+    assert found.error_px == pytest.approx(0.8)
+    np.testing.assert_allclose(found.points, points * RELATIVE_DISTANCE)
+    np.testing.assert_allclose(found.poses[:, 0, 3], np.arange(8) / 100 * RELATIVE_DISTANCE)
+    ((sightings, placed),) = given
+    assert bool(placed.all()) and len(sightings.frame) == len(seen.frame)
+    np.testing.assert_allclose(sightings.times_s, np.arange(8) / 10)
+    np.testing.assert_allclose(sightings.rays, (seen.pixels - [128, 96]) / 200)
+    assert float(sightings.points[:, 2].median()) == pytest.approx(1, abs=0.01)
+    monkeypatch.setattr(odometry, "breathing_trajectory", lambda *_: None)
+    still = trajectory_of(frames, CAMERA)
+    assert still.breathing is None and still.error_px < 0.01
+    assert trajectory_of(frames, CAMERA, separate_breathing=False).poses.tobytes() == still.poses.tobytes()
+
+
+def test_tools_highlights_and_the_outside_are_not_followed():
+    picture = np.full((24, 32, 3), 90, np.uint8)
+    assert followed_part(Frame(0, 0, picture)) is None
+    mask, field = np.ones((24, 32), np.uint8), np.ones((24, 32), np.uint8)
+    mask[:, :8], field[:6] = 0, 0
+    part = followed_part(Frame(0, 0, picture, mask=mask, loss_mask=field))
+    expected = np.ones((24, 32), bool)
+    expected[:, :8] = expected[:6] = False
+    assert np.array_equal(part != 0, expected)
