@@ -191,3 +191,65 @@ def test_a_moved_scope_gets_a_new_answer_and_one_at_rest_keeps_its_own(monkeypat
     cameras = [CAMERA, CAMERA, CAMERA.with_pose(moved), CAMERA.with_pose(moved.copy()), CAMERA]
     found = [estimator.estimate(Frame(seq, seq, image), camera) for seq, camera in enumerate(cameras)]
     assert found == ["a", "a", "b", "b", "c"]
+
+
+@pytest.fixture
+def averaged(monkeypatch):
+    """Return the reliefs that are shown, from those of the looks of each window: one list per window and look."""
+    shown, windows = [], []
+
+    class Window:
+        def __init__(self, grid, look, recent=()):
+            self.looks = [*recent, look]
+            self.kept = recent
+            windows.append(self)
+
+        def add(self, look):
+            if look is refused.get("look"):
+                return False
+            self.looks.append(look)
+            return True
+
+        def relief_of(self, look):
+            return next((np.array([look.value + 100.0 * len(windows)]) for each in self.looks if each is look), None)
+
+    refused = {}
+    monkeypatch.setattr(light, "LightWindow", Window)
+    monkeypatch.setattr(light, "answer", lambda grid, relief, look, frame: shown.append(relief) or "depth")
+    monkeypatch.setattr(light.Grid, "of", lambda camera, shape: None)
+
+    def found(values, refuse=None):
+        estimator = light.LightDepth()
+        for number, value in enumerate(values):
+            look = SimpleNamespace(value=value, shading=SimpleNamespace(known=np.ones(1), brightness=np.ones(1)))
+            monkeypatch.setattr(light, "look_at", lambda frame, camera, look=look: look)
+            if number == refuse:
+                refused["look"] = look
+            estimator._look(None, None)
+        return [float(each[0]) for each in shown], windows
+
+    return found
+
+
+def test_reliefs_are_followed_from_look_to_look_and_averaged_with_a_fifth_of_the_newest_or_more(averaged):
+    """All looks of a window show the same relief here, so the average follows their change at once."""
+    found, windows = averaged([1.0, 2.0, 5.0, 3.0, 3.0, 3.0, 9.0])
+    np.testing.assert_allclose(found, [101.0, 102.0, 105.0, 103.0, 103.0, 103.0, 109.0])
+    assert len(windows) == 1
+
+
+def test_another_window_takes_part_by_one_over_the_number_of_looks_and_a_fifth_at_least(averaged):
+    """The second window begins with another relief, and without the look before it."""
+    found, windows = averaged([1.0, 1.0, 4.0, 6.0], refuse=2)
+    # The third look has no relation to the second: a third of 204 and two of 101, and then its change by 2.
+    expected = 101 + (204 - 101) / 3
+    expected_next = expected + 2 + (206 - expected - 2) / 4
+    np.testing.assert_allclose(found, [101.0, 101.0, expected, expected_next])
+    late, _ = averaged([1.0] * 8 + [4.0], refuse=8)
+    assert late[-1] - late[-2] == pytest.approx((100 * len(windows) + 4 - late[-2]) / 5)
+
+
+def test_a_window_of_thirteen_looks_is_followed_by_one_of_the_newest_six_and_this_one(averaged):
+    _, windows = averaged([1.0] * 13)
+    assert len(windows) == 2 and len(windows[0].looks) == 13 and len(windows[1].looks) == 7
+    assert windows[1].looks[:6] == windows[0].looks[6:12]
