@@ -83,6 +83,17 @@ def test_a_filter_that_makes_no_sense_is_refused(kept, query):
         assert kept.ask("GET", path, params=query).status_code == 422
 
 
+@pytest.mark.parametrize(
+    ("query", "status"),
+    [
+        ({"count": 1}, 200), ({"count": 500}, 200), ({"count": 0}, 422), ({"count": 501}, 422),
+        ({"before": 0}, 200), ({"before": 2**63 - 1}, 200), ({"before": -1}, 422), ({"before": 2**63}, 422),
+    ],
+)  # fmt: skip
+def test_pages_have_1_to_500_entries_before_a_number_of_64_bits(plane, query, status):
+    assert plane.ask("GET", "/v1/audit", params=query).status_code == status
+
+
 def test_the_download_of_everything_can_be_verified(kept, tmp_path):
     answer = kept.ask("GET", "/v1/audit/export")
     assert 'filename="audit-' in answer.headers["content-disposition"]

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.registry import Collector
 
 from services.bus.messages import BOUNDS_S, Durations
+from services.display.hub import KINDS
 from services.supervisor.launcher import cause_of
 from services.supervisor.metrics import GraphFamilies, StreamMeasures
+from services.supervisor.process import StreamEvent
 
 
 class Collected(Collector):
@@ -92,6 +96,56 @@ def test_the_live_model_is_one_series_however_often_it_is_published():
     engine = {"state": "running", "figures": {"picture": {"show": "live", "model_version": 812}, "model": None}}
     families.add("one", {"capture": CAPTURE, "engine": engine}, {})
     assert samples(families)['intrasplat_model_info{model="",show="live",stream="one",version=""}'] == 1
+
+
+class Hub:
+    """Display hub of a stream with one viewer of its picture."""
+
+    def viewers(self, kind: str) -> int:
+        return int(kind == "shown")
+
+    def ages(self, kind: str) -> dict | None:
+        return durations(0.02, 0.03) if kind == "shown" else None
+
+    def counts(self, kind: str) -> dict[str, int]:
+        return {"encoded": 5, "slow viewer": 2} if kind == "shown" else {}
+
+
+def test_streams_tell_their_state_processes_and_viewers_and_stopped_ones_their_state():
+    process = SimpleNamespace(measures={"ages": durations(0.5)}, causes={"killed by signal 9": 3, "heartbeat": 1})
+    idle = SimpleNamespace(measures={}, causes={})
+    running = SimpleNamespace(
+        name="one", hub=Hub(), processes={"capture": idle, "engine": process},
+        view=lambda: SimpleNamespace(state="behind", processes={"capture": CAPTURE, "engine": ENGINE}),
+    )  # fmt: skip
+    stopped = SimpleNamespace(name="two", hub=None, processes={}, view=lambda: SimpleNamespace(state="stopped"))
+    measures = StreamMeasures()
+    registry = CollectorRegistry()
+    registry.register(measures)
+    measures.streams = SimpleNamespace(streams=lambda: [stopped, running])
+    for kind in ("started", "ended", "ended"):
+        measures.count(StreamEvent("one", "engine", kind, "reason"))
+    value = lambda name, **labels: registry.get_sample_value(f"intrasplat_{name}", labels)
+    assert [value("stream_state", stream="one", state=each) for each in ("behind", "live", "stopped")] == [1, 0, 0]
+    assert [value("stream_state", stream="two", state=each) for each in ("behind", "live", "stopped")] == [0, 0, 1]
+    restarts = {"killed by signal 9": 3, "heartbeat": 1, "other": None}
+    for reason, count in restarts.items():
+        assert value("process_restarts_total", stream="one", role="engine", reason=reason) == count
+    assert value("process_restarts_total", stream="one", role="capture", reason="heartbeat") is None
+    assert value("process_events_total", stream="one", role="engine", kind="ended") == 2
+    assert value("process_events_total", stream="one", role="engine", kind="started") == 1
+    assert value("stream_viewers", stream="one", picture="shown") == 1
+    assert value("stream_viewers", stream="two", picture="shown") is None
+    assert value("pictures_encoded_total", stream="one", picture="shown") == 5
+    assert value("pictures_dropped_total", stream="one", picture="shown", reason="slow viewer") == 2
+    assert value("display_latency_seconds_count", stream="one", picture="shown") == 2
+    assert value("display_latency_seconds_sum", stream="one", picture="shown") == 0.05
+    assert value("frame_age_seconds_count", stream="one") == 1
+    assert value("source_state", stream="one", state="stalled") == 1
+    assert value("source_state", stream="two", state="stalled") is None
+    other = next(kind for kind in KINDS if kind != "shown")
+    assert value("stream_viewers", stream="one", picture=other) == 0
+    assert value("display_latency_seconds_count", stream="one", picture=other) is None
 
 
 def test_a_graph_tells_what_its_tracker_has_seen():

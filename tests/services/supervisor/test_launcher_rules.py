@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import socket
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from services.bus.messages import packed_json
-from services.bus.runtime import ProcessIdentity
+from services.bus.runtime import ProcessIdentity, RuntimeFolder
 from services.supervisor import launcher as launchers
 from services.supervisor.launcher import MOST_REMEMBERED, Launcher
 from services.supervisor.worker import Parent
+from tests.services.virtual_time import in_virtual_time
 
 DEAD = ProcessIdentity(os.getpid(), "another boot 1")
 
@@ -106,3 +109,77 @@ def test_an_old_socket_is_replaced(tmp_path: Path) -> None:
         client.connect(str(tmp_path / "socket"))
         launcher.stop()
     launcher.serve()
+
+
+class Started:
+    """Start of processes that records modules and times, and answers with numbers from 100."""
+
+    def __init__(self) -> None:
+        self.modules: list[tuple[str, float]] = []
+
+    async def start(self, module, arguments, output, environment, *, fresh=False) -> int:
+        self.modules.append((module, round(asyncio.get_running_loop().time(), 2)))
+        return 99 + len(self.modules)
+
+
+@pytest.mark.parametrize(
+    ("ready_s", "engine_s", "forked"), [(59.0, 59.0, True), (61.0, 60.0, False), (None, 60.0, False)]
+)
+def test_an_engine_waits_a_minute_for_a_launcher_that_is_loading(tmp_path, monkeypatch, ready_s, engine_s, forked):
+    by = launchers.ByLauncher(RuntimeFolder(tmp_path))
+    by._direct = direct = Started()
+    asked = []
+
+    async def ask(command, **arguments):
+        asked.append((command, arguments["module"], round(asyncio.get_running_loop().time(), 2)))
+        return {"pid": 7}
+
+    monkeypatch.setattr(by, "_ask", ask)
+
+    async def start() -> None:
+        by._keeping = asyncio.ensure_future(asyncio.sleep(1000))
+        if ready_s is not None:
+            asyncio.get_running_loop().call_later(ready_s, by.ready.set)
+        pid = await by.start("services.supervisor.capture", [], tmp_path / "log", {})
+        assert pid == 100 and direct.modules == [("services.supervisor.capture", 0.0)]
+        pid = await by.start("services.supervisor.engine", [], tmp_path / "log", {})
+        assert pid == (7 if forked else 101)
+        by._keeping.cancel()
+
+    in_virtual_time(start())
+    engine = ("services.supervisor.engine", engine_s)
+    assert (asked, direct.modules[1:]) == (([("start", *engine)], []) if forked else ([], [engine]))
+
+
+def test_a_launcher_is_asked_every_second_and_started_again_when_it_has_ended(tmp_path, monkeypatch):
+    by = launchers.ByLauncher(RuntimeFolder(tmp_path))
+    by._direct = direct = Started()
+    times, there, alive = [], [], {}
+    now = lambda: asyncio.get_running_loop().time()
+
+    async def ask(command, **arguments):
+        times.append(round(now(), 2))
+        if 2.5 < now() < 3.5:
+            raise launchers.NoAnswer("busy")
+        return {}
+
+    # The first launcher has loaded after half a second and ends after 6 s.
+    monkeypatch.setattr(by, "_ask", ask)
+    monkeypatch.setattr(launchers, "recorded_launcher", lambda folder: "one" if 0.5 <= now() < 6 else None)
+    monkeypatch.setattr(launchers, "status_of_child", lambda pid: "signal 9" if pid == 100 and now() > 6 else None)
+    monkeypatch.setattr(launchers, "_runs", lambda pid: alive.setdefault(pid, True))
+
+    async def watch() -> None:
+        by.open()
+        by.open()
+        for _ in range(7):
+            await asyncio.sleep(1.0)
+            there.append(by.ready.is_set())
+        await by.close(stop=False)
+
+    in_virtual_time(watch())
+    assert direct.modules[0] == ("services.supervisor.launcher", 0.0) and len(direct.modules) == 2
+    assert 6 <= direct.modules[1][1] < 7
+    assert 0.5 <= times[0] < 0.6
+    assert np.diff(times).round(2).tolist() == [1.0] * (len(times) - 1)
+    assert there == [True, True, False, True, True, True, False]
