@@ -2,8 +2,8 @@
 
     python benchmarks/host_pauses.py
 
-Some processes read the clock without pause, first one alone, then as many as a live stream has busy threads. On an idle machine with
-enough cores, none of them waits for more than a fraction of a millisecond.
+Some processes call the kernel and read the clock without pause, first one alone, then as many as a live stream has busy threads. On an
+idle machine with enough cores, none of them waits for more than a fraction of a millisecond.
 """
 
 from __future__ import annotations
@@ -24,11 +24,12 @@ STREAM_THREADS = 6
 """Threads of a live stream that are busy at the same time: source, three for analysis, training and display."""
 
 LOOP = """
-import json, sys, time
+import json, os, sys, time
 seconds, least_ns = float(sys.argv[1]), int(float(sys.argv[2]) * 1e6)
 last = time.perf_counter_ns()
 end, pauses = last + int(seconds * 1e9), []
 while last < end:
+    os.getppid()
     now = time.perf_counter_ns()
     if now - last > least_ns:
         pauses.append((now - last) / 1e6)

@@ -146,7 +146,7 @@ def machine(device: str) -> dict[str, Any]:
     cpu = next((line.split(":")[1].strip() for line in _lines("/proc/cpuinfo") if line.startswith("model name")), "?")
     stated = {
         "cpu": cpu, "cores": len(os.sched_getaffinity(0)), "instruction_set": instruction_set(),
-        "python": platform.python_version(), "torch": torch.__version__, "pauses": host_pauses(),
+        "python": platform.python_version(), "torch": torch.__version__, "kernel": platform.release(), "pauses": host_pauses(),
     }  # fmt: skip
     if device == "cuda":
         stated["gpu"] = torch.cuda.get_device_name(0)
