@@ -57,3 +57,14 @@ def test_neither_is_nothing_to_do(said):
         "everything runs on the CPU" in checks["CUDA kernels"].advice
         and "make cuda" not in checks["CUDA kernels"].advice
     )
+
+
+def test_every_op_with_a_kernel_for_the_cpu_is_listed_once_and_counted():
+    value = next(check.value for check in doctor._core() if check.name == "ops on the CPU")
+    count, _, names = value.partition(": ")
+    listed = names.split(", ")
+    assert listed == sorted(set(listed)) and len(listed) == int(count) > 20
+    import torch
+
+    for name in listed:
+        assert torch._C._dispatch_has_kernel_for_dispatch_key(f"gsplat_core::{name}", "CPU")

@@ -8,7 +8,7 @@ import pytest
 from pydantic import ValidationError
 
 from services.cli.evaluate import table
-from services.reports.evaluation_html import render_evaluation, write_evaluation_html
+from services.reports.evaluation_html import render_evaluation, table_section, write_evaluation_html
 from services.reports.evaluation_rows import at_age
 from services.reports.evaluation_schema import EvaluationReport
 
@@ -161,3 +161,20 @@ def test_the_file_is_read_back_as_it_was(tmp_path, report, content):
     content["heldout"]["unrounded_db"] = float("nan")
     with pytest.raises(ValidationError):
         EvaluationReport.model_validate(content)
+
+
+def test_dots_are_placed_between_a_decibel_below_the_worst_and_above_the_best(report):
+    text = table_section(report)
+    rows = [
+        (float(cells[1]), float(left))
+        for row in text.split("<tr")[2:]
+        if len(cells := re.findall(r'<td class="n">([^<]*)</td>', row)) == 5
+        for left in re.findall(r"left:([0-9.]+)%", row)
+    ]
+    values = [value for value, _ in rows]
+    low, high = min(values) - 1, max(values) + 1
+    assert len(rows) >= 3 and high > low + 2
+    for value, left in rows:
+        assert left == pytest.approx(100 * (value - low) / (high - low), abs=0.3)
+    ends = re.findall(r"<span>(-?[0-9]+)</span>", text)[:2]
+    assert [float(each) for each in ends] == pytest.approx([low, high], abs=0.51)

@@ -66,3 +66,10 @@ def test_what_is_asked_for_is_taken_and_a_gpu_reconstructs_all_of_it(tmp_path):
     assert engine_scale(EngineSpec(device="cuda"), stream(), kept, machine) == 1.0
     assert engine_scale(EngineSpec(device="cuda", engine_scale=0.5), stream(), kept, machine) == 0.5
     assert machine.measured == 0 and not kept.exists()
+
+
+def test_the_time_of_a_frame_is_kept_in_milliseconds(tmp_path):
+    scale = engine_scale(EngineSpec(), stream(), tmp_path / "size", Machine())
+    kept = json.loads((tmp_path / "size").read_text())
+    assert kept["size"] == [640, 512, 30.0]
+    assert kept["frame_ms"] == pytest.approx(2 + 0.18e-3 * scale**2 * 640 * 512, abs=0.06)
