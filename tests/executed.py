@@ -218,10 +218,13 @@ class Marked:
         self.codes.write_text(json.dumps(codes), encoding="utf-8")
 
     def record(self, files: list[str]) -> str:
-        """Run test files and write their records. Return pytest's exit code and the failed tests."""
+        """Run test files and write their records, unless one cannot be imported. Return pytest's exit code and the failed
+        tests."""
 
-        def write(recorder: Recorder) -> None:
+        def write(recorder: Recorder, code: int) -> None:
             print("\nfailed:", *recorder.failed)  # what they would execute later is not recorded
+            if code not in (pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED, pytest.ExitCode.NO_TESTS_COLLECTED):
+                return  # a file that cannot be imported ends the session before its first test
             for file in files:
                 pairs = [(places, np.full(len(places), test, np.int32)) for places, test in recorder.executed[file]]
                 places = np.concatenate([np.zeros(0, np.int64), *(each for each, _ in pairs)])
@@ -241,7 +244,7 @@ class Marked:
             hook = HOOK.format(codes=str(self.codes), marks=str(marks))
             with marks.open("r+b") as opened:
                 recorder = Recorder(mmap.mmap(opened.fileno(), 0))
-            fork = pytest_fork(files, folder, recorder, hook, LIMIT_S, lambda: write(recorder))
+            fork = pytest_fork(files, folder, recorder, hook, LIMIT_S, lambda code: write(recorder, code))
             code, output = fork.wait(), fork.output.read_text(encoding="utf-8", errors="replace")
         return f"{code}: {(output.strip().splitlines() or [''])[-1]}"
 

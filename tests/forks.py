@@ -110,7 +110,7 @@ class Fork:
 
 def pytest_fork(
     tests: Sequence[str], folder: Path, plugin: object, hook: str = "", limit_s: float = math.inf,
-    after: Callable[[], None] = lambda: None,
+    after: Callable[[int], None] = lambda code: None,
 ) -> Fork:  # fmt: skip
     """Run pytest in a fork.
 
@@ -120,14 +120,14 @@ def pytest_fork(
         plugin: plugin for pytest.
         hook: code to execute before pytest and in each process that tests start.
         limit_s: time limit in seconds.
-        after: called in the fork when pytest has ended.
+        after: called in the fork with pytest's exit code.
     """
 
     def run() -> int:
         if hook:
             execute_everywhere(hook, folder)
         code = int(pytest.main([*OPTIONS, *tests], plugins=[plugin]))
-        after()
+        after(code)
         return code
 
     return Fork(run, folder / "output.txt", limit_s)

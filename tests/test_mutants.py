@@ -142,6 +142,28 @@ def recorded(folder: Path, path: Path, tests: dict[str, tuple[float, set[int]]])
     )  # fmt: skip
 
 
+@pytest.mark.parametrize(("other", "is_recorded"), [("import nothing_like_this", False), ("assert True", True)])
+def test_a_session_that_cannot_import_a_file_records_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, other: str, is_recorded: bool
+) -> None:
+    """Or its files would count as recorded, without tests, until they change."""
+    files = ["test_sound.py", "test_other.py"]
+    for file, text in zip(files, ("assert True", other), strict=True):
+        (tmp_path / file).write_text(f"{text}\n\ndef test():\n    assert True\n", encoding="utf-8")
+    (tmp_path / "pytest.ini").write_text("[pytest]\nmarkers =\n  slow: not run\n", encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(executed, "ROOT", tmp_path)
+    monkeypatch.setattr(executed, "RECORDS", tmp_path / "records")
+    (tmp_path / "records").mkdir()
+    product = object.__new__(executed.Marked)
+    product.keys = product.functions = np.ones(1, np.uint64)
+    product.version, product.codes = "0", tmp_path / "codes.json"
+    product.codes.write_text("{}", encoding="utf-8")
+    product.record(files)
+    records = [np.load(each)["tests"].tolist() for each in (tmp_path / "records").iterdir()]
+    assert records == ([["test"], ["test"]] if is_recorded else [])
+
+
 def test_tests_that_execute_a_line_run_quickest_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "sample.py"
     path.write_text(MODULE, encoding="utf-8")
