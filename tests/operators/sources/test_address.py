@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+import re
 
 import pytest
 
 from gsplat_core.errors import InvalidSetting
-from operators.sources.address import Address, SourceOptions
+from operators.sources.address import PARSERS, Address, SourceOptions, UrlAddress
 
 
 def test_an_address_has_a_place_and_options():
@@ -119,3 +120,72 @@ def test_a_source_that_is_asked_for_nothing_keeps_two_frames_and_the_recorded_pa
     options = SourceOptions()
     assert (options.waiting, options.speed, options.scale, options.fps, options.max_frames) == (2, 1.0, 1.0, None, None)
     assert not (options.realtime or options.loop or options.bounce)
+
+
+@pytest.mark.parametrize(
+    ("scheme", "name", "least", "most", "beyond"),
+    [
+        ("synthetic", "width", "32", "4096", ("31", "4097")),
+        ("synthetic", "height", "32", "4096", ("31", "4097")),
+        ("synthetic", "fps", "1", "240", ("0.9", "240.1")),
+        ("synthetic", "seed", "0", "9223372036854775807", ("-1", "9223372036854775808")),
+        ("synthetic", "eyes", "1", "2", ("0", "3")),
+        ("synthetic", "frames", "1", "1000", ("0", "1001")),
+        ("v4l2", "size", "1x1", "8192x8192", ("0x1", "1x0", "8193x1", "1x8193")),
+        ("v4l2", "fps", "0.01", "1000", ("0.009", "1001")),
+        ("folder", "fps", "0.01", "1000", ("0.009", "1001")),
+        ("folder", "open_s", "0.1", "600", ("0.09", "601")),
+        ("realtime", "speed", "0.01", "1000", ("0.009", "1001")),
+        ("realtime", "fps", "0.01", "1000", ("0.009", "1001")),
+        ("zmq+tcp", "fps", "0.01", "1000", ("0.009", "1001")),
+        ("zmq+ipc", "open_s", "0.1", "600", ("0.09", "601")),
+    ],
+)
+def test_options_of_addresses_have_ranges(scheme, name, least, most, beyond):
+    for value in (least, most):
+        PARSERS[scheme](f"place?{name}={value}", SourceOptions())
+    for value in beyond:
+        with pytest.raises(InvalidSetting, match=rf"^{re.escape(scheme)}: {name} is '{value}'"):
+            PARSERS[scheme](f"place?{name}={value}", SourceOptions())
+
+
+@pytest.mark.parametrize("name", ["open_s", "stall_s"])
+def test_times_of_urls_have_ranges(name):
+    for value in ("0.1", "600"):
+        assert getattr(UrlAddress.parse("rtsp", f"scope:554/live#{name}={value}"), name) == float(value)
+    for value in ("0.09", "601"):
+        with pytest.raises(InvalidSetting, match=f"{name} is '{value}'; it must be a number from 0.1 to 600"):
+            UrlAddress.parse("rtsp", f"scope:554/live#{name}={value}")
+
+
+def test_addresses_without_options_have_defaults():
+    synthetic = PARSERS["synthetic"]("", SourceOptions())
+    assert (synthetic.width_px, synthetic.height_px, synthetic.fps, synthetic.seed, synthetic.eyes) == (
+        640,
+        512,
+        30,
+        0,
+        1,
+    )
+    assert synthetic.frames is None and not synthetic.moving
+    assert PARSERS["synthetic"]("", SourceOptions(fps=25.0)).fps == 25
+    assert (
+        PARSERS["folder"]("place", SourceOptions()).open_s == PARSERS["zmq+tcp"]("place", SourceOptions()).open_s == 10
+    )
+    url = UrlAddress.parse("rtsp", "scope:554/live")
+    assert (url.open_s, url.stall_s, url.transport) == (10, 5, "tcp")
+
+
+def test_a_stream_is_analysed_for_nine_tenths_of_the_time_that_it_has_to_open():
+    options = UrlAddress.parse("rtsp", "scope:554/live#open_s=20&transport=udp").options()
+    assert options["analyzeduration"] == "18000000" and options["rtsp_transport"] == "udp"
+    assert "rtsp_transport" not in UrlAddress.parse("http", "scope/live").options()
+
+
+@pytest.mark.parametrize(("host", "is_one"), [("a" * 63 + ".b", True), ("a" * 64 + ".b", False), (".".join(["a" * 62] * 4) + ".b", True), (".".join(["a" * 62] * 4) + ".bcd", False)])  # fmt: skip
+def test_labels_of_a_host_have_63_characters_and_its_name_253(host, is_one):
+    if is_one:
+        assert UrlAddress.parse("http", f"{host}/live").name == f"http://{host}/live"
+        return
+    with pytest.raises(InvalidSetting, match="which is no host"):
+        UrlAddress.parse("http", f"{host}/live")
