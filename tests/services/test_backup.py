@@ -203,7 +203,8 @@ def damaged(folder: Path, how: str) -> None:
         recording.unlink()
         recording.symlink_to(folder.parent / "elsewhere")
     elif how == "another file":
-        (folder / "data" / "more").write_text("x")
+        for name in ("zero", "more", "one"):
+            (folder / "data" / name).write_text("x")
     elif how == "no list":
         path.unlink()
     elif how == "the list is cut":
@@ -235,16 +236,23 @@ def damaged(folder: Path, how: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "how",
+    ("how", "said"),
     [
-        "changed", "longer", "gone", "a link", "another file", "no list", "the list is cut", "the list is deep", "a list of another kind",
-        "a later format", "a path to the outside", "a recording was left out", "an audit line was left out", "the database is none",
+        *((how, r"/0\.png is not as the backup was made: it is missing") for how in ("changed", "longer", "gone", "a link")),
+        ("another file", "has a file that backup.json does not list: 'data/more'; remove it"),
+        ("no list", "is no backup: it has no backup.json"),
+        *((how, "backup.json cannot be used: ") for how in ("the list is cut", "the list is deep", "a list of another kind")),
+        ("a later format", "its format is 2, and this program knows 1"),
+        ("a path to the outside", r"it lists 'data/\.\./\.\./elsewhere'"),
+        ("a recording was left out", "the files of recording case-1 are not in the backup"),
+        ("an audit line was left out", r"the audit log in it is not as it was: \d+ entries were cut off the end"),
+        ("the database is none", "the database of the backup cannot be read: file is not a database"),
     ],
 )  # fmt: skip
-def test_a_backup_that_is_not_whole_is_not_restored(service, tmp_path, how):
+def test_a_backup_that_is_not_whole_is_not_restored(service, tmp_path, how, said):
     make_backup(service.settings, tmp_path / "backup")
     damaged(tmp_path / "backup", how)
-    with pytest.raises(BackupFailed):
+    with pytest.raises(BackupFailed, match=said):
         restore_backup(ServiceSettings(paths={"data": tmp_path / "new"}), tmp_path / "backup")
     assert not (tmp_path / "new").exists()
     with pytest.raises(BackupFailed):

@@ -229,3 +229,14 @@ def test_frames_with_depth_are_spread_from_the_first_to_the_last(monkeypatch, mo
         assert (frame.depth is not None) == (number in looked_at and number != 2)
         assert frame.depth is None or frame.depth[0, 0] == 5 + number
     assert found.doubts == ({"it moves": 1} if 2 in looked_at else {})
+
+
+@pytest.mark.parametrize(("model", "has_depth"), [("pinhole", True), ("fisheye", False)])
+def test_a_recording_with_depth_or_another_camera_stays_as_it_is(monkeypatch, model, has_depth):
+    monkeypatch.setattr(breathing_depth, "MovingTissue", None)
+    frames = [Frame(seq, seq, np.zeros((6, 8, 3), np.uint8)) for seq in range(3)]
+    if has_depth:
+        frames[1] = frames[1].with_fields(depth=np.ones((6, 8), np.float32))
+    camera = Camera(np.array([[8.0, 0, 4], [0, 8, 3], [0, 0, 1]]), 8, 6, model=model)
+    found = breathing_depth.BreathingDepth().of_recording(frames, [camera] * 3)
+    assert found.frames == frames and not found.doubts and not found.at_rest

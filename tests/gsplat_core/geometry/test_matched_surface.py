@@ -122,6 +122,8 @@ def test_depth_that_was_not_matched_stays_as_it_is():
     assert with_surface(nothing, camera) is nothing
     outside = frame(depth, mask=np.zeros(depth.shape, np.uint8))
     assert with_surface(outside, camera) is outside
+    for lacking in (frame(depth).with_fields(depth_confidence=None), Frame(0, 0, outside.image)):
+        assert with_matched_surface(lacking, camera) is lacking
 
 
 def test_a_variance_is_what_its_confidence_says():

@@ -12,7 +12,9 @@ import torch
 
 from gsplat_core.depth import stereo
 from gsplat_core.depth.stereo import StereoDepth
+from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
+from gsplat_core.scene.frames import Frame
 from tests.gsplat_core.geometry.pairs import (
     BASELINE_MM,
     FOCAL_PX,
@@ -352,3 +354,16 @@ def test_the_interval_contains_the_depth_and_grows_with_the_row_error(left, righ
     for each, errors in ((found, error), (moved, lower.standard_error(moved, lowered, camera()))):
         sure = each.confidence >= 0.5
         assert each.error == pytest.approx(np.median(errors[sure] / each.depth[sure]), rel=0.05)
+
+
+def test_an_error_of_disparity_is_one_of_depth_by_its_square():
+    """A focal length of 100 pixels and a baseline of 4: 400 at 20 pixels is 20 away, and at 20.1 pixels 0.0995 nearer."""
+    pose = np.eye(4)
+    pose[0, 3] = -4
+    camera = Camera.from_focal(100.0, 8, 6)
+    frame = Frame(0, 0, np.zeros((6, 8, 3), np.uint8))
+    depth = np.array([[20.0, 40.0]], np.float32)
+    variance = np.array([[0.01, 0.04]], np.float32)
+    both = frame.with_fields(right_image=frame.image, right_camera=camera.with_pose(pose))
+    np.testing.assert_allclose(stereo._depth_error(variance, depth, both, camera), [[0.1, 0.8]], rtol=1e-6)
+    np.testing.assert_allclose(stereo._depth_error(variance, depth, frame, camera), [[0.4, 3.2]], rtol=1e-6)
