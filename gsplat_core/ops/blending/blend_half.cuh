@@ -17,7 +17,7 @@ union HalfSlot {
   HalfSplat splat;
 };
 
-// Sums of one pixel: red and green, blue and depth, the weights (in units of 1 / kMaxAlpha) and an unused value.
+// Sums of one pixel: red and green, blue and depth, the weights (in units of kMaxAlpha) and an unused value.
 struct PixelSums {
   float2 pairs[3];
 };

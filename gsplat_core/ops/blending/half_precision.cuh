@@ -14,7 +14,7 @@ namespace gsplat::blending {
 namespace {
 
 // Opacities are scaled so that the smallest normal half-precision number corresponds to the alpha cut-off (1/255).
-// Flushing denormals to zero then implements the cut-off. Before flushing, opacities are in units of 1 / kHalfUnits.
+// Flushing denormals to zero then implements the cut-off. Before flushing, opacities are in units of kHalfUnits * kMaxAlpha.
 constexpr float kHalfUnits = 64.875f;  // 2^-14 of them are 1/255 of 1 / 0.99, to within 4e-4
 constexpr float kLog2HalfUnits = 6.0195907f;
 constexpr float kGreatestHalf = 65504;
@@ -128,7 +128,7 @@ struct HalfSplats {
   }
 };
 
-// Return two opacities in units of 1 / kMaxAlpha; 0 below the cut-off.
+// Return two opacities in units of kMaxAlpha; 0 below the cut-off.
 __device__ inline __half2 opacity(float power0, float power1) {
   const uint32_t units = pack_halves(exp2_fast(power0), exp2_fast(power1));
   uint32_t alpha;
@@ -141,13 +141,13 @@ __device__ inline __half2 opacity(float power0, float power1) {
 struct HalfPixels {
   __half2 front;  // transmittance in front of the next splat; 0 once the pixel is closed
   // Two sums of the upper and two of the lower pixel: lane 0 has red and green, lane 1 blue and depth, lane 2 the weights (in
-  // units of 1 / kMaxAlpha).
+  // units of kMaxAlpha).
   float sums[4];
 
   __device__ bool open() const { return bits_of(front) != 0; }
 };
 
-// Weights of a lane's splats at its two pixels.
+// Blending weights of the splats that a lane processes, at the two pixels of its group, in units of kMaxAlpha.
 template <int kTiles>
 struct HalfWeights {
   __half2 weights[2 * kTiles];
