@@ -47,8 +47,9 @@ class StreamMessages:
     """Converts a stream's pictures to OpenIGTLink messages.
 
     Picture axes: i right, j down, k = 0, with three components (red, green, blue). A voxel is `spacing_mm` wide and
-    high, and the origin is the picture's centre. Camera coordinates (x right, y down, z forward) are sent as RAS, so
-    receivers change no sign. The patient's left and right are unknown.
+    high, and the origin is the picture's centre. Camera coordinates (x right, y down, z forward) are sent unchanged.
+    The message declares them as RAS, because receivers would negate the x and y of LPS. They are not the patient's
+    axes, which are unknown.
 
     Raises:
         InvalidSetting: if the name or the spacing is not valid.

@@ -95,7 +95,7 @@ class Viewpoint:
 
 
 class Pictures:
-    """Pictures of a model; requests of several browsers take turns."""
+    """Renders a model from the viewpoints that browsers request, one request at a time. Thread-safe."""
 
     def __init__(self, model: Model, renderer: str, options: RendererOptions, device: str) -> None:
         """Select the renderer.

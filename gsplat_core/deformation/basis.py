@@ -207,7 +207,7 @@ class BasisField(BumpTensors):
 
         Args:
             tau: time as returned by `self.frame_time`, float or float32 [1].
-            gradient: dL/d(deltas) [N, 13], or the frame path's [N, 16].
+            gradient: dL/d(deltas) [N, 13], or [N, 16] from the backward pass of `render_frame`.
             rates: the six rates of `BasisLearningRates` in order, floats or float32 [6].
             betas: Adam's decay rates.
             epsilon: Adam's epsilon.

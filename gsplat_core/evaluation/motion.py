@@ -99,7 +99,7 @@ class Tracking:
     scaled: TrackErrors
     """Errors after scaling the model by the sequence's depth factor."""
     still: TrackErrors
-    """Baseline without motion: each point keeps the pixel and the true depth of its first frame."""
+    """Baseline without motion: each point keeps its pixel and true depth in the frame in which its tracking starts."""
     points: int
     compared: int
     """Number of point positions that were compared with the true ones."""

@@ -315,8 +315,9 @@ class LearnedPrior(FlowPrior):
     """Motion prior that mixes the last motion with those after earlier similar moments, and lets colours return to
     their mean.
 
-    The mixture is learned on the host from earlier predictions in the picture, and applied to Gaussians on the device.
-    It assumes a static camera; for a moving one it behaves like `FlowPrior`.
+    Motion is predicted as a flow and colours as an image, both on the host. The mixing weights are learned from how
+    well earlier predictions matched the frames that followed. The predictions are applied to the Gaussians on the
+    device. The prior assumes a static camera; for a moving one it behaves like `FlowPrior`.
     """
 
     def forget(self) -> None:

@@ -1,4 +1,6 @@
-"""Relief of tissue from the shading of a single static camera at several times (shape from shading).
+"""Relief of tissue, which is its depth up to a factor, from the shading in the pictures of one static camera.
+
+The method is shape from shading at several times.
 
 The logarithm of depth is a sum of cosines along the picture's sides: u = Σ c_k cos_k, z = exp(u). A surface lit by a
 small lamp at the camera's centre has the brightness cos θ / r². Here θ is the angle between the surface normal and the
@@ -221,8 +223,8 @@ class Reliefs:
 
 
 class Equations:
-    """Normal equations of a relief step for one cue (brightness, tracked tissue or highlights). The cue's other
-    unknowns are eliminated.
+    """Normal equations of one cue (brightness, tracked tissue or highlights) for a step of the relief's coefficients.
+    The cue's own unknowns, which no other cue has, are eliminated.
     """
 
     def __init__(
@@ -232,11 +234,11 @@ class Equations:
 
         Args:
             own: derivatives by the cue's own unknowns [N, M].
-            relief: derivatives by the relief [N, cosines].
+            relief: derivatives by the relief's coefficients [N, cosines].
             off: residuals [N].
             weight: weights [N].
-            prior: inverse prior variances of the own unknowns [M].
-            away: deviation of the own unknowns from their prior means [M].
+            prior: inverse prior variances of the cue's own unknowns [M].
+            away: deviation of the cue's own unknowns from their prior means [M].
             tell: weight of the cue for the relief.
         """
         weighted = own * weight[:, None]
@@ -248,7 +250,7 @@ class Equations:
         self.pull = tell * (relief.T @ (weight * off) - gain @ self._right)
 
     def own_step(self, step: Array) -> Array:
-        """Return the step of the own unknowns [M] for a step of the relief [cosines]."""
+        """Return the step of the cue's own unknowns [M], given a step of the relief's coefficients [cosines]."""
         return np.asarray(self.inverse @ (self._right - self._mixed @ step))
 
 

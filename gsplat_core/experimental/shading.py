@@ -212,10 +212,10 @@ RETURN_PX = 1.0
 MOST = 0.5
 """Largest accepted change of a pixel's log brightness; larger changes are errors or shadows."""
 LEAST_FOUND = 0.6
-"""Smallest share of the key picture's tissue that must be found again for a picture to count as tracked."""
+"""Smallest share of the key picture's tissue pixels that must be tracked for a usable comparison of two pictures."""
 WIDEST = 0.15
-"""Largest standard deviation of the change of log brightness for a picture to count as tracked; a moving scope changes
-the light more.
+"""Largest standard deviation of the change of log brightness for a usable comparison; a moving scope changes the light
+more.
 """
 
 
@@ -232,20 +232,20 @@ class Look:
 
 @dataclass(frozen=True)
 class Change:
-    """Change of the tissue in each cell of a key picture relative to another picture."""
+    """Change of the tissue from a key picture to another picture, in each cell of the key picture."""
 
     brighter: NDArray[np.float64]
     """Change of log brightness, float64 [h, w], mean over the cell."""
     share: NDArray[np.float64]
-    """Share of the cell's pixels found again, float64 [h, w]."""
+    """Share of the cell's pixels that were tracked into the other picture, float64 [h, w]."""
     moved: NDArray[np.float64]
     """Displacement in cells (columns, rows), float64 [h, w, 2]."""
     found: float
-    """Share of the key picture's tissue found again."""
+    """Share of the key picture's tissue pixels that were tracked into the other picture."""
 
     @property
     def known(self) -> NDArray[np.bool_]:
-        """Marks of cells with enough pixels found again, bool [h, w]."""
+        """Cells with enough tracked pixels, bool [h, w]."""
         return self.share >= LEAST_KNOWN
 
     @property

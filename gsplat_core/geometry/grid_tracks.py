@@ -169,7 +169,9 @@ def _from_key(
 def _found(
     start: NDArray[np.float32], pixels: NDArray[np.float32], back: NDArray[np.float32], usable: Picture
 ) -> NDArray[np.bool_]:
-    """Return which points pass the forward-backward check and are on tissue, away from the border."""
+    """Return a mask [N] of the points that pass the forward-backward check, are on tissue, and are at least `BORDER_PX`
+    inside the picture.
+    """
     height, width = usable.shape
     x, y = pixels[:, :1], pixels[:, 1:]
     returned = pixels + cv2.remap(back, x, y, cv2.INTER_LINEAR)[:, 0]

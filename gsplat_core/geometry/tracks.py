@@ -65,7 +65,7 @@ RETURN_PX = 0.7
 """Largest accepted forward-backward error in pixels."""
 BORDER_PX = 8
 SURVIVORS = 0.2
-"""Share of the points that must be found again, or the picture is skipped."""
+"""Smallest share of the points that must be found in the next picture; otherwise that picture is skipped."""
 MOST_LEFT_OUT = 15
 """Largest number of consecutively skipped pictures. After that, tracking continues with new points
 as if in a new scene.

@@ -209,7 +209,7 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
 
   // Deformation by per-Gaussian basis functions of time: deltas [N, 13] at tau, their gradients, and gradients with
   // lazy Adam. tau and the six learning rates (position, rotation, log-scale, colour, centres, widths) are float32 on
-  // the field's device. Deltas and gradients may be padded to the frame path's 16 columns.
+  // the field's device. Deltas and gradients may be padded to the 16 columns of render_frame.
   m.def("basis_field(Tensor centers, Tensor log_widths, Tensor weights, Tensor tau, bool padded=False) -> Tensor");
   m.def(
       "basis_field_backward(Tensor gradient, Tensor centers, Tensor log_widths, Tensor weights, Tensor tau) "
@@ -303,8 +303,8 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "ray_normal_loss(Tensor depths, Tensor alphas, Tensor normals, Tensor tissue, Tensor K, int camera_model) -> (Tensor, "
       "Tensor, Tensor, Tensor)");
 
-  // Loss over tissue pixels and its gradients for the frame path: image [H, W, 4] with colours and the weighted sum of
-  // z, alphas [H, W]. Returns (loss, terms, dL/dimage, dL/dalphas).
+  // Loss over tissue pixels and its gradients for the output of render_frame: image [H, W, 4] with colours and the
+  // weighted sum of z, alphas [H, W]. Returns (loss, terms, dL/dimage, dL/dalphas).
   m.def(
       "frame_loss(Tensor image, Tensor alphas, Tensor target, Tensor? mask, Tensor? target_depth, float ssim_weight, "
       "float depth_weight, bool squared=False) -> (Tensor, Tensor, Tensor, Tensor)");

@@ -52,7 +52,7 @@ CERTAIN_SHARE = 0.97
 def rigid_share(frames: Sequence[Frame]) -> float:
     """Return the share of the squared image motion that a plane in front of a moving camera explains.
 
-    It is the median over pairs of frames. It is 0 if the pictures hardly move, or if too few points are found again.
+    It is the median over pairs of frames. It is 0 if the pictures hardly move, or if too few corners can be tracked.
     """
     intervals_s = [after.time_s - before.time_s for before, after in pairwise(frames)]
     positive = [each for each in intervals_s if each > 0]
@@ -97,7 +97,7 @@ def _share(pairs: Collection[tuple[float, float]]) -> float | None:
 
 def _compared(first: Frame, second: Frame) -> tuple[float, float] | None:
     """Return the median motion of corners between two frames, and the median distance from its best homography, both in
-    pixels of the reduced pictures; None if too few corners are found again.
+    pixels of the reduced pictures; None if too few corners can be tracked.
     """
     scale = min(1.0, LONGEST_PX / max(first.width_px, first.height_px))
     size = (max(1, round(first.width_px * scale)), max(1, round(first.height_px * scale)))

@@ -26,7 +26,9 @@ WINDOW = 12
 ANCHORS = 5
 """Number of earlier key frames sharing points with the window that are kept fixed."""
 MOST_KEY_FRAMES = 40
-"""Largest number of key frames. When it is exceeded, the key frame closest to another key frame is removed."""
+"""Largest number of key frames. Beyond it, the key frame whose camera is nearest to that of another one is removed. The
+first key frame and the newest `WINDOW` are kept.
+"""
 NEIGHBOURS = 5
 """Number of known points around a new point whose median depth initialises it."""
 MOST_SIGHTINGS = 1500

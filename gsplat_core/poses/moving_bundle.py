@@ -221,9 +221,11 @@ HELD = 1e3
 RATE, RATE_PERIODS = (0.5, 0.03), (1 / 6, 2.0)
 """Breathing and heart: relative standard deviation of the rate, and its correlation time in mean periods."""
 PHASE = 1.0
-"""Prior standard deviation of a phase from that of the mean rate, in radians."""
+"""Prior standard deviation of the phases from those of a constant rate, in radians."""
 OFFSET = 0.05
-"""Prior standard deviation of the mean phase difference, in radians. The vectors contain any other offset."""
+"""Prior standard deviation of the mean difference from the phases of a constant rate, in radians. It is small because
+the motion vectors can represent a constant phase offset.
+"""
 
 
 @dataclass(frozen=True)
@@ -235,7 +237,7 @@ class Rhythm:
     expected: Tensor
     """Phases of a constant rate in radians [C, F]."""
     precision: Tensor
-    """Precision matrices of the differences [F, C, C]."""
+    """Prior precision matrices of `phases` - `expected`, one per wave frequency, [F, C, C]."""
 
     @classmethod
     def steady(cls, times_s: Tensor, frequencies_hz: Sequence[float]) -> Rhythm:

@@ -1,4 +1,4 @@
-"""One frame from raw Gaussians and deltas in plain torch: test reference of the fused frame path."""
+"""One frame from raw Gaussians and deltas in plain torch: test reference of the CUDA op `render_frame`."""
 
 from __future__ import annotations
 

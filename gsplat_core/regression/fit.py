@@ -41,9 +41,9 @@ class FitOptions:
     birth_spread: float = 2.0
     """Distance of a copy from its parent in standard deviations of the parent, for a normal draw."""
     centre_decay: float = 0.0
-    """Weight λ_b of the penalty Σ|b|² on the centres."""
+    """Weight λ_b of the penalty Σ|b|² on the splats' centres b."""
     factor_decay: float = 0.0
-    """Weight λ_A of the penalty Σ|A|² on the factors."""
+    """Weight λ_A of the penalty Σ|A|² on the splats' covariance factors A."""
     start_width: float = 0.05
     """Standard deviation of the first splats, relative to the extent of the points."""
     seed: int = 0

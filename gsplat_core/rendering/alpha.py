@@ -36,7 +36,7 @@ class AlphaRenderer:
     """Renderer that deforms, projects, sorts and alpha-blends Gaussians (Kerbl et al. 2023).
 
     On a GPU, a frame is one CUDA graph. A snapshot is rendered in its slot by a graph captured once for the slot. A
-    `Model` has its own graph, captured by `prepare`. On the CPU, and for fields without a fused frame path, the field's
+    `Model` has its own graph, captured by `prepare`. On the CPU, and for fields without `frame_deltas`, the field's
     own function deforms the model and `gsplat_core.render` renders it. The outputs of a `Surface` (`SURFACE_OUTPUTS`)
     and the motion to a later time (`FLOW_OUTPUTS`) are rendered by single launches in addition to the picture.
     """

@@ -111,7 +111,7 @@ class RenderOutput(NamedTuple):
 def render(gaussians: Gaussians, camera: Camera, background: Tensor | None = None, depth: bool = True) -> RenderOutput:
     """Render the Gaussians from one camera (Kerbl et al. 2023).
 
-    Float32 Gaussians on CUDA without gradients use the fused frame path (`render_frame`), which needs fewer launches.
+    Float32 Gaussians on CUDA without gradients use the fused op `render_frame`, which needs fewer launches.
 
     Args:
         gaussians: scene.

@@ -176,10 +176,10 @@ class TrainableRenderer(RendererKind, Protocol):
         """Return the Gaussians with the renderer's tensors in `extra`; present ones are unchanged."""
 
     def first_values(self, distance: float) -> Mapping[str, float]:
-        """Return the renderer's positive values for the whole scene before training.
+        """Return initial values, all positive, of the renderer's scalars for the whole scene, by name.
 
         Args:
-            distance: typical distance of the scene from the camera, in its unit.
+            distance: typical distance from the camera to the scene, in the scene's unit.
         """
 
     def picture(

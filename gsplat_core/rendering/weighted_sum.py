@@ -117,10 +117,10 @@ class WeightedSumRenderer:
 
     @classmethod
     def first_values(cls, distance: float) -> dict[str, float]:
-        """Return the values for the whole scene before training, all positive.
+        """Return initial values, all positive, of the renderer's scalars for the whole scene, by name.
 
         Args:
-            distance: typical distance of the scene from the camera, in its unit.
+            distance: typical distance from the camera to the scene, in the scene's unit.
         """
         return {"sigma": 2 * distance, "background": 0.1, "distance": distance}
 

@@ -1,6 +1,6 @@
 """Choice of the number of offline training steps by frames that are kept from training.
 
-The training frames themselves are split. The frames of the held-out protocol are never read.
+The training frames themselves are split. The held-out frames of the evaluation are never read.
 """
 
 from __future__ import annotations

@@ -129,7 +129,7 @@ class Evaluation:
     geometry: Geometry | None = None
     second_eye: SecondEye | None = None
     returns: Mapping[str, tuple[Return, ...]] = field(default_factory=dict)
-    """Score recovery after each return of the endoscope to a place seen before, by protocol."""
+    """Image quality after each return to a place seen before, by evaluation protocol (`live`, `causal`)."""
     logs: Mapping[str, Path] = field(default_factory=dict)
     """Files with per-frame scores, by protocol."""
 

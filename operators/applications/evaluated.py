@@ -38,7 +38,7 @@ class EvaluatedRun:
     steps_per_frame: int | None
     scale: float
     heldout: bool
-    """True if the protocol's held-out frames were excluded from training."""
+    """True if the held-out frames (1, 9, 17, ...) were excluded from training."""
     eyes: Eyes = "left"
     fps: float | None = None
     """Playback rate of a live run, in frames/s; None for the recording's own rate."""

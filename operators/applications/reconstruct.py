@@ -1,6 +1,6 @@
 """Offline reconstruction: training on all training frames at once, then display and scoring of every frame.
 
-The protocol's held-out frames are excluded from training. The evaluation uses the graph of replay with a fixed model.
+Held-out frames (1, 9, 17, ...) are excluded from training. The evaluation uses the graph of replay with a fixed model.
 """
 
 from __future__ import annotations

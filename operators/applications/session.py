@@ -45,7 +45,7 @@ class RunSettings:
     steps_per_frame: int | None
     """Optimiser steps per frame; None if training is not done frame by frame."""
     heldout: bool
-    """True if the protocol's held-out frames are excluded from training and scored separately."""
+    """True if the held-out frames (1, 9, 17, ...) are excluded from training and scored separately."""
 
 
 @dataclass(frozen=True)

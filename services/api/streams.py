@@ -188,6 +188,6 @@ async def delete_stream(request: Request, caller: CallerOf, name: ResourceName) 
 @router.put("/streams/{name}/camera")
 @requires("viewer", scope="stream")
 async def turn_virtual_camera(request: Request, name: ResourceName, wanted: VirtualCamera) -> VirtualCamera:
-    """Move the stream's virtual camera, which all viewers share; the last request wins. Nothing
+    """Set the position of the stream's virtual camera, which all viewers share; the last request wins. Nothing
     else changes, and the audit log has no entry. 409 if the stream is stopped or just starting."""
     return VirtualCamera.model_validate(await streams_of(request).set_camera(name, wanted.model_dump()))

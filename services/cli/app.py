@@ -371,7 +371,7 @@ def live(
     record_keep: RecordKeepOption = None,
     json: JsonOption = False,
 ) -> int:
-    """Reconstruct a stream live: display each frame's reconstruction within its time budget, with its age."""
+    """Reconstruct a stream live: train on each frame for a limited time, then show the result and the frame's age."""
     from services.cli.runs import live_command, live_settings
 
     with live_settings(source, out, record, record_keep or (), **options) as settings:

@@ -375,7 +375,7 @@ def camera(
     zoom: Annotated[float, typer.Option(help="Magnification.")] = 1.0,
     service: Service = Service(),
 ) -> int:
-    """Move the virtual camera of a stream, the viewpoint of the picture `orbit`."""
+    """Set the position of a stream's virtual camera, from which its `orbit` pictures are rendered."""
     service(lambda client: client.turn_camera(stream, azimuth, elevation, zoom))
     return OK
 

@@ -260,7 +260,17 @@ class Client(ReplayMethods, SnapshotMethods):
         self._ask("DELETE", f"/v1/streams/{name}")
 
     def turn_camera(self, stream: str, azimuth_deg: float = 0, elevation_deg: float = 0, zoom: float = 1) -> None:
-        """Move a stream's virtual camera, the viewpoint of the picture `orbit`."""
+        """Set the position of a stream's virtual camera, from which its pictures of kind `orbit` are rendered.
+
+        The position is absolute: each call replaces the one before. The camera orbits the point at the centre of the
+        endoscope's picture.
+
+        Args:
+            stream: name of the stream.
+            azimuth_deg: rotation to the right from the endoscope's view, in degrees.
+            elevation_deg: rotation upwards from the endoscope's view, in degrees.
+            zoom: magnification.
+        """
         wanted = {"azimuth_deg": azimuth_deg, "elevation_deg": elevation_deg, "zoom": zoom}
         self._ask("PUT", f"/v1/streams/{stream}/camera", json=wanted)
 

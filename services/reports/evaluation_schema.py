@@ -243,7 +243,7 @@ class SecondEyeFacts(Part):
 
 
 class ReturnFacts(Part):
-    """Time until a revisited place was recognised."""
+    """Image quality after one return of the endoscope to a place seen before."""
 
     again_s: Seconds
     first_db: list[Decibels]
@@ -283,7 +283,7 @@ class EvaluationReport(Part):
     geometry: GeometryFacts | None = None
     second_eye: SecondEyeFacts | None = None
     returns: dict[str, list[ReturnFacts]]
-    """Returns to known places, by protocol."""
+    """Image quality after each return to a place seen before, by evaluation protocol (`live`, `causal`)."""
     baselines: list[BaselineFacts]
     left_out: dict[str, Count]
     """Frames without a baseline score, by reason."""

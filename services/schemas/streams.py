@@ -73,7 +73,7 @@ class StreamView(BaseModel):
 
 
 class VirtualCamera(BaseModel):
-    """Position of the virtual camera relative to the endoscope, orbiting the point at the centre of its picture."""
+    """Position of the virtual camera relative to the endoscope. It orbits the centre of the endoscope's picture."""
 
     model_config = ConfigDict(
         extra="forbid", strict=True, json_schema_extra={"examples": [{"azimuth_deg": 20, "elevation_deg": 10}]}

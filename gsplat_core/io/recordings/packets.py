@@ -292,7 +292,8 @@ def is_shown(codec: str, data: bytes) -> bool:
         return bool(data[0] & 0x10)
     if codec == "vp9":
         first = data[0]
-        if first >> 6 != 2 or data[-1] & 0xE0 == 0xC0:  # damaged, or several frames in one packet: the last is shown
+        # A damaged packet counts as displayed. In a packet with several frames (superframe), the last one is displayed.
+        if first >> 6 != 2 or data[-1] & 0xE0 == 0xC0:
             return True
         rest = (first & 0x0F) << (1 if first & 0x30 == 0x30 else 0)  # profile 3 has one bit more
         return bool(rest & 0x08 or rest & 0x02)

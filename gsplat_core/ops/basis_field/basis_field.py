@@ -35,7 +35,7 @@ def basis_field(
         log_widths: float32 [N, B].
         weights: float32 [N, B, 13].
         tau: normalised time, a number or one float32 on the field's device.
-        padded: append three zero columns, the frame path's layout.
+        padded: append three zero columns, the layout that `render_frame` takes.
 
     Returns:
         Deltas [N, 13], or [N, 16] if padded.

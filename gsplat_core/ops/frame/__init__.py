@@ -1,1 +1,1 @@
-"""Fused frame path on CUDA: raw Gaussians to a picture, and the backward pass."""
+"""Op `render_frame`: a whole frame on CUDA, from raw Gaussians to the image, in a few launches."""

@@ -35,7 +35,7 @@ __all__ = [
 ]
 
 TILE_SIZE = 16
-"""Side of the frame path's tiles in pixels."""
+"""Side of the square tiles that `render_frame` divides the image into, in pixels."""
 MAX_SEGMENT = 1024
 """Largest capacity of a tile's own segment, in instances."""
 STATUS_NEEDED, STATUS_LONGEST, STATUS_OVERFLOW = range(3)

@@ -1,4 +1,4 @@
-// Host code of render_frame and accumulate_status_: checks, memory and the order of the launches.
+// Host code of render_frame and accumulate_status_: argument checks, memory and kernel launches.
 #include <algorithm>
 #include <tuple>
 

@@ -1,4 +1,4 @@
-// Checked inputs shared by the frame path's ops, converted to kernel arguments.
+// Checked inputs of render_frame and its backward pass, converted to kernel arguments.
 #pragma once
 
 #include <optional>

@@ -19,7 +19,7 @@ GAUSSIAN_TENSORS = ("means", "quats", "log_scales", "logit_opacities", "sh")
 
 
 class View(NamedTuple):
-    """Camera for the frame path; its tensors are read on the device at every launch and replay."""
+    """Camera for `render_frame` and its backward ops; the tensors are read on the device at every launch and replay."""
 
     viewmat: Tensor
     """World-to-camera matrix [4, 4], OpenCV axes."""

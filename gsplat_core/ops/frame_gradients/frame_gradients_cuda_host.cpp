@@ -1,4 +1,4 @@
-// Host code of render_frame_backward and render_frame_backward_adam_: checks, memory and the order of the launches.
+// Host code of render_frame_backward and render_frame_backward_adam_: argument checks, memory and kernel launches.
 #include <cstdint>
 #include <tuple>
 

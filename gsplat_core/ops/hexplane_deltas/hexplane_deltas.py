@@ -1,4 +1,4 @@
-"""HexPlane deltas at one time from cached space features, on CUDA for the fused frame path.
+"""HexPlane deltas at one time from cached space features, on CUDA as input of `render_frame`.
 
 Maths: `gsplat_core.reference.hexplane_deltas`. The time is read from device memory and the host
 does not synchronise, so a CUDA graph can capture the call and replay it with another time.

@@ -1,4 +1,4 @@
-// Host code of hexplane_deltas: checks, memory and the order of the launches.
+// Host code of hexplane_deltas: argument checks, memory and kernel launches.
 #include "field_arguments.h"
 
 namespace gsplat::hexplane {

@@ -1,4 +1,4 @@
-// Host code of hexplane_train and its backward pass: checks, memory and the order of the launches.
+// Host code of hexplane_train and its backward pass: argument checks, memory and kernel launches.
 #include <tuple>
 
 #include "cuda_branch.h"

@@ -56,7 +56,7 @@ struct DeviceImageLoss {
   // Rendered depth: either a plane, or the channel after the colours, which is not yet divided by alpha. If `depth` and
   // `alphas` are both null, there is no depth term.
   const float* depth;   // [H, W]
-  const float* alphas;  // [H, W], for the frame path
+  const float* alphas;  // [H, W], for images of render_frame
   const float* target_depth;
   float ssim_weight, depth_weight;
   int32_t height, width, channels, stride;

@@ -158,8 +158,8 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> image_loss(Tensor image, Tensor targe
 
 #if defined(GSPLAT_CUDA)
 
-// Loss of the frame path: the image's fourth channel is the weighted sum of z, and the depth is that channel divided by
-// alpha.
+// Loss of an image of render_frame: its fourth channel is the weighted sum of z, and the depth is that channel divided
+// by alpha.
 std::tuple<Tensor, Tensor, Tensor, Tensor> frame_loss(Tensor image, Tensor alphas, Tensor target, OptionalTensor mask,
                                                       OptionalTensor target_depth, double ssim_weight, double depth_weight,
                                                       bool squared) {

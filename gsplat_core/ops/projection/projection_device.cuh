@@ -1,4 +1,4 @@
-// Parts of CUDA projection shared by the separate op, the fused rasterization and the frame path.
+// Parts of CUDA projection shared by the separate op, the fused rasterization and render_frame.
 #pragma once
 
 #include <cuda_runtime.h>

@@ -72,7 +72,7 @@ __global__ void __launch_bounds__(kBlockThreads, 8)
   }
 }
 
-// Return the frame path's Scene for the tile lists of one image, or of all images.
+// Return the scene in the format of render_frame's kernels, for the tile lists of one image, or of all images.
 frame::Scene frame_of(const Scene& scene, int64_t count, int64_t tile_rows) {
   frame::Scene of_frame = {};
   of_frame.count = count;

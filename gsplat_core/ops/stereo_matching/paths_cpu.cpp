@@ -20,7 +20,7 @@ struct Kept {
   }
 };
 
-// Advance by one pixel. kFirst: the first path sets the messages, later paths add to them.
+// Advance a path by one pixel. With kFirst it stores its messages there, else it adds them to those of earlier paths.
 template <int kWide, bool kFirst>
 GSPLAT_INLINE void step(const uint8_t* before, const uint8_t* costs, int count, uint8_t* after, uint8_t* messages) {
   using Bytes = typename Vector<kWide>::Bytes;
@@ -38,8 +38,8 @@ GSPLAT_INLINE void step(const uint8_t* before, const uint8_t* costs, int count, 
     store_as(after + d, less(load_as<Bytes>(totals + d) - best, Bytes{} + uint8_t(kLargeStep)));
 }
 
-// Alternate between the rightward and the leftward path, so that their dependency chains overlap. The path that reaches
-// a pixel first sets its message.
+// Advance the rightward and the leftward path of a row alternately, so that their dependency chains overlap. At each
+// pixel, the path that arrives first stores its messages, and the other one adds its own to them.
 template <int kWide>
 GSPLAT_INLINE void along_row(const uint8_t* costs, uint8_t* messages, int64_t width, int count, const Kept& kept) {
   for (int64_t pixel = 0; pixel < 4; ++pixel) kept.begin(pixel);

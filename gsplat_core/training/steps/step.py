@@ -332,7 +332,7 @@ class TrainingStep:
         self._mm_per_px, self._scaled_for = mm_per_px(self.gaussians, camera), None
 
     def distance(self, camera: Camera) -> float:
-        """Return the scene's typical distance in its own units, as last computed."""
+        """Return the typical distance from the camera to the scene, in the scene's unit, as last computed."""
         return self._mm_per_px * float(camera.K[0, 0])
 
     def settle(self, observation: Observation, rate_scale: float = 1.0) -> None:
