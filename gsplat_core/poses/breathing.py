@@ -51,7 +51,7 @@ STEP_CYCLES = 0.25
 """Spacing of the tried breathing frequencies, in cycles over the recording; twice that for the heart."""
 SPREAD = 0.007
 """Cauchy scale of ray errors (x / z)."""
-ROUNDS = 2
+ROUNDS = 3
 BREATHES, BEATS = 0.75, 0.94
 """Largest accepted ratio of the cost with all frequencies to that of the static model, and of the cost with a heart
 frequency to the median over all tried heart frequencies, because any extra frequency lowers the cost a little.
@@ -192,7 +192,7 @@ FEWEST_POINTS = 60
 NEAREST, FARTHEST = 0.5, 2.0
 """Range of accepted initial depths relative to the median depth. Points outside it start at the median depth."""
 FINEST = 0.0017
-STAGES = ((0.014, 8), (0.007, 8), (0.0035, 8), *((FINEST, 8),) * 6)
+STAGES = ((0.014, 8), (0.007, 8), (0.0035, 8), *((FINEST, 8),) * 13)
 """Optimisation stages: Cauchy scale of ray errors (x / z) and number of steps. The trajectory prior is re-estimated
 before each stage.
 """
@@ -272,10 +272,10 @@ def breathing_trajectory(sightings: Sightings, placed: Tensor) -> BreathingTraje
         return None
     found, rhythm, prior = refined(start[0], sightings.times_s[frames], frequencies_hz)
     separable, mistaken = separability(start[0].poses, found.poses, sightings.times_s[frames], rhythm.phases)
-    if not separable:
+    turns = (rhythm.phases[-1] - rhythm.phases[0]) / (2 * torch.pi)
+    if not separable or float(turns[0]) < LEAST_CYCLES:
         return None
     poses = _all_placed(sightings, frames, found, start[1], rhythm)
-    turns = (rhythm.phases[-1] - rhythm.phases[0]) / (2 * torch.pi)
     frequencies_hz = tuple((turns / (sightings.times_s[frames[-1]] - sightings.times_s[frames[0]])).tolist())
     error = float(found.off().norm(dim=1).median())
     return BreathingTrajectory(poses, found.rest, frequencies_hz, max(prior.uncertain, mistaken), error)
@@ -298,8 +298,7 @@ def refined(
     bundle = with_rhythm(start, Rhythm.steady(times_s, frequencies_hz))
     for spread, rounds in STAGES:
         prior = learned_from(bundle.poses, times_s, bundle.waves)
-        bundle, _ = adjust(bundle, spread, rounds, prior)
-        bundle = _with_new_nodes(bundle)
+        bundle, _ = adjust(_with_new_nodes(bundle), spread, rounds, prior)
     assert bundle.rhythm is not None
     return bundle, bundle.rhythm, learned_from(bundle.poses, times_s, bundle.waves)
 

@@ -201,7 +201,13 @@ def errors_px(bundle: Bundle) -> Tensor:
 
 @one_thread()
 def adjust(
-    bundle: Bundle, *, fixed: Tensor, rounds: int = 15, spread_px: float = 1.0, points_move: bool = True
+    bundle: Bundle,
+    *,
+    fixed: Tensor,
+    rounds: int = 15,
+    spread_px: float = 1.0,
+    points_move: bool = True,
+    flat_px: float = 0.0,
 ) -> Bundle:
     """Minimise the robust reprojection error.
 
@@ -211,17 +217,26 @@ def adjust(
         rounds: maximum number of Levenberg-Marquardt steps.
         spread_px: Cauchy scale in pixels; errors well above it have little influence.
         points_move: optimise the points as well. If False, each camera is optimised independently.
+        flat_px: weight of a prior of little relief, for worlds whose z axis is a camera's viewing direction. A point
+            whose z differs from the median by a share x of it costs as much as a squared error of `flat_px` * x pixels.
 
     Returns:
-        The adjusted bundle. Its robust error is never larger than that of the input.
+        The adjusted bundle. Its robust error, with the prior, is never larger than that of the input.
     """
-    step = lambda bundle, damping: _step(bundle, fixed, spread_px, damping, points_move)
-    return descend(bundle, step, lambda bundle: _cost(bundle, spread_px), rounds)[0]
+    step = lambda bundle, damping: _step(bundle, fixed, spread_px, damping, points_move, flat_px)
+    return descend(bundle, step, lambda bundle: _cost(bundle, spread_px, flat_px), rounds)[0]
 
 
-def _cost(bundle: Bundle, spread_px: float) -> float:
+def _cost(bundle: Bundle, spread_px: float, flat_px: float) -> float:
     residual, _, _ = _residuals(bundle)
-    return float(torch.log1p((residual / spread_px).square().sum(1)).sum())
+    seen = torch.log1p((residual / spread_px).square().sum(1)).sum()
+    return float(seen + (flat_px / spread_px * _relief(bundle)).square().sum())
+
+
+def _relief(bundle: Bundle) -> Tensor:
+    """Return the difference of each point's z from the median, as a share of the median, [P]."""
+    depth = bundle.points[:, 2]
+    return depth / depth.median() - 1
 
 
 def _residuals(bundle: Bundle) -> tuple[Tensor, Tensor, Tensor]:
@@ -234,7 +249,7 @@ def _residuals(bundle: Bundle) -> tuple[Tensor, Tensor, Tensor]:
     return bundle.focal_px * (local[:, :2] / depth - bundle.rays), local, rotation
 
 
-def _step(bundle: Bundle, fixed: Tensor, spread_px: float, damping: float, points_move: bool) -> Bundle:
+def _step(bundle: Bundle, fixed: Tensor, spread_px: float, damping: float, points_move: bool, flat_px: float) -> Bundle:
     residual, local, rotation = _residuals(bundle)
     weight = 1 / (1 + (residual / spread_px).square().sum(1))
     by_local, by_rotation = ray_derivatives(local)
@@ -253,6 +268,10 @@ def _step(bundle: Bundle, fixed: Tensor, spread_px: float, damping: float, point
     weighted_point = (by_point * weight[:, None, None]).transpose(1, 2)
     V = summed(weighted_point @ by_point, bundle.point, points)
     h = summed((weighted_point @ residual[:, :, None])[:, :, 0], bundle.point, points)
+    if flat_px:
+        by_depth = flat_px / float(bundle.points[:, 2].median())
+        V[:, 2, 2] += by_depth**2
+        h[:, 2] += by_depth * flat_px * _relief(bundle)
     V = V + damping * diagonal_of(V)
     inverse = torch.linalg.inv(V)
     # Dense camera-by-point blocks: small enough for a few hundred cameras and a few thousand

@@ -6,6 +6,11 @@ frames so far runs at the third key frame and whenever their number has grown by
 near-planar scene need no other initialisation (Yu and Gallup, "3D Reconstruction from Accidental Motion", 2014), and
 an essential matrix is ill-conditioned there.
 
+In front of tissue that moves, points may drift far away, and rotation then explains a lateral motion of the scope. A
+prior of little relief prevents that, but recordings with much relief do not recover from it. The poses are therefore
+estimated without the prior and with it (removed after the last key frame), and those with the lower robust error are
+used.
+
 Tissue motion that is rigid as a whole is indistinguishable from scope motion. Other tissue motion is suppressed by a
 robust loss. Periodic motion, such as breathing, is modelled explicitly if the recording is long enough
 (`breathing_trajectory`). The scale is unknown: the median depth of the first frame's points is set to `RELATIVE_DISTANCE`.
@@ -43,6 +48,8 @@ FARTHEST_APART = 10
 NEIGHBOURS = 5
 """Number of known points around a new point whose median depth initialises it."""
 POSE_ROUNDS, ROUNDS = 10, 25
+FLAT_PX = 33.0
+"""Weight of the prior of little relief (`flat_px` of `adjust`)."""
 GROWTH = 1.3
 """Growth factor of the number of key frames from one bundle adjustment to the next."""
 
@@ -151,7 +158,29 @@ class _Odometry:
 
     @one_thread()
     def run(self, separate_breathing: bool) -> Trajectory:
-        """Process all frames in order, then place the frames between key frames again with the final points."""
+        """Estimate the poses with both starts of the relief, and keep those with the lower robust error."""
+        found = [self._followed(flat_px) for flat_px in (0.0, FLAT_PX)]
+        self._poses, self._points, _ = min(found, key=lambda each: each[2])
+        moving = self._refined_for_breathing() if separate_breathing else None
+        if moving is not None:
+            self._poses = moving.poses
+        for frame in self._lost:
+            self._poses[frame] = self._poses[frame - 1]
+        return self._result(moving)
+
+    def _followed(self, flat_px: float) -> tuple[Tensor, Tensor, float]:
+        """Process all frames in order, then place the frames between key frames again with the final points.
+
+        Args:
+            flat_px: weight of the prior of little relief until the last key frame.
+
+        Returns:
+            The poses [N, 4, 4], the points [P, 3], and their robust error over all observations.
+        """
+        self._poses = torch.eye(4, dtype=torch.float64).repeat(self._count, 1, 1)
+        self._points = torch.zeros_like(self._points)
+        self._known = torch.zeros_like(self._known)
+        self._lost = []
         self._take_up(0)
         keys, next_adjustment = 1, 3
         for frame in range(1, self._count):
@@ -163,17 +192,19 @@ class _Odometry:
             self._take_up(frame)
             keys += 1
             if keys >= next_adjustment or frame == self._count - 1:
-                self._adjust(frame)
+                self._adjust(frame, flat_px)
                 next_adjustment = max(keys + 1, int(keys * GROWTH) + 1)
         for frame in range(1, self._count):
             if not self._is_key[frame]:
                 self._place(frame)
-        moving = self._refined_for_breathing() if separate_breathing else None
-        if moving is not None:
-            self._poses = moving.poses
-        for frame in self._lost:
-            self._poses[frame] = self._poses[frame - 1]
-        return self._result(moving)
+        return self._poses, self._points, float(torch.log1p(errors_px(self._whole()).square()).sum())
+
+    def _whole(self) -> Bundle:
+        """Return the bundle of all frames and their known points."""
+        chosen = self._known[self._point]
+        return Bundle(
+            self._poses, self._points, self._frame[chosen], self._point[chosen], self._rays[chosen], self._focal
+        )
 
     def _of(self, frame: int) -> slice:
         return slice(int(self._bounds[frame]), int(self._bounds[frame + 1]))
@@ -210,7 +241,7 @@ class _Odometry:
         self._points[point[new]] = (local - pose[:3, 3]) @ pose[:3, :3]
         self._known[point[new]] = True
 
-    def _adjust(self, last: int) -> None:
+    def _adjust(self, last: int, flat_px: float) -> None:
         """Run bundle adjustment over the key frames up to `last` and restore the unit of length."""
         keys = torch.nonzero(self._is_key[: last + 1])[:, 0]
         chosen = self._is_key[self._frame] & (self._frame <= last)
@@ -222,7 +253,9 @@ class _Odometry:
         bundle = Bundle(self._poses[keys], self._points[used], camera, point, self._rays[chosen], self._focal)
         fixed = torch.zeros(len(keys), dtype=torch.bool)
         fixed[0] = True
-        bundle = adjust(bundle, fixed=fixed, rounds=ROUNDS)
+        bundle = adjust(bundle, fixed=fixed, rounds=ROUNDS, flat_px=flat_px)
+        if flat_px and last == self._count - 1:
+            bundle = adjust(bundle, fixed=fixed, rounds=ROUNDS)
         self._poses[keys], self._points[used] = bundle.poses, bundle.points
         first = self._points[self._point[self._of(0)]]
         unit = float(first[:, 2].median())
@@ -247,12 +280,10 @@ class _Odometry:
             breathing = Breathing(moving.frequencies_hz, moving.uncertain * RELATIVE_DISTANCE)
             tissue, error_px = (moving.points * RELATIVE_DISTANCE).numpy(), moving.error * self._focal
             return Trajectory(poses.numpy(), tissue, error_px, still_error_px, tuple(self._lost), breathing)
-        chosen, points = self._known[self._point], self._points * RELATIVE_DISTANCE
-        whole = Bundle(poses, points, self._frame[chosen], self._point[chosen], self._rays[chosen], self._focal)
         return Trajectory(
             poses.numpy(),
-            points[self._known].numpy(),
-            float(errors_px(whole).median()),
+            (self._points[self._known] * RELATIVE_DISTANCE).numpy(),
+            float(errors_px(self._whole()).median()),
             still_error_px,
             tuple(self._lost),
         )
