@@ -11,6 +11,7 @@ import torch
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.bundle import save_bundle
+from gsplat_core.rendering.renderer import RendererOptions
 from operators.applications.render import render_model, render_picture
 from operators.errors import DeviceMissing, OutputError, OutputFolderInUse
 
@@ -102,3 +103,9 @@ def test_an_unknown_renderer_is_refused_before_the_model_is_read(tmp_path):
     assert not (tmp_path / "images").exists()
     with pytest.raises(InvalidSetting, match="sculptor"):
         render_picture(tmp_path / "missing", renderer="sculptor")
+
+
+def test_an_option_that_a_renderer_does_not_have_is_refused_before_the_model_is_read(tmp_path):
+    with pytest.raises(InvalidSetting, match="'alpha' has no option samples; choose stochastic or points"):
+        render_model(tmp_path / "none", tmp_path / "out", options=RendererOptions(samples=4))
+    assert not (tmp_path / "out").exists()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -13,6 +14,7 @@ from gsplat_core.errors import InvalidSetting, RecordingMissing
 from gsplat_core.evaluation.baselines import Baselines
 from gsplat_core.io.bundle import load_bundle
 from gsplat_core.io.recordings import open_recording
+from gsplat_core.scene.cameras import Camera
 from gsplat_core.training.config import ReconstructorConfig
 from operators import pipeline as pipeline_module
 from operators.applications import replay as replay_module
@@ -225,3 +227,24 @@ def test_a_black_picture_is_withheld_as_in_a_live_stream(tiny, tmp_path):
     assert training.withheld == {"black": 1} and training.frames == 3
     assert (quality.frames, quality.trained.count) == (4, 3)
     assert any("withheld and not scored (black: 1)" in note for note in outcome.notes)
+
+
+@pytest.mark.parametrize(
+    ("model", "poses", "refused"),
+    [("fisheye", "estimated", True), ("fisheye", "auto", False), ("fisheye", "given", False), ("pinhole", "estimated", False)],
+)  # fmt: skip
+def test_poses_that_cannot_be_estimated_are_refused_before_the_first_frame(
+    settings, monkeypatch, model, poses, refused
+):
+    source = replay_module.open_source(settings.recording)
+    about = source.description
+    camera = Camera(about.camera.K, about.width_px, about.height_px, model=model)
+    other = SimpleNamespace(description=replace(about, camera=camera))
+    monkeypatch.setattr(replay_module, "open_source", lambda *_: other)
+    wanted = replace(settings, poses=poses)
+    if not refused:
+        wanted.out.mkdir()
+        assert replay_module.prepare(wanted, []) is other
+        return
+    with pytest.raises(InvalidSetting, match="this one is fisheye: undistort the pictures"):
+        replay_module.prepare(wanted, [])
