@@ -9,7 +9,10 @@ import torch
 from gsplat_core import Camera, InvalidInput, load_bundle, save_bundle
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.losses.loss import LossContext
+from gsplat_core.training.losses.semantics import Semantics
 from gsplat_core.training.reconstructor import Reconstructor
+from tests.gsplat_core.training.test_surface_losses import SMALL, observation, wall
 
 CAMERA = Camera.from_focal(90.0, 64, 48)
 
@@ -65,3 +68,22 @@ def test_labels_change_neither_colours_nor_geometry():
 def test_labels_must_have_the_size_of_the_picture():
     with pytest.raises(InvalidInput, match="labels is \\[2, 2\\]"):
         Frame(0, 0, np.zeros((4, 4, 3), np.uint8), labels=np.zeros((2, 2), np.uint8))
+
+
+def test_classes_are_0_to_3_and_other_labels_are_unknown():
+    """Without logits all four classes are as likely, and only pixels with a class count."""
+    loss, context = Semantics(), LossContext([], lambda _: wall(0.0))
+    scene = loss.extended(wall(0.0))
+    assert scene.extra["semantics"].shape == (scene.count, 4) and not scene.extra["semantics"].any()
+    assert loss.extended(scene) is scene
+    logits = torch.zeros(scene.count, 4)
+    logits[:, 3] = 1.0
+    sure = replace(scene, extra={"semantics": logits})
+    seen = observation(SMALL)
+    assert loss(scene, seen, context) is None
+    labels = torch.full((SMALL[1], SMALL[0]), 4, dtype=torch.uint8)
+    assert float(loss(sure, replace(seen, labels=labels), context)) == 0
+    labels[:, :45] = 3
+    assert float(loss(scene, replace(seen, labels=labels), context)) == pytest.approx(np.log(4), rel=1e-3)
+    expected = np.log(3 + np.e) - 1
+    assert float(loss(sure, replace(seen, labels=labels), context)) == pytest.approx(expected, rel=0.02)
