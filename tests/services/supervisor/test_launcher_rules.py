@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import os
+import signal
 import socket
+import sys
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -183,3 +186,29 @@ def test_a_launcher_is_asked_every_second_and_started_again_when_it_has_ended(tm
     assert 0.5 <= times[0] < 0.6
     assert np.diff(times).round(2).tolist() == [1.0] * (len(times) - 1)
     assert there == [True, True, False, True, True, True, False]
+
+
+@pytest.mark.parametrize(("argument", "code"), [("7", 7), ("wrong", 1)])
+def test_a_forked_process_has_its_environment_log_and_session_and_ends_with_the_code_of_its_module(
+    tmp_path, monkeypatch, argument, code
+):
+    module = ModuleType("forked_by_a_test")
+
+    def main(arguments):
+        os.write(1, f"{os.environ['INTRASPLAT_FORKED']} {arguments} {os.getsid(0) == os.getpid()}\n".encode())
+        os.write(2, b"error\n")
+        return int(arguments[0])
+
+    module.main = main  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    monkeypatch.setattr(signal, "signal", lambda number, handler: os.write(log, f"{number} {handler!r}\n".encode()))
+    log = os.open(tmp_path / "log", os.O_CREAT | os.O_WRONLY | os.O_APPEND, 0o600)
+    pid = os.fork()
+    if pid == 0:
+        launchers._become(module.__name__, [argument], {"INTRASPLAT_FORKED": "yes"}, log)
+    os.close(log)
+    assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == code
+    lines = (tmp_path / "log").read_text().splitlines()
+    assert sorted(int(line.split()[0]) for line in lines[:3]) == sorted((signal.SIGTERM, signal.SIGINT, signal.SIGHUP))
+    assert lines[3:5] == [f"yes ['{argument}'] True", "error"]
+    assert "INTRASPLAT_FORKED" not in os.environ
