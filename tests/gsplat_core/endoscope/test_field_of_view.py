@@ -219,3 +219,18 @@ def test_a_smaller_field_is_accepted_after_three_windows(monkeypatch, windows, i
     found = masks([*seen_through(large, count=3), *seen_through(small, count=1 + 2 * windows)])
     assert overlap(found[2], large) > 0.92
     assert overlap(found[-1], small if is_taken else large) > 0.9
+
+
+def test_a_window_of_thirty_frames_is_judged_by_the_brightest_and_darkest_level_of_each_pixel(monkeypatch):
+    judged = []
+    monkeypatch.setattr(field_of_view, "find_outline", lambda *levels: judged.append(levels))
+    view, levels = FieldOfView(), np.random.default_rng(0).integers(30, 220, (61, 12, 16))
+    for each in levels:
+        view.observe(np.repeat(each[..., None], 3, 2).astype(np.uint8))
+    assert len(judged) == 3
+    for found, window in zip(judged, (levels[:1], levels[:30], levels[30:60]), strict=True):
+        shown = window.repeat(10, 1).repeat(10, 2)  # enlarged to 160 pixels
+        if found[0].shape == (12, 16):
+            shown = window
+        for each, expected in zip(found, (shown.max(0), shown.min(0)), strict=True):
+            assert np.abs(each.astype(int) - expected).max() <= 1

@@ -66,7 +66,7 @@ def test_points_are_found_again_behind_a_tool():
 
 
 def test_five_references_each_20_pictures_apart_are_found_at_once():
-    seen = followed_tracks(*[np.ascontiguousarray(view(0)[:90, :120])] * 102)
+    seen = followed_tracks(*[np.ascontiguousarray(view(0)[:70, :80])] * 102)
     first = np.full(seen.point.max() + 1, 999)
     np.minimum.at(first, seen.point, seen.frame)
     assert np.unique(first).tolist() == [0, 20, 40, 60, 80, 100]

@@ -367,3 +367,31 @@ def test_an_error_of_disparity_is_one_of_depth_by_its_square():
     both = frame.with_fields(right_image=frame.image, right_camera=camera.with_pose(pose))
     np.testing.assert_allclose(stereo._depth_error(variance, depth, both, camera), [[0.1, 0.8]], rtol=1e-6)
     np.testing.assert_allclose(stereo._depth_error(variance, depth, frame, camera), [[0.4, 3.2]], rtol=1e-6)
+
+
+def test_points_of_both_eyes_keep_three_pixels_from_overexposed_ones():
+    left = np.random.default_rng(0).uniform(40, 200, (60, 80)).astype(np.float32)
+    left = np.clip(cv2.resize(left, (240, 180), interpolation=cv2.INTER_CUBIC), 0, 240).astype(np.uint8)
+    for column in range(20, 230, 16):
+        left[:, column : column + 2] = 255
+    right = np.roll(left, -6, 1)
+    here, there, tried = stereo._points_in_both(left, right, None)
+    bright = np.array([column for start in range(20, 230, 16) for column in (start, start + 1)])
+    away = np.abs(np.rint(here[:, :1]) - bright).min(1)
+    assert tried >= len(here) > 20 and away.min() == 4 and np.count_nonzero(away <= 6) > 5
+    np.testing.assert_allclose(np.median(here - there, axis=0), [6, 0], atol=0.1)
+
+
+@pytest.mark.parametrize("calibrated", [True, False])
+def test_a_pair_with_a_right_camera_is_judged_as_a_calibrated_one(monkeypatch, calibrated):
+    asked = []
+    look = stereo.PairLook(np.arange(10.0), np.zeros(3), np.zeros((10, 2), np.float32), 0.1)
+    monkeypatch.setattr(stereo, "look_at", lambda left, right, mask: look)
+    monkeypatch.setattr(
+        stereo, "_why_implausible", lambda look, parallel_px, *, calibrated: asked.append(calibrated) or "it is"
+    )
+    image = np.zeros((6, 8, 3), np.uint8)
+    camera = Camera.from_focal(100.0, 8, 6)
+    frame = Frame(0, 0, image, right_image=image, right_camera=camera if calibrated else None)
+    found = StereoDepth()._look(image[..., 0], image[..., 0], frame, 0.0)
+    assert asked == [calibrated] and found.doubt == "it is"

@@ -17,7 +17,7 @@ from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.steps.step import TrainingStep
 from gsplat_core.training.strategies.adc import CappedAdc
 from gsplat_core.training.strategies.mcmc import SceneMcmc
-from gsplat_core.training.strategies.operations import remove, split
+from gsplat_core.training.strategies.operations import draw, remove, split
 from gsplat_core.training.strategies.scene import Plan, change_rows
 
 COUNT = 90
@@ -140,3 +140,14 @@ def test_strategies_of_alpha_blending_name_what_works_with_other_renderers(name)
         ReconstructorConfig(renderer="weighted_sum", strategy=name)
     assert ReconstructorConfig(renderer="points", strategy=name).strategy == name
     assert STRATEGIES[name].library is not None
+
+
+@pytest.mark.parametrize("count", [1000, (1 << 24) + 2])
+def test_indices_are_drawn_in_proportion_to_any_number_of_weights(count):
+    """`torch.multinomial` takes up to 2^24 of them."""
+    weights = torch.zeros(count)
+    weights[7], weights[count - 1] = 1.0, 3.0
+    drawn = draw(weights, 4000, torch.Generator().manual_seed(0))
+    found, counts = drawn.unique(return_counts=True)
+    assert drawn.dtype == torch.int64 and found.tolist() == [7, count - 1]
+    assert counts[1] / 4000 == pytest.approx(0.75, abs=0.03)

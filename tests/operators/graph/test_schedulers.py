@@ -8,6 +8,7 @@ import subprocess
 import sys
 import textwrap
 import threading
+from types import SimpleNamespace
 
 import pytest
 
@@ -15,12 +16,14 @@ from operators.errors import EngineUnsupported, GraphInvalid, OperatorStuck
 from operators.graph import (
     AsynchronousCondition,
     AsynchronousEventState,
+    GreedyScheduler,
     ManualClock,
     MultiThreadScheduler,
     Operator,
     PeriodicCondition,
     StopReason,
     run,
+    schedulers,
 )
 
 
@@ -254,3 +257,14 @@ def test_sigterm_still_ends_the_process_after_a_run(runner):
     command = [sys.executable, "-c", textwrap.dedent(TERMINATED), runner.engine]
     done = subprocess.run(command, capture_output=True, timeout=300, check=False)
     assert done.returncode == -signal.SIGTERM, done.stderr
+
+
+def test_a_greedy_scheduler_waits_until_an_operator_is_due(monkeypatch):
+    waits = []
+    monkeypatch.setattr(schedulers, "interruptible_wait", lambda woken, seconds=None: waits.append(seconds))
+    scheduler = GreedyScheduler(clock=SimpleNamespace(timestamp=lambda: 3_000_000_000))
+    assert scheduler._await(3_250_000_000, False) and waits == [pytest.approx(0.25)]
+    assert scheduler._await(None, True) and waits[1:] == [None]
+    assert not scheduler._await(None, False)
+    scheduler.wake()
+    assert scheduler._await(None, False) and len(waits) == 2
