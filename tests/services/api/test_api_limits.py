@@ -1,4 +1,4 @@
-"""Limits of the values that clients send. Narrower ones would refuse requests that are valid today."""
+"""Limits of the values that clients send, and statuses of answers. Clients rely on both."""
 
 from __future__ import annotations
 
@@ -47,3 +47,65 @@ def test_the_api_document_states_the_limits_of_all_values(plane):
     for name, limits in limits_in(plane.client.get("/openapi.json").json()):
         found.setdefault(name, set()).add(limits)
     assert found == LIMITS
+
+
+STATUSES = {
+    "get /metrics": "200",
+    "get /v1/version": "200",
+    "get /v1/config": "200",
+    "get /v1/config/schema": "200",
+    "get /v1/streams": "200",
+    "post /v1/streams": "201 408 409 415",
+    "get /v1/streams/{name}": "200 404",
+    "delete /v1/streams/{name}": "204 404 409",
+    "post /v1/streams/{name}/start": "200 404 409",
+    "post /v1/streams/{name}/stop": "200 404 409",
+    "patch /v1/streams/{name}/options": "200 404 408 409 415",
+    "put /v1/streams/{name}/camera": "200 404 408 409 415 507",
+    "get /v1/streams/{name}/mjpeg": "200 404 409",
+    "get /v1/models": "200",
+    "get /v1/models/{name}/versions": "200 404",
+    "put /v1/models/{name}/versions": "201 404 408 409 415 507",
+    "get /v1/models/{name}/versions/{number}": "200 404",
+    "delete /v1/models/{name}/versions/{number}": "204 404 409",
+    "post /v1/models/{name}/activate": "200 404 408 409 415",
+    "post /v1/models/{name}/rollback": "200 404 409",
+    "post /v1/streams/{name}/snapshots": "201 404 408 409 415",
+    "get /v1/streams/{name}/snapshots": "200 404",
+    "get /v1/streams/{name}/snapshots/{number}": "200 404",
+    "delete /v1/streams/{name}/snapshots/{number}": "204 404 409",
+    "get /v1/models/{name}/versions/{number}/exports/{format}": "200 404 409",
+    "post /v1/models/{name}/versions/{number}/render": "200 404 408 409 415",
+    "get /v1/streams/{name}/snapshots/{number}/exports/{format}": "200 404",
+    "post /v1/replays": "202 404 408 409 415",
+    "get /v1/replays": "200",
+    "get /v1/replays/{job_id}": "200 404",
+    "delete /v1/replays/{job_id}": "204 404 409",
+    "get /v1/batches/{batch}": "200 404",
+    "post /v1/replays/{job_id}/cancel": "200 404 409",
+    "get /v1/replays/{job_id}/results/{file}": "200 206 404",
+    "post /v1/replays/{job_id}/keep": "201 404 408 409 415",
+    "get /v1/recordings": "200",
+    "get /v1/recordings/{name}": "200 404",
+    "put /v1/recordings/{name}": "200 201 404 408 409 415 507",
+    "delete /v1/recordings/{name}": "204 404 409",
+    "get /v1/me": "200",
+    "get /v1/keys": "200",
+    "post /v1/keys": "201 408 409 415",
+    "delete /v1/keys/{key_id}": "204 404 409",
+    "post /v1/tickets": "201 408 409 415",
+    "get /v1/audit": "200",
+    "get /v1/audit/export": "200",
+}
+"""Statuses by operation that answers a caller with a key, in addition to those that each of them may answer with."""
+ALWAYS = {"400", "401", "403", "413", "421", "422", "429", "431", "500", "503"}
+
+
+def test_the_api_document_states_the_statuses_of_all_operations(plane):
+    paths = plane.client.get("/openapi.json").json()["paths"]
+    found = {
+        f"{method} {path}": set(each["responses"]) for path, item in paths.items() for method, each in item.items()
+    }
+    guarded = {name: statuses for name, statuses in found.items() if "401" in statuses}
+    assert set(found) - set(guarded) == {"get /livez", "get /readyz"}
+    assert guarded == {name: {*ALWAYS, *statuses.split()} for name, statuses in STATUSES.items()}
