@@ -131,6 +131,7 @@ def watch(monkeypatch):
         now = SimpleNamespace(s=0.0)
 
         def wait(seconds: float) -> bool:
+            assert 0 < seconds <= 0.5, "an orphan ends 1.25 s after the death of its supervisor"
             now.s = next(looks, -1.0)
             then(now.s)
             return now.s < 0
