@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -136,6 +137,19 @@ def followed_part(frame: Frame) -> NDArray[np.uint8] | None:
     return np.logical_and.reduce([mask != 0 for mask in masks]).astype(np.uint8) if masks else None
 
 
+class _Followed(NamedTuple):
+    """Poses of all frames from one start of the relief."""
+
+    poses: Tensor
+    """World-to-camera, [N, 4, 4]."""
+    points: Tensor
+    """[P, 3]."""
+    lost: list[int]
+    """Frames with too few known points."""
+    error: float
+    """Robust error, summed over all observations."""
+
+
 class _Odometry:
     """State of one recording's estimate, float64 on the CPU. Equal observations give bit-identical results."""
 
@@ -160,7 +174,8 @@ class _Odometry:
     def run(self, separate_breathing: bool) -> Trajectory:
         """Estimate the poses with both starts of the relief, and keep those with the lower robust error."""
         found = [self._followed(flat_px) for flat_px in (0.0, FLAT_PX)]
-        self._poses, self._points, _ = min(found, key=lambda each: each[2])
+        best = min(found, key=lambda each: each.error)
+        self._poses, self._points, self._lost = best.poses, best.points, best.lost
         moving = self._refined_for_breathing() if separate_breathing else None
         if moving is not None:
             self._poses = moving.poses
@@ -168,14 +183,11 @@ class _Odometry:
             self._poses[frame] = self._poses[frame - 1]
         return self._result(moving)
 
-    def _followed(self, flat_px: float) -> tuple[Tensor, Tensor, float]:
+    def _followed(self, flat_px: float) -> _Followed:
         """Process all frames in order, then place the frames between key frames again with the final points.
 
         Args:
             flat_px: weight of the prior of little relief until the last key frame.
-
-        Returns:
-            The poses [N, 4, 4], the points [P, 3], and their robust error over all observations.
         """
         self._poses = torch.eye(4, dtype=torch.float64).repeat(self._count, 1, 1)
         self._points = torch.zeros_like(self._points)
@@ -197,7 +209,8 @@ class _Odometry:
         for frame in range(1, self._count):
             if not self._is_key[frame]:
                 self._place(frame)
-        return self._poses, self._points, float(torch.log1p(errors_px(self._whole()).square()).sum())
+        error = float(torch.log1p(errors_px(self._whole()).square()).sum())
+        return _Followed(self._poses, self._points, self._lost, error)
 
     def _whole(self) -> Bundle:
         """Return the bundle of all frames and their known points."""

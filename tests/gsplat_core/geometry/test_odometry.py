@@ -206,9 +206,10 @@ def test_key_frames_are_sixty_or_one_in_ten_and_the_last(count, apart):
 
 def test_bundles_are_adjusted_when_their_key_frames_have_grown_by_a_third(monkeypatch):
     adjusted = []
-    monkeypatch.setattr(odometry._Odometry, "_adjust", lambda self, last: adjusted.append(last + 1))
+    monkeypatch.setattr(odometry._Odometry, "_adjust", lambda self, last, flat_px: adjusted.append((flat_px, last + 1)))
     odometry_of(exact(40), 40).run(False)
-    assert adjusted == [3, 4, 6, 8, 11, 15, 20, 27, 36, 40]
+    frames = [3, 4, 6, 8, 11, 15, 20, 27, 36, 40]
+    assert adjusted == [(flat_px, last) for flat_px in (0.0, odometry.FLAT_PX) for last in frames]
 
 
 @pytest.mark.parametrize(("left", "lost"), [(23, (5,)), (24, ())])
