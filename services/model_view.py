@@ -81,7 +81,7 @@ class ModelView:
         self._server.stop()
 
     def run(self, stop_requested: Callable[[], bool]) -> None:
-        """Follow the slider until a stop is requested."""
+        """Show the model at the slider's time, and advance the slider during playback, until a stop is requested."""
         start_s, end_s = self._model.time_window_s
         wait = threading.Event()
         before_s = time.monotonic()

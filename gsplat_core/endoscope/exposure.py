@@ -94,10 +94,13 @@ UNCHANGED: Gains = (1.0, 1.0, 1.0)
 
 
 DEAD_ZONE = 0.08
-"""Difference of a log gain from the held gain up to which the gain stays held."""
+"""Difference between the measured and the held log exposure gain up to which the gain stays held, in the comparison
+with the previous frame.
+"""
 DRIFT_ZONE = 0.1
-"""Difference of a log gain from the held gain up to which it stays held, for slow changes measured by older references;
-larger than `DEAD_ZONE`, because the tissue has moved since.
+"""Difference between the measured and the held log exposure gain up to which the gain stays held, in the comparison
+with earlier pictures that detects slow changes. Larger than `DEAD_ZONE`, because the tissue has moved since those
+pictures.
 """
 MORE_PIXELS = 1.5
 """Ratio of the pixels that agree with a gain change to those that agree with no change, from which the change is

@@ -48,7 +48,9 @@ class StripDetector:
 
     def __init__(self) -> None:
         self.mask: NDArray[np.uint8] | None = None
-        """Mask uint8 [H, W], 0 on strips and text; None without any. Read-only, and the same array until it changes."""
+        """Mask uint8 [H, W], 0 on overlays (strips and text at the borders); None without overlays. Read-only.
+        A new array is set when the overlays change.
+        """
         self._shape: tuple[int, ...] = ()
         self._bands: list[_Band] = []
         self._small: tuple[int, int] = (0, 0)

@@ -43,7 +43,9 @@ class FlatDepths(NamedTuple):
 
 
 def flat_depths(rays: Array, z: Array) -> FlatDepths | None:
-    """Return both baselines for one frame; None for fewer than three pixels.
+    """Return two trivial depth maps of one frame, fitted to its true depth: a level plane and a tilted plane.
+
+    None for fewer than three pixels.
 
     Args:
         rays: (x/z, y/z, 1) of the pixels [N, 3].

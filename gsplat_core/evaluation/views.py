@@ -62,7 +62,7 @@ class NovelViewSums:
         self._seen, self._frames = 0.0, 0
 
     def add(self, view: Frame, seen: NDArray[np.bool_], picture: Any, left: Any, shifted: Any) -> None:
-        """Score a rendered picture and both baselines against the view, over the pixels in `seen`.
+        """Score a rendered picture and the baselines `left` and `shifted` against the view, over the pixels in `seen`.
 
         Args:
             view: frame of the novel view's camera.

@@ -330,7 +330,10 @@ def together_px(off: Array, tracks: GridTracks) -> Array:
 
 
 def _gathered(values: Array, where: NDArray[np.integer], size: tuple[int, int]) -> Array:
-    """Return sums of `values` [N] over cells, blurred by the neighbourhood."""
+    """Return sums of `values` [N] in the cells of a grid, blurred with a Gaussian, [rows, columns].
+
+    `where` [N] is the flat cell index of each value; `size` is (rows, columns).
+    """
     sums = np.bincount(where, values, size[0] * size[1]).reshape(size)
     return np.asarray(cv2.GaussianBlur(sums, (0, 0), AROUND_PX / CELL_PX, borderType=cv2.BORDER_CONSTANT))
 

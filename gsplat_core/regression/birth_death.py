@@ -29,7 +29,7 @@ def probabilities(phi: Tensor, rate: float) -> tuple[Tensor, Tensor]:
 
     Args:
         phi: ∂L/∂ln o of each splat, [N]. Non-finite values count as the mean.
-        rate: events per splat at one standard deviation from the mean.
+        rate: rate of death or duplication of a splat whose φ is one standard deviation above or below the mean.
     """
     finite = phi.isfinite()
     count = finite.sum().clamp(min=1)

@@ -37,7 +37,9 @@ class FitOptions:
     birth_until: float = 0.7
     """Share of the steps after which rounds end, so that the last copies are trained."""
     birth_rate: float = 0.5
-    """Events per splat and round at one standard deviation of ∂L/∂ln|v|."""
+    """Death rate per round of a splat whose ∂L/∂ln|v| is one standard deviation above the mean of all splats; v is its
+    value. Each dead splat is replaced by a copy of a splat below the mean.
+    """
     birth_spread: float = 2.0
     """Distance of a copy from its parent in standard deviations of the parent, for a normal draw."""
     centre_decay: float = 0.0

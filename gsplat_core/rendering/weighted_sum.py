@@ -126,7 +126,7 @@ class WeightedSumRenderer:
 
     @classmethod
     def weights(cls, depths: Tensor, gaussians: Gaussians, values: Mapping[str, Tensor]) -> Tensor:
-        """Return ω [N] of the Gaussians at the camera depths [N]."""
+        """Return the blending weights ω [N] of the Gaussians at the camera depths [N]."""
         return (1 - depths / values["sigma"]).clamp(min=0) * gaussians.extra[FACTOR]
 
     @classmethod

@@ -49,7 +49,7 @@ class LateDepth:
     believed: Tensor | None
     """Target of the depth loss, float32 [H, W], 0 where not confident; None if the loss ignores this depth source."""
     possible: Tensor | None
-    """Depth for correcting the scene, float32 [H, W], 0 where unknown; None if unknown everywhere."""
+    """Depth towards which the scene is moved, float32 [H, W], 0 where unknown; None if unknown everywhere."""
     everywhere: Tensor | None
     """`possible` extrapolated to all pixels, for moving a whole scene to its first depth; None if not yet computed."""
 
@@ -69,7 +69,9 @@ class LateDepth:
 
     @staticmethod
     def for_placement(frame: Frame, device: torch.device | str) -> LateDepth:
-        """Prepare only the fields for correcting the scene, for a frame that was already trained on with its depth."""
+        """Prepare only `possible`, the depth towards which the scene is moved. For a frame whose depth loss was already
+        trained.
+        """
         possible = possible_depth(frame)
         return LateDepth(None, known_depth(possible, device) if possible.any() else None, None)
 
@@ -197,7 +199,10 @@ class CapturedCorrection:
 
 
 class Placement:
-    """Depth corrections of consecutive scenes: the first depth places the whole scene, later ones refine it."""
+    """Moves the Gaussians of consecutive scenes to the depth that frames bring.
+
+    The first depth map moves a whole scene to its distance. Later ones move its regions by smaller amounts.
+    """
 
     def __init__(self, *, postpones: bool = False) -> None:
         """Create the corrections of a stream, before its first scene.

@@ -21,18 +21,18 @@ from gsplat_core.training.steps.step import TrainingStep
 from gsplat_core.transfers import HostCopy
 
 MOST_PLACES = 8
-"""Largest number of stored left scenes. The one that the stream left first is dropped."""
+"""Largest number of earlier scenes that are stored. The oldest is dropped."""
 RENDERED_PX = 160
-"""Width in pixels at which a left scene is rendered for comparison."""
+"""Width in pixels at which an earlier scene is rendered for comparison."""
 COMPARED_PX = 64
 """Width at which pictures are compared, in pixels; small enough to tolerate motion of a few pixels."""
 FINE_PX, COARSE_PX = 1.0, 16.0
 """Standard deviations, in pixels of the compared pictures, of the band-pass filter that removes noise and illumination.
 """
 SAME_PLACE = 0.75
-"""Correlation from which a picture counts as showing a left scene. See benchmarks/results/constants.md."""
+"""Correlation from which a picture counts as showing an earlier scene. See benchmarks/results/constants.md."""
 LEAST_SHARE = 0.3
-"""Smallest share of the picture that must be both tissue and covered by the left scene."""
+"""Smallest share of the picture that must be both tissue and covered by the earlier scene."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class Structure:
 
 @dataclass
 class Place:
-    """Scene left by a stream, in host memory."""
+    """Earlier scene, which the stream has left, in host memory."""
 
     gaussians: Gaussians
     """Last state of the Gaussians, without a deformation field."""
@@ -91,8 +91,9 @@ class Place:
     _seen: dict[Camera, Structure] = field(default_factory=dict, repr=False)
 
     def structure(self, camera: Camera) -> Structure:
-        """Return the structure of the left scene from a camera. It is rendered unless the last one was from the same
-        camera.
+        """Render the earlier scene from a camera and return the band-pass filtered picture.
+
+        The result for the last camera is cached.
         """
         if camera not in self._seen:
             with torch.no_grad():
@@ -105,7 +106,7 @@ class Place:
 
 
 class Places:
-    """Store of the scenes left most recently."""
+    """Store of the scenes that the stream left most recently."""
 
     def __init__(self, most: int = MOST_PLACES) -> None:
         self._most = most
@@ -128,10 +129,10 @@ class Places:
         self._left = [*self._left, place][-self._most :] if self._most else []
 
     def take(self, frame: Frame) -> Place | None:
-        """Remove and return the left scene that a frame shows, or None if it shows none.
+        """Remove and return the earlier scene that a frame shows, or None if it shows none.
 
-        Each left scene is seen from the frame's pose or, without a pose, from its last camera. The comparison ignores
-        the frame's exposure and white balance.
+        Each earlier scene is seen from the frame's pose or, without a pose, from its last camera. The comparison
+        ignores the frame's exposure and white balance.
         """
         if not self._left:
             return None
@@ -142,7 +143,7 @@ class Places:
 
 
 def _seen_by(place: Place, frame: Frame) -> Camera:
-    """Return the camera from which a left scene is compared with a frame."""
+    """Return the camera from which an earlier scene is rendered for the comparison with a frame."""
     camera = place.camera.resized(frame.width_px, frame.height_px)
     return camera if frame.pose is None else camera.with_pose(frame.pose)
 
@@ -167,7 +168,7 @@ class LeftScenes:
     def __init__(self) -> None:
         self.places = Places()
         self._recognised: tuple[int, Place] | None = None
-        """Number of the frame that starts the next scene, and the left scene that this frame shows; None if it shows
+        """Number of the frame that starts the next scene, and the earlier scene that this frame shows; None if it shows
         none.
         """
         self._kept: TrainingStep | None = None
@@ -175,7 +176,7 @@ class LeftScenes:
         """Picture size (height, width) of the newest scene."""
 
     def forget(self) -> None:
-        """Discard all left scenes."""
+        """Discard all earlier scenes."""
         self.places, self._recognised = Places(), None
 
     def leave(self, step: TrainingStep, newest: Observation, time_s: float) -> None:
@@ -193,7 +194,7 @@ class LeftScenes:
         return place is not None
 
     def recognised(self, seq: int) -> Gaussians | None:
-        """Return the Gaussians of the left scene as which frame `seq` was recognised, or None."""
+        """Return the Gaussians of the earlier scene that frame `seq` was found to show, or None."""
         return self._recognised[1].gaussians if self._recognised and self._recognised[0] == seq else None
 
     def keep_memory(self, step: TrainingStep | None) -> None:

@@ -263,12 +263,12 @@ class Reconstructor:
         """Leave the current scene. The next observed frame, `frame`, starts a new scene or returns to one that was left
         before.
 
-        A bounded number of left scenes is kept in host memory in their last state. The frame may have another size.
+        A bounded number of earlier scenes is kept in host memory in their last state. The frame may have another size.
         Version numbers continue.
 
         Args:
             frame: first frame of the scene.
-            anew: start the model of the present scene anew. The present one is not kept, and no left scene is recognised.
+            anew: start the model of the present scene anew. The present one is not kept, and no earlier one recognised.
 
         Returns:
             True if the frame shows a scene that was left before.
@@ -382,8 +382,8 @@ class Reconstructor:
         """Return the model for displaying the time of the newest trained frame and later, with the next version number.
 
         On a GPU the whole model is copied into a preallocated slot without allocation or synchronisation, see
-        `gsplat_core.models.snapshots`. On a CPU with a motion prior only the current state is copied; `whole_model`
-        includes the past. Otherwise it equals `snapshot`.
+        `gsplat_core.models.snapshots`. On a CPU with a motion prior the model covers only the times from the newest
+        trained frame on; `whole_model` includes the past. In all other cases the result is that of `snapshot`.
         """
         step, prior = self._step, self._motion.prior
         if step is not None and prior is not None and self.device.type == "cpu":

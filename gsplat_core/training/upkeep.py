@@ -57,7 +57,7 @@ is reached after about 7,000 steps without visibility.
 
 @dataclass(frozen=True)
 class Seen:
-    """Scene projected to the picture of a frame."""
+    """Gaussians of a scene at a frame's time, projected to that frame's picture."""
 
     now: Gaussians
     """Gaussians of the scene at the frame's time."""

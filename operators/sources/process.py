@@ -416,7 +416,9 @@ OPEN_TIMEOUT_S = 30.0
 HUNG_AFTER_S = 5.0
 """Time without a message, in seconds, after which the process is considered hung."""
 MOST_FAILURES = 10
-"""Maximum number of consecutive processes without a frame before the source is given up."""
+"""Number of consecutive processes that end without a frame after which the source is given up. Failures to open a
+source that may return, such as a camera, do not count.
+"""
 LOOK_S = 0.05
 
 

@@ -300,7 +300,7 @@ class Layers:
         self._thread = threading.Thread(target=self._run, name="layers", daemon=True)
 
     def open(self) -> None:
-        """Start the thread that draws layers."""
+        """Start the thread that draws the layers: the stream's depth, confidence and orbit pictures."""
         self._thread.start()
 
     def close(self) -> None:

@@ -191,7 +191,10 @@ def _of(segment: SegmentReader) -> Iterator[FrameLine]:
 
 
 def frame_of(line: FrameLine, pictures: SegmentPictures) -> Frame | None:
-    """Return the frame of a line, damaged if a part cannot be decoded; None without its image."""
+    """Return the frame that a line of a segment's log describes.
+
+    The frame is marked damaged if one of its pictures cannot be decoded. None if its colour image is missing.
+    """
     planes, damage = pictures.of(line)
     return _frame(line, planes, line.damage or damage)
 

@@ -72,7 +72,9 @@ class SegmentWriter:
 
     @property
     def full(self) -> bool:
-        """True if the limit on track files is reached, so that a new picture size cannot be added."""
+        """True if the segment has the maximum number of track files. A track or picture size that it does not have yet
+        then needs a new segment.
+        """
         return len(self._tracks) >= MOST_FILES
 
     def picture(self, stage: Stage, track: str, picture: NDArray[Any], pts_ns: int) -> int:

@@ -69,8 +69,8 @@ struct InputGradients {
 // from the mean to the pixel. A splat with a non-finite value has l = -infinity, so that it reaches no pixel.
 struct SplatRecord {
   float x, y, a, b, c, l;
-  // Pixels where log2(alpha) exceeds this are skipped: l for an indefinite conic (sigma would be negative), else
-  // infinity.
+  // Pixels where log2(alpha) exceeds this are skipped. For an indefinite conic it is l, the log2 of the opacity,
+  // because sigma would be negative there. Otherwise it is infinity.
   float cap;
   float unused;
   float colors[kMaxRecordChannels];  // unused with more than kMaxRecordChannels channels

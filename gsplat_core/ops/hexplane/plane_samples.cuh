@@ -80,10 +80,10 @@ __device__ __forceinline__ Channels<kLane> between(const Channels<kLane>& a, con
   return plus(a, t, b - a);
 }
 
-// Grid nodes around a point: four in a plane, two in a line. Offsets are in floats from the start of the plane.
+// Grid nodes around a point: four in a plane, two in a line. Offsets are integers that count floats.
 struct Corners {
-  int64_t start;
-  int32_t right, below;  // offsets to the neighbours; 0 if the axis has only one cell
+  int64_t start;         // offset of the first node from the start of the plane
+  int32_t right, below;  // offsets from the first node to its neighbours; 0 if the axis has only one cell
   LinePosition u, v;
 
   __device__ Corners(const FeaturePlane& plane, const LinePosition& along_u, const LinePosition& along_v, int channels)

@@ -15,7 +15,7 @@ namespace gsplat::packed_projection {
 using projection::ProjectionInput;
 using projection::ProjectionSize;
 
-// Visibility of all pairs, and the first row of each block of pairs.
+// Visibility of all (image, Gaussian) pairs, and the first output row of each block of pairs.
 struct Visible {
   uint32_t* bits;   // one bit per pair, 32 pairs of one image per word; blocks(size) * 8 words
   int64_t* starts;  // [blocks(size) + 1]; the last value is the number of rows

@@ -17,7 +17,8 @@ void run(Call& call, const NormalLoss& loss, float* value) { normal_loss_on_devi
 
 constexpr int64_t kRows = 16;  // minimum rows per task
 
-// Run both passes of a loss. Sums of rows are added in row order, independent of the thread that computed each row.
+// Run the forward and the backward pass of a loss. Sums of rows are added in row order, independent of the thread that
+// computed each row.
 template <class Loss>
 void run_passes(Call& call, const Loss& loss, double least_divisor, float* value,
                 void (*terms)(const Loss&, Sums*, int64_t, int64_t), void (*gradients)(const Loss&, float, int64_t, int64_t)) {

@@ -25,8 +25,8 @@ GSPLAT_INLINE View view_of(const float* viewmat, const float* K) {
   return v;
 }
 
-// Intermediate values of both passes. Gaussians behind the camera or with values that are not finite are replaced by a
-// Gaussian at (0, 0, 1) in camera axes and are not `visible`.
+// Intermediate values of the forward and the backward pass. Gaussians behind the camera or with values that are not
+// finite are replaced by a Gaussian at (0, 0, 1) in camera axes and are not `visible`.
 struct State {
   vint visible;
   UnitQuat quat;

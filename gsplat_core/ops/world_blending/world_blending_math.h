@@ -11,7 +11,8 @@ using namespace gsplat::world_blending;
 
 constexpr float kHalfLog2E = 0.72134752f;
 
-// How rays pass a Gaussian. The order of operations is explicit, so that both passes compute identical bits.
+// Closest points of rays to a Gaussian. The order of operations is explicit, so that the forward and the backward pass
+// compute identical bits.
 struct Passing {
   vfloat away[3];   // from the centre to the ray's origin
   vfloat step;      // from the origin to the closest point, in lengths of the direction

@@ -59,7 +59,7 @@ class StepKind(NamedTuple):
     of_right: bool
     """The right eye is trained."""
     compares_rays: bool
-    """The losses of rays are evaluated."""
+    """The losses that compare depth, normals and classes along rays are evaluated too."""
 
 
 class StepInputs:
