@@ -395,3 +395,15 @@ def test_a_pair_with_a_right_camera_is_judged_as_a_calibrated_one(monkeypatch, c
     frame = Frame(0, 0, image, right_image=image, right_camera=camera if calibrated else None)
     found = StereoDepth()._look(image[..., 0], image[..., 0], frame, 0.0)
     assert asked == [calibrated] and found.doubt == "it is"
+
+
+def test_windows_are_inside_of_the_field_of_view_of_both_eyes():
+    """A disparity of 20 pixels shows a pixel 20 to the left in the other eye, which needs a column there, too."""
+    usable = np.zeros((60, 100), np.uint8)
+    usable[:, :80] = 1
+    for disparity, first in ((0.0, 0), (20.0, 20), (19.6, 20), (-30.0, 0)):
+        plane = torch.full((60, 100), disparity)
+        found = StereoDepth()._inside_both(usable, plane, 1).numpy()
+        columns = np.flatnonzero(found[30])
+        last = 80 - 7 - 1 if disparity >= 0 else 80 - 7 - 1 - 30
+        assert columns[0] == first and columns[-1] == last and len(columns) == last - first + 1

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import time
 
 import pytest
 
+from services.cli import terminal
 from services.cli.terminal import MOST_WORD, WIDEST, sentence, size, table
 
 
@@ -139,3 +141,14 @@ def test_a_run_that_does_not_unwind_is_ended_without_its_unfinished_files():
     code, out, err = interrupted(0, "SIGTERM", "SIGINT")
     assert (code, out) == (130, "removed\n")
     assert err.count("interrupted") == 2 and "interrupted again: ending at once" in err
+
+
+@pytest.mark.parametrize(("byte", "written"), [(0x80, b"\x80"), (0xFF, b"\xff"), (0xE4, b"\xe4")])
+def test_bytes_of_file_names_are_written_as_they_are_and_other_characters_as_escapes(byte, written):
+    name = os.fsdecode(b"a" + bytes([byte]) + b"b")
+    error = UnicodeEncodeError("ascii", name, 1, 2, "")
+    assert terminal._as_the_system_spells_it(error) == (written, 2)
+    missing = UnicodeEncodeError("ascii", "x\u20ac", 1, 2, "")
+    assert terminal._as_the_system_spells_it(missing) == (b"\\u20ac", 2)
+    lone = UnicodeEncodeError("utf-8", "\udc7f\udd00", 0, 1, "")
+    assert terminal._as_the_system_spells_it(lone) == (b"\\udc7f", 1)
