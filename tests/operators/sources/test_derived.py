@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import threading
+from collections import deque
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings import open_recording, synthesize
 from gsplat_core.io.recordings.calibration import default_camera
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import FrameStatus
+from gsplat_core.scene.frames import Frame, FrameStatus
 from operators.sources.derived import JoinedSource, SplitSource
 from operators.sources.live import LiveSource
 from operators.sources.registry import SourceOptions, open_source
@@ -161,3 +163,21 @@ def test_a_path_may_have_such_words_in_it(tmp_path):
     path = tmp_path / "take?stereo=side_by_side"
     synthesize(path, frames=1, width_px=64, height_px=48, stereo=False)
     assert open_source(path).description.width_px == 64
+
+
+@pytest.mark.parametrize(
+    ("at_ms", "right_ms", "paired", "left_over"),
+    [(100, [60, 95, 103, 140], 103, [140]), (100, [60, 97, 110], 97, [110]), (100, [100, 100, 130], 100, [100, 130]), (100, [70], None, [70]), (100, [], None, [])],
+)  # fmt: skip
+def test_the_right_picture_nearest_in_time_is_paired_and_earlier_ones_are_dropped(at_ms, right_ms, paired, left_over):
+    """Pictures are at most 20 ms apart."""
+    picture = lambda ms: Frame(0, ms * 1_000_000, np.full((4, 4, 3), ms, np.uint8))
+    rights, counted = iter([picture(ms) for ms in right_ms]), []
+    source = object.__new__(JoinedSource)
+    source._right = SimpleNamespace(read=lambda timeout_s: next(rights, None))
+    source._apart_ns, source.count = 20_000_000, counted.append
+    kept = deque()
+    found = source._paired(picture(at_ms), kept)
+    assert (None if found.right_image is None else found.right_image[0, 0, 0]) == paired
+    assert counted == ([] if paired else ["without_right"])
+    assert [each.image[0, 0, 0] for each in (*kept, *rights)] == left_over
