@@ -204,3 +204,39 @@ def test_visibility_is_tested_every_eighth_frame_or_in_every_one_if_there_is_no_
         unseen.append(out_of_view.unseen_s(30).max().item())
     expected = [8 * (k // 8) / 100 if capacity == 300 else k / 100 for k in range(18)]
     assert unseen == pytest.approx(expected, abs=1e-6)
+
+
+def test_gaussians_leave_from_a_tenth_of_the_width_outside_of_the_picture_on(monkeypatch):
+    """Only as many as are wanted, and only after the given time."""
+    camera = Camera.from_focal(100.0, 100, 80)
+    pixels = torch.tensor(
+        [[50.0, 40.0], [-9.0, 40.0], [-11.0, 40.0], [109.0, 40.0], [111.0, 40.0], [50.0, -9.0], [50.0, 91.0]]
+    )
+    rays = torch.cat([(pixels - torch.tensor([50.0, 40.0])) / 100, torch.ones(7, 1)], 1)
+    out, asked = OutOfView(10, torch.device("cpu")), []
+    step = SimpleNamespace(gaussians=SimpleNamespace(count=7), at=lambda time_s: SimpleNamespace(means=50 * rays))
+    monkeypatch.setattr(
+        out.last_seen, "longest_unseen", lambda *given: asked.append(given) or torch.zeros(7, dtype=torch.bool)
+    )
+    seen = SimpleNamespace(camera=camera, time_s=3.0)
+    out.make_room(step, seen, 3, 0.5)
+    assert asked == [], "three rows are free"
+    out.make_room(step, seen, 5, 0.5)
+    ((short, before_s, outside),) = asked
+    assert (short, before_s) == (2, 2.5)
+    assert outside.tolist() == [False, False, True, False, True, False, True]
+
+
+def test_nothing_is_brought_back_where_nothing_was_archived_or_is_wanted(monkeypatch):
+    out, searched = OutOfView(10, torch.device("cpu")), []
+    seen = SimpleNamespace(camera=None)
+    monkeypatch.setattr(out.archive, "take_uncovered", lambda camera, near, most: searched.append((near, most)))
+    wanted = torch.zeros(20, 30, dtype=torch.bool)
+    out.bring_back(None, seen, wanted)
+    assert searched == []
+    wanted[10, 12] = True
+    out.bring_back(None, seen, wanted)
+    ((near, most),) = searched
+    expected = torch.zeros(20, 30, dtype=torch.bool)
+    expected[5:16, 7:18] = True  # five pixels around
+    assert most == 10 and torch.equal(near, expected)
