@@ -266,7 +266,6 @@ TABLES = (
         OFFLINE_COLUMNS,
         (
             every_recording("`cutting`", "cuda", "offline", "cutting", front=True),
-            Row("`cutting`, `--steps 16000`", "cuda/reconstruct_cutting_16000", asked="40.0 dB in 15 s"),
             every_recording("`heart`, left eye", "cuda", "offline", "heart", front=True),
             every_recording("`sinus`", "cuda", "offline", "sinus", "33 dB", True),
             every_recording("`organ_still`, eight equal stereo frames", "cuda", "offline", "others/organ_still", "48 dB"),

@@ -79,7 +79,6 @@ BENCHMARKS = (
     plain("live_cutting_hexplane", "cuda", "live", "cutting", "--field", "hexplane", runs=1),
     *(plain(f"replay_{name}", "cuda", "replay", path) for name, path in REPLAYED.items()),
     plain("replay_sinus_no_depth", "cuda", "replay", "sinus", "--depth", "none"),
-    plain("reconstruct_cutting_16000", "cuda", "reconstruct", "cutting", "--steps", "16000", runs=1),
     *(
         Benchmark(f"stream_{name}", f"benchmarks/endless.py {{recordings}}/{path} --clock --once --device cuda", "cuda")
         for name, path in {
