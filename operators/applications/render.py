@@ -384,8 +384,6 @@ def write_video(images: Iterator[NDArray], out: Path, size_px: tuple[int, int], 
             raise
         if not video.frames:
             partial.discard()
-        else:
-            partial.finish()
     return video.frames
 
 

@@ -12,7 +12,7 @@ import torch
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.bundle import save_bundle
 from gsplat_core.rendering.renderer import RendererOptions
-from operators.applications.render import render_model, render_picture
+from operators.applications.render import render_model, render_picture, write_video
 from operators.errors import DeviceMissing, OutputError, OutputFolderInUse
 
 
@@ -109,3 +109,44 @@ def test_an_option_that_a_renderer_does_not_have_is_refused_before_the_model_is_
     with pytest.raises(InvalidSetting, match="'alpha' has no option samples; choose stochastic or points"):
         render_model(tmp_path / "none", tmp_path / "out", options=RendererOptions(samples=4))
     assert not (tmp_path / "out").exists()
+
+
+def pictures_until_an_error(count):
+    for number in range(count):
+        yield np.full((48, 64, 3), 40 * number, np.uint8)
+    raise OutputError("no space is left")
+
+
+def frames_of(path):
+    video = cv2.VideoCapture(str(path))
+    frames = 0
+    while video.read()[0]:
+        frames += 1
+    return frames
+
+
+def test_after_an_error_the_pictures_so_far_are_kept_where_no_video_was(tmp_path):
+    out = tmp_path / "view.mp4"
+    with pytest.raises(OutputError, match="no space is left"):
+        write_video(pictures_until_an_error(3), out, (64, 48), 30.0, overwrite=False)
+    assert frames_of(out) == 3
+    assert [path.name for path in tmp_path.iterdir()] == ["view.mp4"]
+
+
+def test_after_an_error_an_earlier_video_is_kept(tmp_path):
+    out = tmp_path / "view.mp4"
+    out.write_bytes(b"earlier")
+    with pytest.raises(OutputError, match="no space is left"):
+        write_video(pictures_until_an_error(3), out, (64, 48), 30.0, overwrite=True)
+    assert out.read_bytes() == b"earlier"
+    assert [path.name for path in tmp_path.iterdir()] == ["view.mp4"]
+
+
+@pytest.mark.parametrize("was_there", [False, True])
+def test_an_error_before_the_first_picture_leaves_no_video(tmp_path, was_there):
+    out = tmp_path / "view.mp4"
+    if was_there:
+        out.write_bytes(b"earlier")
+    with pytest.raises(OutputError, match="no space is left"):
+        write_video(pictures_until_an_error(0), out, (64, 48), 30.0, overwrite=True)
+    assert out.exists() == was_there
