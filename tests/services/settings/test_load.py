@@ -192,3 +192,13 @@ def test_numbers_have_their_defaults_and_are_refused_beyond_their_bounds(name):
 def test_the_folder_of_recordings_that_tests_read_is_no_setting(monkeypatch):
     monkeypatch.setenv("INTRASPLAT_RECORDINGS", "/somewhere/recordings")
     assert load_settings(None, {}).uploaded_recordings == ServiceSettings().uploaded_recordings
+
+
+def test_the_data_folder_follows_the_desktop_standard(tmp_path, monkeypatch):
+    """$XDG_DATA_HOME, or ~/.local/share if it is not set or empty (XDG Base Directory Specification)."""
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    assert load_settings(None).data_dir == tmp_path / "data" / "intrasplat"
+    for unset in (lambda: monkeypatch.setenv("XDG_DATA_HOME", ""), lambda: monkeypatch.delenv("XDG_DATA_HOME")):
+        unset()
+        assert load_settings(None).data_dir == tmp_path / "home" / ".local" / "share" / "intrasplat"
