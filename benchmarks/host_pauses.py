@@ -12,7 +12,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 SECONDS = 3.0
@@ -47,12 +47,17 @@ def interruptions(processes: int, seconds: float = SECONDS) -> dict[str, float]:
     """
     words = [sys.executable, "-c", LOOP, str(seconds), str(LEAST_MS)]
     running = [subprocess.Popen(words, stdout=subprocess.PIPE, text=True) for _ in range(processes)]
-    found = [json.loads(each.communicate()[0]) for each in running]
-    every = [pause for pauses in found for pause in pauses]
+    return summary([json.loads(each.communicate()[0]) for each in running], seconds)
+
+
+def summary(pauses_ms: Sequence[Sequence[float]], seconds: float) -> dict[str, float]:
+    """Return the figures of `interruptions` from the interruptions of each process in milliseconds."""
+    every = [pause for pauses in pauses_ms for pause in pauses]
+    whole_s = len(pauses_ms) * seconds
     return {
         "longest_ms": round(max(every, default=0.0), 2),
-        "long_per_s": round(sum(pause > LONG_MS for pause in every) / (processes * seconds), 3),
-        "share": round(sum(every) / (1e3 * processes * seconds), 4),
+        "long_per_s": round(sum(pause > LONG_MS for pause in every) / whole_s, 3),
+        "share": round(sum(every) / (1e3 * whole_s), 4),
     }
 
 

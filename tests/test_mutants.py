@@ -146,7 +146,7 @@ def recorded(folder: Path, path: Path, tests: dict[str, tuple[float, set[int]]])
 def test_a_session_that_cannot_import_a_file_records_none(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, other: str, is_recorded: bool
 ) -> None:
-    """Or its files would count as recorded, without tests, until they change."""
+    """Otherwise the files of the session would count as recorded without tests until they change."""
     files = ["test_sound.py", "test_other.py"]
     for file, text in zip(files, ("assert True", other), strict=True):
         (tmp_path / file).write_text(f"{text}\n\ndef test():\n    assert True\n", encoding="utf-8")

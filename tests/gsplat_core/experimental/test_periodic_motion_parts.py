@@ -216,7 +216,7 @@ def test_the_error_is_the_largest_change_of_depth_among_fits_that_cost_up_to_six
 
 @pytest.mark.parametrize(("pulled", "used"), [(6, False), (8, True)])
 def test_disturbed_observations_are_left_out_unless_less_than_three_tenths_are_left(monkeypatch, pulled, used):
-    """Of ten observations of each point, some deviate by a pixel. The motion is fitted to the others twice."""
+    """Some of the ten observations of each point deviate by a pixel. The motion is fitted again without them."""
     tracks = GridTracks(
         np.zeros((10, 5, 2)), np.ones((10, 5), bool), np.stack([np.eye(4)] * 10), np.arange(10.0), FOCAL_PX, EXTENT
     )

@@ -249,7 +249,7 @@ def test_points_are_triangulated_from_their_rays():
 
 
 def test_observations_far_off_and_points_seen_twice_are_no_start():
-    """Of 70 points, 4 are seen in two frames, and 5 in three with one observation of them 5 pixels off."""
+    """Four of 70 points are seen in two frames only. Five others are seen in three, with one observation off by 5 pixels."""
     observations, trajectory = seen(orbit, 288.0)
     kept, rank = np.ones(len(observations.frame), bool), np.zeros(POINTS, int)
     for place, number in enumerate(observations.point):

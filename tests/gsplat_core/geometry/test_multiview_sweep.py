@@ -44,7 +44,7 @@ def test_costs_are_least_at_the_distance_by_which_a_view_is_shifted():
 
 @pytest.mark.parametrize(("deviation", "cost"), [(2.0, 0.25), (6.0, 0.05), (1.0, 0.4)])
 def test_contrast_of_two_grey_levels_correlates_by_half(deviation, cost):
-    """Of two equal pictures the correlation is v / (v + 4) for the variance v."""
+    """Two equal pictures of variance v have the correlation v / (v + 4)."""
     checks = np.float32(100) + np.float32(deviation) * (2 * (np.indices((HEIGHT, WIDTH)).sum(0) % 2) - 1)
     view = View(checks.astype(np.float32), TISSUE, camera())
     found, votes = sweep(view, [view], np.array([0.05]))
@@ -298,7 +298,7 @@ def test_a_recording_of_a_still_scope_or_with_depth_stays_as_it_is(compared):
 
 @pytest.mark.parametrize(("agreeing", "kept"), [(2, True), (1, False)])
 def test_depth_of_a_recording_is_kept_if_half_of_it_is_confirmed(compared, monkeypatch, agreeing, kept):
-    """Of five frames with depth, each agreement confirms two or one more."""
+    """Five frames have depth. The first agreement of two frames confirms both, each later one confirms one more."""
     answers = iter([True] * (agreeing == 2) + [False, True] + [False] * 4)
     monkeypatch.setattr(multiview, "agree", lambda first, second, error: next(answers))
     found = ParallaxDepth().of_recording(*recording(5, 0.1))

@@ -174,7 +174,7 @@ def test_contrast_far_above_two_per_cent_has_one_strength_and_weaker_one_less(sp
 
 
 def test_dark_pixels_have_less_contrast_than_their_ratio():
-    """By eight grey levels that are added before the logarithm."""
+    """Eight grey levels are added before the logarithm, so 8 and 9 contrast like 16 and 17."""
     grey = np.tile(np.repeat(np.array([8, 9], np.uint8), 5), (60, 30))
     contrast = local_contrast(grey, np.ones(grey.shape, bool)).astype(float)
     spread = np.log(17 / 16) / 2
