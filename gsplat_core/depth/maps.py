@@ -5,7 +5,7 @@ unknown depth, and wrong rows or columns along the border. Gaussians initialised
 tissue and occlude it when they move. `measured_confidence` rejects these pixels.
 
 Depth by parallax is validated by a second map of the same tissue from another pose and time, which must show the same
-relief within the stated intervals (`agree`). The reprojection error does not reveal wrong poses or moving tissue. Tissue that moves evenly for a
+relief (`agree`). The reprojection error does not reveal wrong poses or moving tissue. Tissue that moves evenly for a
 while looks like static tissue at another distance, and a warp by the wrong depth fits as well as one by the true depth.
 The tissue's motion changes over time, however, and so does the depth error that it causes. If two depth maps differ by
 a fair share of the relief that they show, a level plane is as accurate as they are.
@@ -230,10 +230,6 @@ LONGEST_PX = 160
 """Longest side of the compared depth maps, in pixels."""
 MOST_DISAGREEMENT = 0.25
 """Largest accepted median difference of two depth maps, as a share of their median relief."""
-HALF_OF_90 = 1.645
-"""Half width of the central 90 % interval of a normal distribution, in standard deviations."""
-MOST_OUTSIDE = 0.1
-"""Largest accepted share of pixels at which two depth maps differ by more than the 90 % interval of their difference."""
 LEAST_SHARED = 0.1
 """Share of the picture that both depth maps must cover."""
 UNCONFIRMED = "two depth maps by parallax disagree about the relief, so a level plane may be as accurate"
@@ -277,17 +273,6 @@ def disagreement(first: Look, second: Look) -> float:
 
     Differences of the overall distance count as well, since the poses determine it.
     """
-    found, off = _compared(first, second)
-    if len(off) == 0:
-        return np.inf
-    relief = float(np.median(np.abs(found - np.median(found))))
-    return float(np.median(off)) / relief if relief > 0 else np.inf
-
-
-def _compared(first: Look, second: Look) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the logarithms of the second map's inverse depth [n] at shared pixels, and the relative differences [n] of both
-    maps; both empty if they share too little tissue.
-    """
     inverse = np.where(first.inverse > 0, first.inverse, 1)
     points = pixel_rays(first.camera) / inverse[..., None]
     between = second.camera.world_to_camera @ np.linalg.inv(first.camera.world_to_camera)
@@ -301,20 +286,13 @@ def _compared(first: Look, second: Look) -> tuple[NDArray[np.float64], NDArray[n
     )
     shared = (first.believed > 0) & (known > 0.99) & (there > 0) & (seen[..., 2] > 0)
     if shared.mean() < LEAST_SHARED:
-        return np.zeros(0), np.zeros(0)
+        return np.inf
     found = np.log(there[shared])
-    return found, np.abs(found + np.log(seen[shared][:, 2]))
+    relief = float(np.median(np.abs(found - np.median(found))))
+    off = float(np.median(np.abs(found + np.log(seen[shared][:, 2]))))
+    return off / relief if relief > 0 else np.inf
 
 
-def agree(first: Look, second: Look, relative_error: float) -> bool:
-    """Return True if two depth maps confirm each other: they show the same relief, and the intervals stated for them hold.
-
-    Args:
-        first: a depth map.
-        second: another depth map of the same tissue.
-        relative_error: relative standard error stated for each of them.
-    """
-    if disagreement(first, second) > MOST_DISAGREEMENT:
-        return False
-    _, off = _compared(first, second)
-    return float((off > HALF_OF_90 * np.sqrt(2) * relative_error).mean()) <= MOST_OUTSIDE
+def agree(first: Look, second: Look) -> bool:
+    """Return True if two depth maps confirm each other."""
+    return disagreement(first, second) <= MOST_DISAGREEMENT

@@ -550,11 +550,7 @@ class ParallaxDepth(Estimator):
         self._found_s = now_s
         if is_first or before is None:
             return None
-        return (
-            found
-            if agree(before, self._look, found.origin.relative_error)
-            else doubted(found.depth.shape, found.origin, UNCONFIRMED)
-        )
+        return found if agree(before, self._look) else doubted(found.depth.shape, found.origin, UNCONFIRMED)
 
     def _is_elsewhere(self, camera: Camera) -> bool:
         """Return True if the scope is farther from every key frame than the closest two key frames
@@ -595,7 +591,7 @@ def _confirmed(frames: list[Frame], doubts: Counter[str], cameras: Sequence[Came
     ]
     confirmed: set[int] = set()
     for (one, first), (other, second) in pairwise(zip(numbers, looks, strict=True)):
-        if agree(first, second, PARALLAX.relative_error):
+        if agree(first, second):
             confirmed |= {one, other}
     if 2 * len(confirmed) < len(numbers):
         for number in numbers:

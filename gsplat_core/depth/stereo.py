@@ -23,7 +23,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gsplat_core.depth.maps import HALF_OF_90, MOST_OUTSIDE, DepthMap, Estimator, doubted
+from gsplat_core.depth.maps import DepthMap, Estimator, doubted
 from gsplat_core.geometry.tracks import Points, followed
 from gsplat_core.ops.disparity_fit.disparity_fit import fit_disparities
 from gsplat_core.ops.edge_aware_filter.edge_aware_filter import smooth_within_edges
@@ -616,6 +616,10 @@ def _why_wrong(found: DepthMap, look: PairLook, frame: Frame, camera: Camera, pa
     return f"two ways of matching the eyes contradict each other: {outside:.0%} of the points differ by more than their 90 % interval"
 
 
+HALF_OF_90 = 1.645
+"""Half width of the central 90 % interval of a normal distribution, in standard deviations."""
+MOST_OUTSIDE = 0.1
+"""Largest accepted share of points at which two ways of matching differ by more than the 90 % interval."""
 ONE_PERCENT = 2.33
 """Standard deviations that a normal value exceeds with a probability of 1 %."""
 

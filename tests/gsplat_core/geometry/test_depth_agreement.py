@@ -18,7 +18,6 @@ from tests.gsplat_core.geometry.test_key_frames import answers, stream
 
 WIDTH, HEIGHT, FOCAL = 120, 90, 100.0
 CAMERA = Camera.from_focal(FOCAL, WIDTH, HEIGHT)
-ERROR = DEPTH_ORIGINS["parallax"].relative_error
 
 
 def moved_by(x: float, y: float, z: float) -> Camera:
@@ -55,24 +54,14 @@ def test_looks_at_the_truth_agree_from_wherever_they_are() -> None:
 @pytest.mark.parametrize("factor", [0.8, 1.25])
 def test_looks_at_other_distances_do_not_agree(factor: float) -> None:
     other = moved_by(4.0, 0.0, 0.0)
-    assert not agree(look(CAMERA), look(other, factor * true_depth(other)), ERROR)
+    assert not agree(look(CAMERA), look(other, factor * true_depth(other)))
 
 
 def test_a_look_at_a_relief_that_is_not_there_does_not_agree() -> None:
     other = moved_by(4.0, 2.0, 0.0)
-    assert not agree(look(CAMERA), look(other, np.flip(true_depth(other), axis=1).copy()), ERROR)
+    assert not agree(look(CAMERA), look(other, np.flip(true_depth(other), axis=1).copy()))
     flat = np.full((HEIGHT, WIDTH), 60, np.float32)
     assert disagreement(look(CAMERA), look(other, flat)) == np.inf
-
-
-@pytest.mark.parametrize(("rows", "factor", "is_confirmed"), [(5, 1.2, True), (14, 1.2, False), (14, 1.1, True)])
-def test_a_look_that_is_off_by_more_than_its_interval_on_a_tenth_of_the_pixels_is_not_confirmed(
-    rows: int, factor: float, is_confirmed: bool
-) -> None:
-    depth = true_depth(CAMERA)
-    depth[:rows] *= factor
-    assert disagreement(look(CAMERA, depth), look(CAMERA)) < MOST_DISAGREEMENT
-    assert agree(look(CAMERA, depth), look(CAMERA), ERROR) is is_confirmed
 
 
 def test_noise_counts_as_much_as_it_is_beside_the_relief() -> None:
