@@ -47,6 +47,7 @@ target_compile_options(gsplat_core_cuda PRIVATE
 target_include_directories(gsplat_core_cuda PRIVATE gsplat_core/native)
 target_include_directories(gsplat_core_cuda SYSTEM PRIVATE ${TORCH_ROOT}/include
                            $<$<COMPILE_LANGUAGE:CXX>:${CUDA_INCLUDE}>)
+target_precompile_headers(gsplat_core_cuda PRIVATE ${PRECOMPILED})
 find_package(Threads REQUIRED)
 target_link_libraries(gsplat_core_cuda PRIVATE ${TORCH_CPU_LIBRARY} ${TORCH_CUDA_LIBRARY} ${CUDA_RUNTIME} Threads::Threads dl rt)
 # The static runtime is linked by its path. The library then depends on the CUDA driver only, with any toolkit.
