@@ -76,21 +76,22 @@ def test_interruptions_of_the_machine_are_stated_with_its_figures(tmp_path):
     assert "interrupted" not in publish.provenance(TABLE, folder)
     pauses = {
         "1": {"longest_ms": 2.4, "long_per_s": 0.0, "share": 0.001},
-        "6": {"longest_ms": 31.6, "long_per_s": 1.52, "share": 0.1},
+        "6": {"longest_ms": 31.6, "long_per_s": 1.52, "share": 0.1, "slow_share": 0.016, "slowest": 0.2},
     }
     line = LINE | {"machine": LINE["machine"] | {"pauses": pauses}, "result": {"live": {"db": 40.0}}}
     (folder / "cpu" / "x.jsonl").write_text(json.dumps(line), encoding="utf-8")
     assert (
         "which interrupted 1 busy loop for up to 2 ms (0.0 times per second for more than 5 ms)"
-        " and 6 busy loops for up to 32 ms (1.5 times per second for more than 5 ms)"
+        " and 6 busy loops for up to 32 ms (1.5 times per second for more than 5 ms) and slowed them to less than half of their pace for 1.6 % of the time"
     ) in publish.provenance(TABLE, folder)
 
 
 def test_interruptions_are_shares_of_the_time():
     pauses = script("host_pauses")
-    found = pauses.summary([[1.0, 6.0], [20.0, 5.0, 0.5]], 4.0)
-    assert found == {"longest_ms": 20.0, "long_per_s": 0.25, "share": 0.0041}
-    assert pauses.summary([[], []], 1.0) == {"longest_ms": 0.0, "long_per_s": 0.0, "share": 0.0}
+    found = pauses.summary([[1.0, 6.0], [20.0, 5.0, 0.5]], [[8.0, 10.0, 10.0], [3.0, 1.4, 3.0]], 4.0)
+    assert found == {"longest_ms": 20.0, "long_per_s": 0.25, "share": 0.0041, "slow_share": 0.1667, "slowest": 0.47}
+    still = {"longest_ms": 0.0, "long_per_s": 0.0, "share": 0.0, "slow_share": 0.0, "slowest": 1.0}
+    assert pauses.summary([[], []], [[], []], 1.0) == still
     assert pauses.interruptions(2, 0.05).keys() == found.keys()
 
 
