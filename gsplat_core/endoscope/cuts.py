@@ -210,6 +210,7 @@ class CutDetector:
         self._last: View | None = None
         self._shape: tuple[int, ...] = ()
         self._doubted: View | None = None
+        self._doubted_is_known = False
         self._doubts = 0
         self._doubts_since_ns = 0
         self._most_doubts = LONGEST_DOUBT_FRAMES
@@ -249,9 +250,10 @@ class CutDetector:
         too_long = pts_ns - self._doubts_since_ns > 1e9 * LONGEST_DOUBT_S
         if settled or self._doubts > self._most_doubts or too_long:
             self._most_doubts = LONGEST_DOUBT_FRAMES if settled else self._most_doubts // 2
-            known = any(self._same(view, earlier, gap=False) for earlier in self._earlier)
+            known = self._doubted_is_known if settled else self._is_known(view)
             return self._accept(view, "returned" if known else "cut")
-        self._doubted = view
+        # Compared with earlier scenes before the cut is certain, because the next frame is to be shown without delay.
+        self._doubted, self._doubted_is_known = view, self._is_known(view)
         return SceneVerdict(in_doubt=True)
 
     def _related(self, view: View) -> bool:
@@ -261,6 +263,10 @@ class CutDetector:
             return True
         interrupted = self._gap or self._doubted is not None
         return interrupted and any(self._same(view, earlier, self._gap) for earlier in self._views)
+
+    def _is_known(self, view: View) -> bool:
+        """Return True if the view belongs to an earlier scene."""
+        return any(self._same(view, earlier, gap=False) for earlier in self._earlier)
 
     def _same(self, view: View, other: View, gap: bool) -> bool:
         away = difference(view, other)

@@ -10,15 +10,14 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch.nn.functional import interpolate
 
+from gsplat_core.endoscope.reduced import averaged
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.steps.step import TrainingStep
-from gsplat_core.transfers import HostCopy
 
 MOST_PLACES = 8
 """Largest number of earlier scenes that are stored. The oldest is dropped."""
@@ -26,6 +25,8 @@ RENDERED_PX = 160
 """Width in pixels at which an earlier scene is rendered for comparison."""
 COMPARED_PX = 64
 """Width at which pictures are compared, in pixels; small enough to tolerate motion of a few pixels."""
+SAMPLES = 4
+"""Number of rows and columns of a frame that are averaged for a row and a column of a compared picture."""
 FINE_PX, COARSE_PX = 1.0, 16.0
 """Standard deviations, in pixels of the compared pictures, of the band-pass filter that removes noise and illumination.
 """
@@ -80,10 +81,10 @@ class Structure:
 
 @dataclass
 class Place:
-    """Earlier scene, which the stream has left, in host memory."""
+    """Earlier scene, which the stream has left."""
 
     gaussians: Gaussians
-    """Last state of the Gaussians, without a deformation field."""
+    """Last state of the Gaussians, without a deformation field, in host memory after `Places.to_host`."""
     camera: Camera
     """Camera that last observed this scene."""
     left_s: float
@@ -97,7 +98,7 @@ class Place:
         """
         if camera not in self._seen:
             with torch.no_grad():
-                output = render(self.gaussians, camera.scaled(RENDERED_PX / camera.width_px), depth=False)
+                output = render(self.gaussians.to("cpu"), camera.scaled(RENDERED_PX / camera.width_px), depth=False)
             size = compared_size(camera.width_px, camera.height_px)
             pictures = (output.image.numpy(), output.alpha.numpy())
             image, alpha = (cv2.resize(picture, size, interpolation=cv2.INTER_AREA) for picture in pictures)
@@ -116,7 +117,7 @@ class Places:
         return len(self._left)
 
     def leave(self, gaussians: Gaussians, camera: Camera, time_s: float, seen: Structure | None = None) -> None:
-        """Keep a copy of a scene in host memory.
+        """Keep a copy of a scene on its device until the next call of `to_host`, `take` or this method.
 
         Args:
             gaussians: last state of the scene.
@@ -124,9 +125,15 @@ class Places:
             time_s: time of the copy in seconds.
             seen: structure of a picture of the scene from that camera; None to render it when it is needed.
         """
-        kept = gaussians.map(lambda tensor: tensor.detach().to("cpu", torch.float32, copy=True))
+        self.to_host()
+        kept = gaussians.map(lambda tensor: tensor.detach().to(torch.float32, copy=True))
         place = Place(kept, camera, time_s, {} if seen is None else {camera: seen})
         self._left = [*self._left, place][-self._most :] if self._most else []
+
+    def to_host(self) -> None:
+        """Move all scenes to host memory. The first picture of the next scene need not wait for that."""
+        for place in self._left:
+            place.gaussians = place.gaussians.to("cpu")
 
     def take(self, frame: Frame) -> Place | None:
         """Remove and return the earlier scene that a frame shows, or None if it shows none.
@@ -148,15 +155,19 @@ def _seen_by(place: Place, frame: Frame) -> Camera:
     return camera if frame.pose is None else camera.with_pose(frame.pose)
 
 
+def structure_of(frame: Frame) -> Structure | None:
+    """Return the structure of the tissue in a frame; None if it shows too little tissue to be compared."""
+    shown = _shown(frame)
+    return shown if np.count_nonzero(shown.known) >= LEAST_SHARE * shown.known.size else None
+
+
 def _shown(frame: Frame) -> Structure:
-    """Return the structure of the tissue in a frame."""
     size = compared_size(frame.width_px, frame.height_px)
-    image = np.asarray(cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA), np.float32) / np.float32(255)
-    known = np.ones(image.shape[:2], bool)
+    known = np.ones((size[1], size[0]), bool)
     for mask in (frame.mask, frame.loss_mask):
         if mask is not None:
-            known &= cv2.resize((mask > 0).astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.5
-    return Structure.of(image, known)
+            known &= averaged((mask > 0).view(np.uint8) * np.uint8(255), size, SAMPLES) > 127
+    return Structure.of(averaged(frame.image, size, SAMPLES).astype(np.float32) / np.float32(255), known)
 
 
 class LeftScenes:
@@ -179,13 +190,17 @@ class LeftScenes:
         """Discard all earlier scenes."""
         self.places, self._recognised = Places(), None
 
-    def leave(self, step: TrainingStep, newest: Observation, time_s: float) -> None:
-        """Keep the last state of a scene at `time_s` to recognise it later.
+    def leave(self, step: TrainingStep, camera: Camera, time_s: float, frame: Frame | None) -> None:
+        """Keep the last state of a scene to recognise it later.
 
-        The scene's newest observation stands for a rendering from its camera. Rendering would delay the first picture of
-        the next scene by more than half a frame interval.
+        Args:
+            step: training of the scene.
+            camera: camera that last observed the scene.
+            time_s: time of the last observation in seconds.
+            frame: frame of that observation, which stands for a rendering of the scene from its camera; None to render the scene when a frame is
+                compared with it, which delays that frame's picture by more than half a frame interval.
         """
-        self.places.leave(step.at(time_s), newest.camera, time_s, structure_of(newest))
+        self.places.leave(step.at(time_s), camera, time_s, None if frame is None else structure_of(frame))
 
     def recognise(self, frame: Frame) -> bool:
         """Return True if the frame, which starts the next scene, shows a scene that the stream left before."""
@@ -211,18 +226,6 @@ class LeftScenes:
         if kept is None or not same_size:
             return None
         return kept if kept.restart(gaussians, observation.time_s, observation.camera) else None
-
-
-def structure_of(observation: Observation) -> Structure | None:
-    """Return the structure of an observation's picture; None if it shows too little tissue to be compared."""
-    camera = observation.camera
-    planes = torch.cat([observation.image.permute(2, 0, 1) / 255, (observation.mask != 0).float()[None]])
-    width, height = compared_size(camera.width_px, camera.height_px)
-    small = HostCopy(interpolate(planes[None], size=(height, width), mode="area")[0].permute(1, 2, 0)).numpy()
-    tissue = small[..., 3] > 0.5
-    if np.count_nonzero(tissue) < LEAST_SHARE * tissue.size:
-        return None
-    return Structure.of(np.ascontiguousarray(small[..., :3]), tissue)
 
 
 def compared_size(width_px: int, height_px: int) -> tuple[int, int]:

@@ -98,7 +98,7 @@ class Reconstructor:
         self._start_here: StartOnDevice | None = None
         self._slots, self._version = SnapshotSlots(self.device, rows=self._fixed_rows), 0
         self._first_time_s = self._last_time_s = self._learned_s = 0.0
-        self._certain: Observation | None = None
+        self._certain: tuple[Frame, Observation] | None = None
         """Newest observation of the scene that is not doubtful."""
         self._depth_source: DepthSource | None = None
         self.depth_doubts: Mapping[str, int] = {}
@@ -194,7 +194,7 @@ class Reconstructor:
         self._depth_source = DepthSource.after(self._depth_source, frame)
         self._motion.observe(step, frame, observation, first=first)
         if first or not doubtful:
-            self._certain = observation
+            self._certain = frame, observation
         self._window.add(observation)
         self._placement.apply(step, frame, observation)
         if self._growth is None:
@@ -236,6 +236,7 @@ class Reconstructor:
         """
         if self._step is None:
             raise InvalidInput("there is nothing to rehearse yet: observe a frame first")
+        self._left.places.to_host()
         self._schedule.rehearse(self._step, self._window, steps)
 
     def rehearsal_ns(self, steps: int) -> float:
@@ -275,8 +276,8 @@ class Reconstructor:
         """
         if self._step is not None and not anew:
             # A doubtful frame may be the newest of the window, and shows the next scene if this one ends with it.
-            last = self._certain or self._window.newest
-            self._left.leave(self._step, last, last.time_s)
+            seen, last = self._certain or (None, self._window.newest)
+            self._left.leave(self._step, last.camera, last.time_s, seen)
         self._end_scene()
         if (frame.width_px, frame.height_px) != (self.camera.width_px, self.camera.height_px):
             self.camera = self.camera.resized(frame.width_px, frame.height_px)

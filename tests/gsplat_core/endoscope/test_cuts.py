@@ -107,6 +107,26 @@ def test_scenes_that_change_with_every_frame_are_cut_after_a_while():
     assert list(verdicts([*texture(1, 5, 64, 48), *unrelated]).values()) == ["in doubt"] * 6 + ["cut"]
 
 
+@pytest.mark.parametrize(("last", "verdict"), [(["known", "odd"], "cut"), (["odd", "known"], "returned")])
+def test_only_the_frame_that_ends_the_doubts_tells_whether_an_earlier_scene_returned(rng, last, verdict):
+    earlier, present = texture(1, 16, 64, 48), texture(2, 16, 64, 48)
+    odd = [rng.integers(0, 256, (48, 64, 3), np.uint8) for _ in range(6)]
+    ends = {"known": earlier[0], "odd": odd[5]}
+    found = verdicts([*earlier, *present, *odd[:5], *(ends[each] for each in last)])
+    assert list(found.values()) == ["in doubt", "cut", *["in doubt"] * 6, verdict]
+
+
+def test_earlier_scenes_are_compared_before_the_cut_is_certain(monkeypatch):
+    """The frame that makes it certain is displayed; the one before it is withheld."""
+    earlier, present = texture(1, 16, 64, 48), texture(2, 16, 64, 48)
+    detector = CutDetector()
+    for k, image in enumerate([*earlier, *present, earlier[0]]):
+        verdict = detector.observe(image, k, k * FRAME_NS)
+    assert verdict.in_doubt
+    monkeypatch.setattr(detector, "_is_known", lambda view: pytest.fail("compared too late"))
+    assert detector.observe(earlier[1], 32, 32 * FRAME_NS).new_scene == "returned"
+
+
 def test_a_stream_of_unrelated_pictures_passes_after_a_while(rng):
     pictures = [rng.integers(0, 256, (48, 64, 3), np.uint8) for _ in range(30)]
     detector = CutDetector()

@@ -13,8 +13,7 @@ from gsplat_core.training.budget import Budget
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.growth.initialisation import gaussians_from_frame
 from gsplat_core.training.metrics import psnr_tissue_db
-from gsplat_core.training.observations import Observation
-from gsplat_core.training.places import MOST_PLACES, Places, Structure, structure_of
+from gsplat_core.training.places import LEAST_SHARE, MOST_PLACES, Places, Structure, structure_of
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.schedule import LiveTraining
 
@@ -77,11 +76,48 @@ def test_the_last_picture_stands_for_the_scene_where_the_camera_is_the_same():
     """Without a pose no scene is rendered: the picture decides, whatever the Gaussians are."""
     gaussians = gaussians_from_frame(frame_of(1), CAMERA, 400, sh_degree=0, default_depth_mm=60.0)
     places = Places()
-    places.leave(gaussians, CAMERA, 1.0, structure_of(Observation.of(frame_of(2), CAMERA)))
+    places.leave(gaussians, CAMERA, 1.0, structure_of(frame_of(2)))
     assert places.take(frame_of(1)) is None
     assert places.take(frame_of(2)) is not None
     hidden = frame_of(2, mask=np.zeros((HEIGHT, WIDTH), np.uint8))
-    assert structure_of(Observation.of(hidden, CAMERA)) is None
+    assert structure_of(hidden) is None
+
+
+@pytest.mark.parametrize("share", [0.28, 0.32])
+def test_a_picture_with_little_tissue_does_not_stand_for_the_scene(share):
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    mask[:, : round(share * WIDTH)] = 1
+    assert (structure_of(frame_of(2, mask=mask)) is not None) == (share > LEAST_SHARE)
+
+
+def test_a_place_is_a_copy():
+    gaussians = gaussians_from_frame(frame_of(1), CAMERA, 400, sh_degree=0, default_depth_mm=60.0)
+    before, places = gaussians.means.clone(), Places()
+    places.leave(gaussians, CAMERA, 1.0)
+    gaussians.means.add_(1)
+    assert torch.equal(places._left[0].gaussians.means, before)
+
+
+def test_places_are_moved_to_the_host_while_frames_are_rehearsed(monkeypatch):
+    moved = []
+    monkeypatch.setattr(Places, "to_host", lambda places: moved.append(places))
+    made = Reconstructor(ReconstructorConfig(gaussians=60, max_gaussians=60), CAMERA, live=LiveTraining())
+    made.observe(frame_of(1), budget=Budget.of_steps(1))
+    assert not moved
+    made.rehearse(1)
+    assert moved
+
+
+def test_on_a_gpu_the_newest_place_stays_there_until_there_is_time(gpu):
+    gaussians = gaussians_from_frame(frame_of(1), CAMERA, 400, sh_degree=0, default_depth_mm=60.0)
+    places = Places()
+    for time_s in (1.0, 2.0):
+        places.leave(gaussians.to(gpu), CAMERA, time_s)
+    assert [place.gaussians.means.device.type for place in places._left] == ["cpu", "cuda"]
+    found = places.take(frame_of(1))
+    assert found is not None and torch.equal(found.gaussians.means.cpu(), gaussians.means)
+    places.to_host()
+    assert [place.gaussians.means.device.type for place in places._left] == ["cpu"]
 
 
 def test_a_pose_that_looks_elsewhere_does_not_show_the_place():
