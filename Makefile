@@ -65,8 +65,9 @@ results: .venv/.development
 mutants: native .venv/.development
 	$(BIN)/python -m tests.mutants --count $(MUTANTS)
 
-# Rebuild the C++ core if its sources changed.
+# Rebuild the C++ core if its sources changed or its build folder was deleted.
 native: .venv/.runtime
+	@test -f build/editable/build.ninja || $(BIN)/pip install --quiet --no-build-isolation --no-deps --editable .
 	@$(BIN)/cmake --build build/editable -- --quiet
 
 # Build the CUDA kernels with NVIDIA's compiler from pip, in a separate folder without torch, or with the nvcc in CUDACXX.
