@@ -108,6 +108,7 @@ def test_places_are_moved_to_the_host_while_frames_are_rehearsed(monkeypatch):
     assert moved
 
 
+@pytest.mark.cuda
 def test_on_a_gpu_the_newest_place_stays_there_until_there_is_time(gpu):
     gaussians = gaussians_from_frame(frame_of(1), CAMERA, 400, sh_degree=0, default_depth_mm=60.0)
     places = Places()
