@@ -151,8 +151,12 @@ class OrdinaryFrames:
 
 
 class OrdinaryStream:
-    """State shared by `PictureStagesOp` and `TissueStagesOp`: whether the current frame is ordinary, and its due
-    stages."""
+    """State shared by `PictureStagesOp` and `TissueStagesOp`: whether the current frame is ordinary, and the stages
+    that are due for it.
+
+    A frame is ordinary if its picture is as expected from the previous ones. It is checked by the due stages only, and
+    any other frame by all stages.
+    """
 
     def __init__(self) -> None:
         self.pictures = OrdinaryPictures()

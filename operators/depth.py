@@ -266,8 +266,9 @@ def share_of(cores: int) -> float:
 class DepthOp(Operator):
     """Attaches to each frame the depth that `choice` selects. Frames without a result pass without depth.
 
-    With `in_background`, frames are passed on immediately, with their recorded depth or without depth. `UntilDisplay`
-    offers the frames that it trains on to `background` and takes the results.
+    With `in_background`, frames are passed on immediately, with their recorded depth or without depth. The
+    training operator `UntilDisplay` passes the frames that it trains on to the estimator in the attribute
+    `background`, and fetches the finished estimates from it.
 
     Inputs:
         frame: `Frame`.

@@ -105,7 +105,8 @@ class AuditInUse(AuditError, UserError):
 
 
 class CannotServe(UserError):
-    """The server cannot listen as the settings demand."""
+    """The server cannot start with its settings. For example, an address is in use, the TLS files cannot be loaded, or
+    other machines could connect without TLS."""
 
 
 class ClientError(UserError):

@@ -159,4 +159,7 @@ MODULES: Mapping[str, Mapping[str, str]] = {
     "gsplat.version": {"__version__": "gsplat_core.as_gsplat.names:VERSION"},
     "fused_ssim": {"fused_ssim": "gsplat_core.ops.ssim.ssim"},
 }
-"""For each module its names, and for each name the module that defines it, or `module:name` if it has another name there."""
+"""Modules of gsplat's API with the names in each.
+
+Each name is mapped to this package's module that defines it, or to `module:name` if the name differs there.
+"""

@@ -120,8 +120,8 @@ class Columns:
         return torch.cat([tensor[:, self.oldest :], tensor[:, : self.oldest]], dim=1)
 
     def laid_out(self, like: Tensor) -> Tensor:
-        """Return initial bump centres [places] in bump spacings, with dtype and device of `like`; unused columns are
-        inert.
+        """Return the initial bump centres [places] in bump spacings, one per stored column, with dtype and device of
+        `like`. Unused columns get `INERT_CENTER`, so that their bumps are 0 at any time.
         """
         columns = torch.arange(self.count, dtype=like.dtype, device=like.device)
         if self.spare:
@@ -336,7 +336,7 @@ class BumpTensors(ContinuedField):
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any], gaussians: Gaussians) -> Self:
-        """Create an untrained field with the column layout of `config`."""
+        """Create an untrained field with the column layout of `config`; the caller then loads its tensors."""
         start, end = config["time_window_s"]
         field = cls(gaussians.count, (start, end), bumps=config["bumps"])
         field._columns = replace(

@@ -82,7 +82,9 @@ class NewField:
     spacing_s: float
     """Temporal resolution of motion: shortest time in seconds in which its direction or speed can change."""
     history_s: float | None = None
-    """Length of the past, in seconds, that stays deformable in a live session; None for all of it."""
+    """Length of the past, in seconds, that stays deformable in a live session; None for all of it. Earlier times show
+    the state at its start.
+    """
 
     @property
     def time_window_s(self) -> tuple[float, float]:
@@ -91,7 +93,7 @@ class NewField:
 
 
 class FieldTraining(Protocol):
-    """Training of a field: `deform`, then `update` with the gradient at the deformed Gaussians."""
+    """Training of a deformation field: `deform`, then `update` with the gradient at the deformed Gaussians."""
 
     def deform(self, gaussians: Gaussians, time_s: float) -> Gaussians:
         """Return the Gaussians at `time_s` without autograd."""
@@ -109,7 +111,7 @@ class FieldTraining(Protocol):
 
 
 class CapturedTraining(Protocol):
-    """Training of a field inside a captured CUDA graph; no method synchronises with the device."""
+    """Training of a deformation field inside a captured CUDA graph; no method synchronises with the device."""
 
     rates: int
     """Number of learning rates taken by `update`."""

@@ -31,9 +31,9 @@ LEAST_SURROUND = 0.015
 LEAST_FIELD = 0.15
 """Smallest share of the picture covered by the field."""
 ELLIPSE_SHARE = 0.7
-"""Share of the outline that must be on an ellipse for it to be used."""
+"""Share of the outline that must be on the fitted ellipse for the ellipse to replace it."""
 ELLIPSE_DISTANCE = 0.015
-"""Largest distance from the ellipse, as a share of its size."""
+"""Largest distance of a point of the outline that counts as on the ellipse, as a share of the ellipse's diameter."""
 LIT_OUTSIDE = 0.25
 """Largest share of lit pixels outside the outline, such as text, logos and compression artefacts."""
 MARGIN_SHARE = 0.01

@@ -195,7 +195,7 @@ SMALLEST_PX = 24
 RED_SCENE = 0.8
 """Third quartile of redness to which paler scenes (smoke, fat, a phantom) are stretched."""
 PALEST_SCENE = 0.2
-"""Third quartile of redness below which scenes are not stretched further."""
+"""Lower limit of the third quartile from which the stretch is computed; it limits the stretch of very pale scenes."""
 BINS, LOWEST, HIGHEST = 100, -0.3, 0.7
 """Bins of the redness distribution; values beyond count in the first and last bin."""
 MEMORY = 0.9

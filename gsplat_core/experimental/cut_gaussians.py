@@ -129,7 +129,7 @@ class GaussianKernel:
 
 
 class CutKernel(GaussianKernel):
-    """Falloff of a Gaussian, 0 beyond its curves."""
+    """Falloff of a Gaussian cut by Bézier curves: unchanged on the positive side of all its curves, 0 elsewhere."""
 
     name = "cut"
     extra = (CURVES,)

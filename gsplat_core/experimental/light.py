@@ -166,6 +166,9 @@ def shows_enough(look: Look) -> bool:
 def answer(grid: Grid, relief: Array | None, look: Look, frame: Frame) -> DepthMap:
     """Return the depth map of a frame from its relief coefficients.
 
+    The map is rejected, with zero confidence, if there are no coefficients or if the relief explains too little of the
+    brightness.
+
     Args:
         grid: cell grid of the picture.
         relief: coefficients, or None if too little tissue is visible.

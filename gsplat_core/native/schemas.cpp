@@ -255,8 +255,8 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
   // infinity where unknown.
   m.def("fit_disparities(Tensor left, Tensor right, Tensor sixteenths) -> (Tensor, Tensor)");
 
-  // Edge-aware smoothing of planes [C, H, W]. Smoothing stops where the guide, uint8 [H, W] or [H, W, channels],
-  // changes by grey_step grey values or more.
+  // Edge-aware smoothing of planes [C, H, W]. The strength between neighbouring pixels is multiplied by
+  // exp(-d / grey_step), where d is their difference in the guide, uint8 [H, W] or [H, W, channels], in grey values.
   m.def("smooth_within_edges(Tensor planes, Tensor guide, float strength, float grey_step) -> Tensor");
 
   // Histograms [width, bins] of the depth along the pixels' rays, summed over each picture column. A splat adds its

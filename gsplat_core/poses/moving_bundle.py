@@ -215,7 +215,9 @@ RELIEF = 0.3
 NEAREST = 0.05
 """Smallest depth used in projections, in units of the median depth."""
 HELD = 1e3
-"""Stiffness with which the tissue's common rigid motion is held constant if there is no trajectory prior."""
+"""Stiffness, in units of 1 / `SIGMA`, that keeps steps from changing the rigid part of the tissue's motion. It is used
+if there is no trajectory prior.
+"""
 
 
 RATE, RATE_PERIODS = (0.5, 0.03), (1 / 6, 2.0)
@@ -394,7 +396,7 @@ class _Places:
     inverse: Tensor
     """Inverses of the diagonal blocks of the rest positions, [P, 3, 3]."""
     slope: Tensor
-    """Gradients of the cost by the rest positions, [P, 3]."""
+    """Gradients of the least-squares cost by the rest positions of the P tracked points, [P, 3]."""
     by_camera: Tensor
     """Hessian blocks of the unknowns of a frame (twist and phases) and rest positions, [C, P, D, 3]."""
     by_amplitude: Tensor
@@ -502,7 +504,9 @@ def _amplitude_terms(
 
 
 def _rigid(bundle: MovingBundle, wave_count: int) -> Tensor:
-    """Return the penalty matrix [3 B, M, 3 B, M] that holds the rigid motion of the amplitudes."""
+    """Return the term of the amplitudes' Hessian, [3 B, M, 3 B, M] for B waves and M nodes, that keeps a step from
+    changing the rigid part of the motion.
+    """
     at = bundle.field.nodes - bundle.field.middle
     x, y, z = at.unbind(1)
     one, zero = torch.ones_like(x), torch.zeros_like(x)

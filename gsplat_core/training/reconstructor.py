@@ -240,7 +240,9 @@ class Reconstructor:
         self._schedule.rehearse(self._step, self._window, steps)
 
     def rehearsal_ns(self, steps: int) -> float:
-        """Return the usual duration of rehearsal steps in nanoseconds, including unfinished ones; 0 if unknown."""
+        """Return the usual duration of `steps` rehearsal steps in nanoseconds; 0 if unknown. On a GPU it includes the
+        earlier rehearsal steps that may still be queued.
+        """
         return self._schedule.rehearsal_ns(steps)
 
     def grow(self, frame: Frame) -> None:

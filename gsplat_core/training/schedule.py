@@ -139,7 +139,9 @@ class Schedule(ABC):
             step.settle(unsettled)
 
     def rehearsal_ns(self, steps: int) -> float:
-        """Return the usual duration of rehearsal steps in nanoseconds, including unfinished ones; 0 if unknown."""
+        """Return the usual duration of `steps` rehearsal steps in nanoseconds; 0 if unknown. On a GPU it includes the
+        earlier rehearsal steps that may still be queued.
+        """
         under_way = REHEARSED_IN_FLIGHT if self.device.type == "cuda" else 0
         return (steps + under_way) * (self.step_s or 0.0) * 1e9
 

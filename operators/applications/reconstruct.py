@@ -175,11 +175,13 @@ class Fitted(NamedTuple):
     """Eyes that were trained on."""
     steps: ChosenSteps
     source: FrameSource
-    """Source of the frames; with estimated poses if they were chosen."""
+    """Source of the frames. They have estimated poses if the settings require them, or if validation frames are
+    reconstructed better with them.
+    """
     path: CameraPath | None
     """Estimated path of the scope; None if its poses are given or not used."""
     settings: ReplaySettings
-    """Settings with the inputs that were chosen."""
+    """Settings of the training, with the inputs (poses, depth, eyes) that validation selected or the user gave."""
 
 
 class _Inputs:

@@ -179,7 +179,10 @@ class HoloscanScheduler:
                 gate.notify_scheduler()
 
     def now_ns(self, timestamp: int) -> int:
-        """Convert the SDK's time to the time of the graph's clock. A manual clock is advanced to the SDK's time."""
+        """Return the time of the graph's clock in nanoseconds.
+
+        A `ManualClock` is first advanced to `timestamp`, the time of the Holoscan scheduler in nanoseconds.
+        """
         if isinstance(self.clock, ManualClock):
             self.clock.advance_to(timestamp)
         return self.clock.timestamp()

@@ -192,7 +192,10 @@ class Served:
             self._let_go()
 
     def listen(self) -> None:
-        """Receive messages from the parent until the connection closes, then exit. Runs in its own thread."""
+        """Receive messages from the parent until the connection closes. End the process `_EXIT_WITHIN_S` seconds later.
+
+        Runs in its own thread.
+        """
         try:
             while True:
                 received = parsed(self._connection.recv_bytes(1 << 12))

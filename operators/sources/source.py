@@ -260,7 +260,10 @@ class ThreadedSource:
         """Make a blocked `frames()` return soon. Called by `close` from another thread."""
 
     def _ended(self, error: BaseException | None) -> None:
-        """Handle the end of the iterator; `error` is its exception or None. Called once per reading, with the lock."""
+        """Handle the end of `frames()`; `error` is its exception or None.
+
+        Called with the lock held, at most once after each `open`. Not called if `close` ended the reading.
+        """
 
     def _run(self, stop: threading.Event) -> None:
         """Main function of the reader's thread."""

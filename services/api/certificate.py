@@ -22,7 +22,7 @@ from services.schemas.service import CheckResult
 
 log = logging.getLogger(__name__)
 LOOK_S = 2.0
-"""Interval in seconds at which the files are checked for changes."""
+"""Interval in seconds at which the certificate and key files are checked for changes."""
 _CERTIFICATE = re.compile(r"-----BEGIN CERTIFICATE-----.+?-----END CERTIFICATE-----", re.DOTALL)
 _SEQUENCE, _VERSION, _UTC_TIME = 0x30, 0xA0, 0x17
 

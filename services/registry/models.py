@@ -195,7 +195,7 @@ class ModelRegistry:
 
         Raises:
             NotFound: if the version does not exist.
-            Conflict: if another version than `expected_current` is active, or `version` is not ready.
+            Conflict: if another version than `expected_current` is active, or `version` is neither ready nor retired.
             BlobDamaged: if its file is missing or altered.
         """
         check_by(by)

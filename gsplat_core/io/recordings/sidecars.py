@@ -192,7 +192,7 @@ def _read_valid_mask(path: Path, size: tuple[int, int], findings: Findings) -> n
 
 
 def _read_description(path: Path, size: tuple[int, int], findings: Findings) -> dict[str, Any] | None:
-    """Read and check `recording.json`; see `description`."""
+    """Read the values of `Beside.description` from `recording.json`. Returns None if the file is invalid."""
     if (content := read_json(path, findings)) is None:
         return None
     if content.get("format") != RECORDING_FORMAT or content.get("version") != RECORDING_VERSION:

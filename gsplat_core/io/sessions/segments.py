@@ -108,9 +108,9 @@ class SegmentWriter:
         self._closed = True
 
     def abandon(self, why: str) -> None:
-        """Release the files without finishing them, logging the reason if possible.
+        """Close the files after an error, without encoding the last pictures and without syncing to disk.
 
-        Without effect after `close`.
+        `why` is written to the last line of the segment's log if possible. Without effect after `close`.
         """
         if self._closed:
             return

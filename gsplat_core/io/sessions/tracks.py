@@ -154,7 +154,7 @@ class TrackWriter:
     def __init__(self, path: Path, coding: Coding, height_px: int, width_px: int, fps: float) -> None:
         self.path, self.coding = path, coding
         self.bytes = 0
-        """Number of bytes written, without the index that closing appends."""
+        """Total size of the encoded pictures in bytes, without the container's headers and index."""
         self._last_ms = -1
         self._file = path.open("xb", buffering=0)
         self._container = av.open(self._file, mode="w", format="matroska", options=_MUXER)
@@ -201,7 +201,10 @@ class TrackWriter:
         self._file.close()
 
     def abandon(self) -> None:
-        """Release the file without finishing it."""
+        """Close the file after an error.
+
+        Unlike `close`, this neither encodes the last picture nor syncs the file to disk, and ignores errors of the container.
+        """
         with suppress(OSError, av.FFmpegError):  # closing a file that failed before may fail again
             self._container.close()
         self._file.close()

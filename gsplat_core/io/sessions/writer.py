@@ -311,7 +311,7 @@ class SessionWriter:
         self._segment.close(why)
 
     def abandon(self, why: str) -> None:
-        """Release all files without finishing them, after a failed write."""
+        """Close all files after a failed write, as `SegmentWriter.abandon` does."""
         self._segment.abandon(why)
 
     def _pictures(self, stage: Stage, planes: dict[TrackName, NDArray[Any]], pts_ns: int) -> dict[TrackName, int]:

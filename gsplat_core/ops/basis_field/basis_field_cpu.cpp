@@ -140,7 +140,8 @@ void backward(const BasisBumps& field, const float* gradient, float* centers, fl
   }
 }
 
-// Two passes over a Gaussian's bumps: the sum of the deltas, then the change. The second pass hits the cache.
+// Two passes over a Gaussian's bumps. The first sums their deltas, and the second changes their weights by the difference
+// from the target. Its data are still in the cache.
 void move_to(const BasisBumps& field, float* weights, const float* target, int64_t begin, int64_t end) {
   for (int64_t n = begin; n < end; ++n) {
     const int64_t first = n * field.bumps;

@@ -176,7 +176,7 @@ struct HalfWeights {
     if (threadIdx.x & 1) in_front = __hmul2(in_front, beside);
   }
 
-  // Return true if a pixel that was open becomes closed behind these splats.
+  // Return true if these splats reduce the transmittance of a pixel that was open below kMinTransmittance.
   __device__ bool closes(const HalfPixels& pixels) const {
     return !__hbge2(behind, __hmin2(pixels.front, __float2half2_rn(kMinTransmittance)));
   }

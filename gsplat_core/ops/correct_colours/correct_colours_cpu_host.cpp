@@ -1,4 +1,4 @@
-// Host code of correct_colours: checks, memory, and the loops over tiles and iterations.
+// correct_colours on the CPU: argument checks, memory, and the loops over tiles and iterations.
 #include "correct_colours.h"
 
 #include <algorithm>

@@ -94,9 +94,10 @@ struct PackedSplats {
   Splats rows;      // the records are unused
   int32_t* row_of;  // [images, N]: row of each splat, or -1
 };
-// `visible` [images * blocks of Gaussians + 1] receives the number of rows in the preceding blocks; its last entry is
-// the total.
+// Write the number of visible splats of each block of Gaussians to `counts` [images * blocks].
 void count_visible(const Scene& scene, const Splats& splats, uint32_t* counts, cudaStream_t stream);
+// Write the rows of the visible splats. `block_starts` [images * blocks + 1]: number of visible splats in all preceding
+// blocks; the last entry is the total.
 void pack(const Scene& scene, const Splats& splats, const int32_t* block_starts, const PackedSplats& out, cudaStream_t stream);
 // Write the rows of the splats `from` to `to`.
 void renumber(int64_t length, const int32_t* row_of, const int32_t* from, int32_t* to, cudaStream_t stream);

@@ -1,4 +1,4 @@
-// Losses of rays in two launches each: terms with their sums per block, then the total and the gradients. The sums of
+// Losses along rays in two launches each: terms with their sums per block, then the total and the gradients. The sums of
 // blocks are added in a fixed order.
 #include "cuda_check.h"
 #include "cuda_scratch.h"

@@ -1,4 +1,4 @@
-// Losses of rays, row by row.
+// Losses along rays, row by row.
 #include "ray_losses_math.h"
 
 namespace GSPLAT_ISA::ray_losses {

@@ -12,7 +12,7 @@ from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled op
 
 MOST_DIMENSIONS = 4
-"""Largest number of dimensions of a point."""
+"""Largest number of dimensions of the points at which a splat regression is evaluated."""
 
 
 def check_splats(points: Tensor, centres: Tensor, factors: Tensor, values: Tensor) -> None:

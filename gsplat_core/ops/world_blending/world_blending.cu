@@ -186,7 +186,8 @@ __global__ void __launch_bounds__(kStaged)
   for (int k = 0; k < kRayNumbers; ++k) to[k] = (first_channel == 0 ? 0 : to[k]) + v_ray[k];
 }
 
-// Write the gradients of the Gaussians from their sums, or add those of further channels.
+// Convert each Gaussian's sums over pixels to gradients, in one launch per group of channels. The first launch
+// (first_channel = 0) overwrites the gradients of the Gaussian and its opacity, and later launches add to them.
 __global__ void convert_sums(Inputs in, const float* sums, int row_size, int first_channel, InputGradients out) {
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i >= in.count * in.images) return;
@@ -202,7 +203,8 @@ __global__ void convert_sums(Inputs in, const float* sums, int row_size, int fir
     if (first_channel + d < in.channels) out.colors[i * in.channels + first_channel + d] = own[kMoments + d];
 }
 
-// Call run with the number of channels of a launch, which is sufficient for `channels` or the most of one launch.
+// Call run with the number of channels of one launch as a compile-time constant: the smallest of 3, 8 and kMostChannels
+// that is sufficient for `channels`, or kMostChannels if several launches are needed.
 template <class Run>
 void with_channels(int channels, const Run& run) {
   if (channels <= 3) return run(std::integral_constant<int, 3>());

@@ -114,7 +114,8 @@ GSPLAT_INLINE void add_terms(const Inputs& in, const float* gaussian, int64_t id
   for (int k = 0; k < kRayNumbers; ++k) store(columns.v_rays + k * kPixels + at, v_ray[k]);
 }
 
-// Write the rows of a tile's instances from the pixels of one window, or add to them.
+// Compute the gradient rows of a tile's instances from the pixels of one window. With `add` they are added to the rows,
+// otherwise they overwrite them.
 static void window_backward(const Inputs& in, const Tile& t, int x0, int y0, bool add, const PixelGradients& from,
                             const GradientRows& out, float* scratch) {
   constexpr int kPixels = kWindow * kWindow;

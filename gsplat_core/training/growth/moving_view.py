@@ -208,12 +208,17 @@ class NewTissue:
         return bool(self._entered.any())
 
     def _empty(self, now: Gaussians) -> tuple[Tensor, Tensor]:
-        """Return the new cells with almost no Gaussians, bool [rows, columns], and the mean depth around each cell."""
+        """Return the cells that came into view and have almost no Gaussians, bool [rows, columns], and the mean depth
+        around each cell.
+        """
         count, depth = around_cells(now, self._camera, self._spacing, self._shape)
         return tensor_of(self._entered.reshape(self._shape), now.device) & (count < 9 * USUAL_DENSITY), depth
 
     def pixels(self, now: Gaussians) -> Tensor:
-        """Return the pixels of the new grid cells with almost no Gaussians, bool [H, W], without host sync."""
+        """Return the pixels of the grid cells that came into view and have almost no Gaussians, bool [H, W].
+
+        Does not synchronise with the device.
+        """
         return self._of_cells(self._empty(now)[0])
 
     def unfilled(self, now: Gaussians, mask: Tensor) -> tuple[NDArray[np.float64], NDArray[np.float32]]:

@@ -111,7 +111,7 @@ class WeightedLosses:
         return compared and (self._steps - 1) % EVERY == 0
 
     def compare(self, rays: RenderedRays) -> Tensor:
-        """Return the weighted sum of the losses of rays for a step that compares them.
+        """Return the weighted sum of the losses along rays for a step that compares them.
 
         Args:
             rays: rays for which `are_rays_due` returned True.

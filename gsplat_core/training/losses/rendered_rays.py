@@ -14,7 +14,7 @@ from gsplat_core.training.observations import Observation
 SMALL_PIXELS = 24_000
 """Number of pixels up to which pictures are compared at full size."""
 EVERY = 4
-"""Interval in steps at which losses of rays are evaluated."""
+"""Interval in steps at which losses along rays are evaluated."""
 
 
 class RenderedRays(NamedTuple):

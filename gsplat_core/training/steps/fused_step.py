@@ -48,7 +48,9 @@ GEOMETRY: Mapping[str, slice | int] = {
     "log_scales": LOG_SCALE,
     "logit_opacities": OPACITY.start,
 }
-"""Columns of a raw row of the tensors that losses of rays train."""
+"""Tensors trained by the losses along rays (depth, normals and classes), with their columns in the raw parameters
+[N, 16].
+"""
 
 
 class StepKind(NamedTuple):
@@ -130,7 +132,7 @@ class FusedStep:
             adam: optimiser of the parameters.
             weights: weights of the losses of a picture.
             camera: size and projection model of every observation.
-            losses: losses of rays, `WeightedLosses.can_be_captured`.
+            losses: losses along rays, `WeightedLosses.can_be_captured`.
         """
         device = gaussians.device
         self._gaussians, self._field, self._adam = gaussians, field, adam
@@ -297,7 +299,7 @@ class FusedStep:
     def _compare_rays(
         self, scene: Gaussians, deltas: Tensor | None, view: View, inputs: StepInputs, status: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return the losses of rays and their gradient by the raw parameters [N, 16]. Reports an overflow in `status`."""
+        """Return the losses along rays and their gradient by the raw parameters [N, 16]. Reports an overflow in `status`."""
         assert self._losses is not None
         tensors = {name: tensor.detach() for name, tensor in scene.tensors().items() if name in GEOMETRY}
         if deltas is not None:
