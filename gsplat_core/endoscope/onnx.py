@@ -7,7 +7,7 @@ bytes instead of a path. Input and output conventions come from the model's meta
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Generic, Literal, TypeVar
 
@@ -18,6 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.io.files import read_regular
+from gsplat_core.io.protobuf import fields
 
 MOST_BYTES = 512 * 2**20
 MOST_NESTING = 64
@@ -34,8 +35,6 @@ _PARTS: dict[str, dict[int, str]] = {
     "sparse": {1: "tensor", 2: "tensor"},
 }
 """Fields of each message type that lead to tensors (onnx.proto, IR version 13)."""
-_VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
-"""Protobuf wire types."""
 
 
 def read_model(path: Path, what: str) -> bytes:
@@ -75,49 +74,13 @@ def has_external_data(data: bytes) -> bool:
         kind, message, depth = waiting.pop()
         if depth > MOST_NESTING:
             raise ValueError(f"graphs inside each other more than {MOST_NESTING} deep")
-        for field, value in _fields(message):
+        for field, value in fields(message):
             if kind == "tensor":
                 if field == _EXTERNAL_DATA or (field == _DATA_LOCATION and value == _EXTERNAL):
                     return True
             elif field in _PARTS[kind] and isinstance(value, memoryview):
                 waiting.append((_PARTS[kind][field], value, depth + 1))
     return False
-
-
-def _fields(message: memoryview) -> Iterator[tuple[int, int | memoryview]]:
-    """Yield number and value of a message's fields: integers, and bytes of length-delimited fields."""
-    at = 0
-    while at < len(message):
-        tag, at = _varint(message, at)
-        field, wire = tag >> 3, tag & 7
-        if wire == _VARINT:
-            number, at = _varint(message, at)
-            yield field, number
-            continue
-        if wire == _BYTES:
-            length, at = _varint(message, at)
-        elif wire in (_FIXED64, _FIXED32):
-            length = 8 if wire == _FIXED64 else 4
-        else:
-            raise ValueError(f"wire type {wire}")
-        if field == 0 or at + length > len(message):
-            raise ValueError("it ends too early")
-        if wire == _BYTES:
-            yield field, message[at : at + length]
-        at += length
-
-
-def _varint(message: memoryview, at: int) -> tuple[int, int]:
-    value = 0
-    for shift in range(0, 70, 7):
-        if at >= len(message):
-            raise ValueError("it ends too early")
-        byte = message[at]
-        at += 1
-        value |= (byte & 0x7F) << shift
-        if byte < 0x80:
-            return value, at
-    raise ValueError("a number of more than 64 bits")
 
 
 METADATA_KEY = "intrasplat"

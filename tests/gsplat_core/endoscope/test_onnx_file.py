@@ -179,14 +179,3 @@ def test_messages_that_end_within_a_field_are_refused(data):
 
 def test_values_in_the_tensor_are_not_external():
     assert not has_external_data(tagged(7, tagged(5, bytes([14 << 3, 0]))))
-
-
-def test_a_number_has_ten_bytes_at_most():
-    """Seven bits each, the lowest first. A length of eleven would be read from foreign bytes."""
-    assert onnx._varint(memoryview(b"\x07"), 0) == (7, 1)
-    assert onnx._varint(memoryview(b"x\x96\x01y"), 1) == (150, 3)
-    assert onnx._varint(memoryview(9 * b"\x80" + b"\x01"), 0) == (2**63, 10)
-    with pytest.raises(ValueError, match="more than 64 bits"):
-        onnx._varint(memoryview(10 * b"\x80" + b"\x01"), 0)
-    with pytest.raises(ValueError, match="ends too early"):
-        onnx._varint(memoryview(b"\x80"), 0)
