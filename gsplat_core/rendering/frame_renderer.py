@@ -69,16 +69,22 @@ class CapturedSequence(Generic[Result]):
     them. Inputs that change between replays must be in device memory referenced by the sequence.
 
     CUDA cannot load kernels during a capture. The sequence must therefore have run before. `warm_up` runs it once, with
-    all its side effects.
+    all its side effects. Replays have the `priority` of a CUDA stream, whichever stream they are launched on.
     """
 
     def __init__(
-        self, sequence: Callable[[], Result], device: torch.device, memory: GraphMemory, *, warm_up: bool
+        self,
+        sequence: Callable[[], Result],
+        device: torch.device,
+        memory: GraphMemory,
+        *,
+        warm_up: bool,
+        priority: int = 0,
     ) -> None:
         if warm_up:
             sequence()
         self._graph = torch.cuda.CUDAGraph()
-        self.results = _capture(self._graph, sequence, device, memory.pool)
+        self.results = _capture(self._graph, sequence, device, memory.pool, priority)
 
     def replay(self) -> Result:
         """Launch the graph on the current stream without waiting."""
@@ -102,11 +108,13 @@ def _capture(
     sequence: Callable[[], Result],
     device: torch.device,
     pool: Any,
+    priority: int = 0,
 ) -> Result:
     # Not `torch.cuda.graph`, which runs the garbage collector first. That takes longer than many frames. The collector
     # must not run during the capture either: freeing an earlier graph invalidates it.
     with _CAPTURING, _without_garbage_collection():
-        current, side = torch.cuda.current_stream(device), torch.cuda.Stream(device)
+        # torch instantiates graphs with the priorities of their nodes, which are that of the capturing stream.
+        current, side = torch.cuda.current_stream(device), torch.cuda.Stream(device, priority=priority)
         side.wait_stream(current)
         with torch.cuda.stream(side):
             # thread_local lets other threads allocate memory during the capture.
