@@ -96,11 +96,12 @@ class Analysis(Application):
         super().__init__(name="analysis")
         options = SourceOptions(arguments.scale, arguments.frames, fps=arguments.fps)
         self._source = open_source(path, options)
+        self._device = arguments.device
         self.frames: list[Frame] = []
 
     def compose(self) -> None:
         source = SourceOp(self, name="source", source=self._source)
-        analysis = analysis_operator(self, "builtin", "withhold")
+        analysis = analysis_operator(self, "builtin", "withhold", device=self._device)
         sink = CallbackSinkOp(self, name="frames", callback=self.frames.append)
         self.add_flow(source, analysis, {("frame", "frame")})
         self.add_flow(analysis, sink, {("frame", "message")})

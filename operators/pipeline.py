@@ -82,6 +82,7 @@ def analysis_operator(
     *,
     behind_gate: Sequence[Operator] = (),
     behind: Sequence[Operator] = (),
+    device: str = "cpu",
 ) -> SideBySideOp:
     """Return the operator between source and reconstruction, with the input and output `frame`.
 
@@ -94,6 +95,7 @@ def analysis_operator(
         positions: operators that set pose and depth of a frame.
         behind_gate: operators inserted directly after the out-of-body gate.
         behind: operators appended at the end.
+        device: device of the built-in tool network.
     """
     others = [name for name in PICTURE_STAGES if name != SIDE_STAGE]
     stream = OrdinaryStream()
@@ -105,7 +107,7 @@ def analysis_operator(
         first=[PictureStagesOp(fragment, name="picture", stages=picture_stages, stream=stream)],
         beside=[
             [
-                new_tool_mask(fragment, tool_mask),
+                new_tool_mask(fragment, tool_mask, device=device),
                 StageOp(fragment, name=SIDE_STAGE, stages=new_stages(PICTURE_STAGES, without=others)),
             ]
         ],
@@ -287,6 +289,7 @@ class Pipeline(Application):
                 (*poses, depth),
                 behind_gate=[RecordFramesOp(self, name="recorded_frames", recorder=recorder)] if recorder else [],
                 behind=[RecordPreparationOp(self, name="recorded_preparation", recorder=recorder)] if recorder else [],
+                device=settings.device,
             ),
         )
 

@@ -195,7 +195,16 @@ class BuiltInToolMaskOp(FoundToolMaskOp):
     """Detects tools with the trained network (`NetworkToolFinder`), or by colour if the network cannot be loaded."""
 
     def __init__(self, fragment: Any, *args: Any, **kwargs: Any) -> None:
-        super().__init__(fragment, *args, make_finder=built_in_finder, method="builtin", doubts=True, **kwargs)
+        self.device = "cpu"
+        """Device of the network, read in `start()`."""
+        super().__init__(
+            fragment,
+            *args,
+            make_finder=lambda: built_in_finder(self.device),
+            method="builtin",
+            doubts=True,
+            **kwargs,
+        )
 
 
 class ClassicalToolMaskOp(FoundToolMaskOp):
@@ -205,11 +214,11 @@ class ClassicalToolMaskOp(FoundToolMaskOp):
         super().__init__(fragment, *args, make_finder=ToolFinder, method="classical", doubts=True, **kwargs)
 
 
-def built_in_finder() -> MaskFinder:
-    """Return the default detector."""
+def built_in_finder(device: str = "cpu") -> MaskFinder:
+    """Return the default detector, with its network on `device`."""
     try:
-        return NetworkToolFinder()
-    except cv2.error as error:
+        return NetworkToolFinder(device=device)
+    except (cv2.error, InvalidSetting, RuntimeError) as error:
         log.warning("the tool network cannot be loaded, so tools are found by colour: %s", error)
         return ToolFinder()
 
@@ -281,19 +290,23 @@ def onnx_tool_mask(fragment: Any, name: str, argument: str) -> Operator:
     return OnnxToolMaskOp(fragment, name=name, path=Path(argument))
 
 
-def new_tool_mask(fragment: Any, choice: str, name: str = "tool_mask") -> Operator:
+def new_tool_mask(fragment: Any, choice: str, name: str = "tool_mask", *, device: str = "cpu") -> Operator:
     """Create the tool mask operator for a setting.
 
     Args:
         fragment: the graph.
         choice: name in `TOOL_MASKS`, optionally with a colon and an argument ("onnx:model.onnx").
         name: name of the operator.
+        device: device of the run, used by the built-in network.
 
     Raises:
         InvalidSetting: the name is unknown, or the factory rejects the argument.
     """
     method, _, argument = choice.partition(":")
-    return TOOL_MASKS[method](fragment, name, argument)
+    operator = TOOL_MASKS[method](fragment, name, argument)
+    if isinstance(operator, BuiltInToolMaskOp):
+        operator.device = device
+    return operator
 
 
 def check_tool_mask(choice: str) -> None:

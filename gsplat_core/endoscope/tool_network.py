@@ -6,6 +6,7 @@ and trains the networks.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -47,28 +48,62 @@ BORDER: NDArray[np.uint8] = np.ones((7, 7), np.uint8)
 class _Network:
     """Loaded network and its input."""
 
-    network: cv2.dnn.Net
+    logits: Callable[[NDArray[np.float32]], NDArray[np.float32]]
+    """Function of `features` [1, inputs, h, w] that returns logits of tool [h / 2, w / 2]."""
     input_px: tuple[int, int]
     """Width and height."""
     inputs: int
     """Number of planes."""
 
 
-class NetworkToolFinder:
-    """Tool segmentation of single pictures on the CPU. Deterministic, without state between pictures."""
+def _loaded(path: Path, device: str, input_px: tuple[int, int], inputs: int) -> _Network:
+    """Load a network for a device. OpenCV runs it on the CPU, torch on a GPU."""
+    if device != "cpu":
+        import torch
 
-    def __init__(self, network: Path | None = None, input_px: tuple[int, int] = INPUT_PX, inputs: int = 5) -> None:
-        """Load the networks. Raises cv2.error if OpenCV cannot.
+        from gsplat_core.endoscope.tool_network_torch import TorchToolNetwork
+
+        return _Network(TorchToolNetwork(path, torch.device(device)).logits, input_px, inputs)
+    network = cv2.dnn.readNetFromONNX(str(path))
+
+    def logits(planes: NDArray[np.float32]) -> NDArray[np.float32]:
+        network.setInput(planes)
+        return np.asarray(network.forward()[0, 0], np.float32)
+
+    return _Network(logits, input_px, inputs)
+
+
+class NetworkToolFinder:
+    """Tool segmentation of single pictures. Deterministic on each device, without state between pictures.
+
+    A GPU runs the network alone; the CPU prepares its input and turns its output into a mask.
+    """
+
+    def __init__(
+        self,
+        network: Path | None = None,
+        input_px: tuple[int, int] = INPUT_PX,
+        inputs: int = 5,
+        *,
+        device: str = "cpu",
+    ) -> None:
+        """Load the networks.
 
         Args:
             network: file written by `benchmarks/tool_network/train.py`, for all pictures; None for the two of this package.
             input_px: width and height of its input.
             inputs: number of planes of its input, 5 or 8.
+            device: device of the network, "cpu" or "cuda".
+
+        Raises:
+            cv2.error: if OpenCV cannot load a network.
+            InvalidSetting: if a network cannot be run on a GPU.
+            RuntimeError: for an error of CUDA.
         """
-        self._network = _Network(cv2.dnn.readNetFromONNX(str(network or NETWORK)), input_px, inputs)
+        self._network = _loaded(network or NETWORK, device, input_px, inputs)
         self._round = self._network
         if network is None:
-            self._round = _Network(cv2.dnn.readNetFromONNX(str(ROUND_NETWORK)), ROUND_INPUT_PX, ROUND_INPUTS)
+            self._round = _loaded(ROUND_NETWORK, device, ROUND_INPUT_PX, ROUND_INPUTS)
 
     def reset(self) -> None:
         """Do nothing, since no state is kept between pictures."""
@@ -89,8 +124,7 @@ class NetworkToolFinder:
             chosen = self._round
             small = averaged(image, chosen.input_px)
         planes = features(small, chosen.inputs)
-        chosen.network.setInput(planes)
-        smoothed = along_edges(chosen.network.forward()[0, 0], planes[0])
+        smoothed = along_edges(chosen.logits(planes), planes[0])
         levels = (smoothed * np.float32(127 / CERTAIN) + 128).clip(0, 255).astype(np.uint8)
         view = field_of_view(lowest_and_highest(small)[1])
         levels *= view

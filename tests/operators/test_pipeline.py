@@ -6,9 +6,13 @@ from types import SimpleNamespace
 
 import pytest
 
+from operators.applications.replay import ReplaySettings
 from operators.frame_clock import ClockSettings, FrameClock
 from operators.graph import Application, GreedyScheduler, MultiThreadScheduler
-from operators.pipeline import Pace
+from operators.pipeline import Pace, Pipeline, analysis_operator
+from operators.side_by_side import SideBySideOp
+from operators.sources.recording import RecordingSource
+from operators.tool_mask import BuiltInToolMaskOp
 from operators.training import EveryFrame, RecordedCalls, UntilDisplay
 
 CLOCK = FrameClock(ClockSettings(), 30.0)
@@ -37,3 +41,20 @@ def test_the_clock_decides_on_training_before_a_session_and_a_session_before_the
     depth = SimpleNamespace(background=None)
     paces = Pace(clock=CLOCK, session=session), Pace(session=session), Pace()
     assert [type(pace.training(depth)) for pace in paces] == [UntilDisplay, RecordedCalls, EveryFrame]
+
+
+def device_of_tools(analysis):
+    (tools,) = (operator for operator in analysis.parts if isinstance(operator, BuiltInToolMaskOp))
+    return tools.device
+
+
+@pytest.mark.parametrize("device", ["cpu", "cuda"])
+def test_the_tool_network_runs_on_the_device_of_the_run(recording, tmp_path, device):
+    settings = ReplaySettings(tmp_path, tmp_path, device=device)
+    graph = Pipeline(
+        RecordingSource(recording), settings, tmp_path, name="replay", pace=Pace(), make_reconstructor=lambda: None
+    )
+    graph.compose()
+    (analysis,) = (operator for operator in graph.operators if isinstance(operator, SideBySideOp))
+    assert device_of_tools(analysis) == device
+    assert device_of_tools(analysis_operator(Application(), "builtin", "withhold")) == "cpu"

@@ -19,6 +19,7 @@ from operators.tool_mask import (
     FoundMasks,
     FoundToolMaskOp,
     RecordedToolMaskOp,
+    built_in_finder,
     check_tool_mask,
     new_tool_mask,
 )
@@ -120,6 +121,52 @@ def test_without_its_network_the_built_in_mask_is_found_by_colour(frame, compute
     assert "the tool network cannot be loaded" in caplog.text
     (found,) = compute(operator, frame=frame(0, image=np.full((64, 64, 3), (190, 90, 70), np.uint8)))
     assert found.mask.all()
+
+
+@pytest.mark.parametrize(
+    "error", [RuntimeError("CUDA error: out of memory"), InvalidSetting("its operator Mish is not supported")]
+)
+def test_if_the_gpu_cannot_run_the_network_the_built_in_mask_is_found_by_colour(
+    frame, compute, monkeypatch, caplog, error
+):
+    asked = []
+
+    def fail(path, device):
+        asked.append(str(device))
+        raise error
+
+    monkeypatch.setattr("gsplat_core.endoscope.tool_network_torch.TorchToolNetwork", fail)
+    operator = new_tool_mask(None, "builtin", device="cuda")
+    with caplog.at_level(logging.WARNING):
+        operator.start()
+    assert (
+        asked == ["cuda"] and f"the tool network cannot be loaded, so tools are found by colour: {error}" in caplog.text
+    )
+    (found,) = compute(operator, frame=frame(0, image=np.full((64, 64, 3), (190, 90, 70), np.uint8)))
+    assert found.mask.all()
+
+
+def test_other_errors_are_raised(monkeypatch):
+    def fail(path, device):
+        raise TypeError("a bug")
+
+    monkeypatch.setattr("gsplat_core.endoscope.tool_network_torch.TorchToolNetwork", fail)
+    with pytest.raises(TypeError, match="a bug"):
+        new_tool_mask(None, "builtin", device="cuda").start()
+
+
+def test_the_network_runs_on_the_cpu_unless_another_device_is_named(monkeypatch):
+    devices = []
+
+    def made(*, device):
+        devices.append(device)
+        return FakeFinder()
+
+    monkeypatch.setattr("operators.tool_mask.NetworkToolFinder", made)
+    new_tool_mask(None, "builtin").start()
+    new_tool_mask(None, "builtin", device="cuda").start()
+    built_in_finder()
+    assert devices == ["cpu", "cuda", "cpu"]
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import pytest
 
@@ -17,27 +16,12 @@ from gsplat_core.endoscope.tool_network import (
 )
 from gsplat_core.errors import InvalidInput
 
+from .tool_pictures import in_round_view, tissue, with_rod
+
 
 @pytest.fixture(scope="module")
 def finder():
     return NetworkToolFinder()
-
-
-def tissue(height, width):
-    noise = cv2.resize(np.random.default_rng(0).normal(0, 1, (9, 11)), (width, height), interpolation=cv2.INTER_CUBIC)
-    return np.clip(np.array([170.0, 70.0, 60.0]) * (1 + 0.12 * noise[..., None]), 0, 255).astype(np.uint8)
-
-
-def with_rod(height, width):
-    """A grey rod with a bright line from the right border to the middle, and its mask (1 = rod)."""
-    image, mask = tissue(height, width), np.zeros((height, width), np.uint8)
-    y, x = np.mgrid[0:height, 0:width] / height
-    across = (y - 0.25 - 0.25 * x / (width / height)) / 0.12
-    rod = (np.abs(across) < 1) & (x > 0.5 * width / height)
-    shade = 40 + 120 * np.sqrt(np.clip(1 - across**2, 0, 1)) + 90 * np.exp(-(((across + 0.3) / 0.2) ** 2))
-    image[rod] = np.clip(shade[rod][:, None], 0, 255)
-    mask[rod] = 1
-    return image, mask
 
 
 @pytest.mark.parametrize("size", [(256, 320), (540, 540), (360, 640)])
@@ -86,14 +70,6 @@ def test_small_regions_inside_the_view_are_no_tools():
     wanted[inside] = 0
     remove_inner_regions(levels, view)
     np.testing.assert_array_equal(levels, wanted)
-
-
-def in_round_view(image):
-    """The picture with a black surround, and its view (1 inside)."""
-    height, width = image.shape[:2]
-    y, x = np.mgrid[0:height, 0:width]
-    inside = (x - width / 2) ** 2 + (y - height / 2) ** 2 < (0.55 * height) ** 2
-    return image * inside[..., None].astype(np.uint8), inside
 
 
 def test_a_round_view_has_four_dark_corners():
