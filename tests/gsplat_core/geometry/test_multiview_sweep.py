@@ -280,7 +280,7 @@ def recording(count: int, apart_s: float) -> tuple[list[Frame], list[Camera]]:
 def test_at_most_32_frames_of_a_recording_get_depth_from_those_within_three_seconds(
     compared, monkeypatch, count, estimated
 ):
-    monkeypatch.setattr(multiview, "agree", lambda first, second, error: True)
+    monkeypatch.setattr(multiview, "agree", lambda first, second: True)
     found = ParallaxDepth().of_recording(*recording(count, 0.7))
     numbers = [frame.seq for frame in found.frames if frame.depth is not None]
     assert len(numbers) == estimated == len(compared) and numbers[0] == 0 and numbers[-1] == count - 1
@@ -300,7 +300,7 @@ def test_a_recording_of_a_still_scope_or_with_depth_stays_as_it_is(compared):
 def test_depth_of_a_recording_is_kept_if_half_of_it_is_confirmed(compared, monkeypatch, agreeing, kept):
     """Five frames have depth. The first agreement of two frames confirms both, each later one confirms one more."""
     answers = iter([True] * (agreeing == 2) + [False, True] + [False] * 4)
-    monkeypatch.setattr(multiview, "agree", lambda first, second, error: next(answers))
+    monkeypatch.setattr(multiview, "agree", lambda first, second: next(answers))
     found = ParallaxDepth().of_recording(*recording(5, 0.1))
     assert sum(frame.depth is not None for frame in found.frames) == (5 if kept else 0)
     assert found.doubts == ({} if kept else {multiview.UNCONFIRMED: 5})
@@ -314,7 +314,7 @@ def test_reasons_why_frames_of_a_recording_have_no_depth_are_counted(monkeypatch
         return DepthMap(np.full(size, 20, np.float32), np.full(size, x > 2, np.float32), PARALLAX, metric=False)
 
     monkeypatch.setattr(multiview, "depth_of_view", depth_of_view)
-    monkeypatch.setattr(multiview, "agree", lambda first, second, error: True)
+    monkeypatch.setattr(multiview, "agree", lambda first, second: True)
     found = ParallaxDepth().of_recording(*recording(5, 0.1))
     assert [frame.depth is not None for frame in found.frames] == [False, False, True, True, True]
     assert found.doubts == {"too dark": 2, multiview.DEFORMS: 1}
