@@ -22,6 +22,8 @@ from services.errors import BadMessage, BusError, CommandRefused, NoAnswer
 
 MOST_BYTES = 1 << 16
 """Largest size of a JSON message between processes, in bytes."""
+MOST_NESTING = 64
+"""Largest number of objects and lists inside each other. Python's own limit depends on its version."""
 
 
 def packed_json(content: Mapping[str, Any]) -> bytes:
@@ -43,7 +45,7 @@ def parsed_json(data: bytes | memoryview) -> dict[str, Any]:
     """Decode a message's JSON object.
 
     Raises:
-        BadMessage: if the data is too large or is no JSON object.
+        BadMessage: if the data is too large, too deeply nested or no JSON object.
     """
     if len(data) > MOST_BYTES:
         raise BadMessage(f"a message of {len(data)} bytes is not read; at most {MOST_BYTES} are")
@@ -54,6 +56,12 @@ def parsed_json(data: bytes | memoryview) -> dict[str, Any]:
         raise BadMessage(f"{text[:40]!r} is not JSON: {error}") from None
     if not isinstance(content, dict):
         raise BadMessage(f"{text[:40]!r} is not a JSON object")
+    inside: list[Any] = [content]
+    for _ in range(MOST_NESTING):
+        children = (each.values() if isinstance(each, dict) else each for each in inside)
+        inside = [value for values in children for value in values if isinstance(value, dict | list)]
+    if inside:
+        raise BadMessage(f"{text[:40]!r} has more than {MOST_NESTING} objects and lists inside each other")
     return content
 
 

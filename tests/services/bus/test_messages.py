@@ -5,7 +5,7 @@ import pickle
 
 import pytest
 
-from services.bus.messages import MOST_BYTES, packed_json, parsed_json
+from services.bus.messages import MOST_BYTES, MOST_NESTING, packed_json, parsed_json
 from services.errors import BadMessage
 
 
@@ -40,3 +40,13 @@ def test_what_cannot_be_sent(content):
 def test_what_is_not_read(data):
     with pytest.raises(BadMessage):
         parsed_json(data)
+
+
+@pytest.mark.parametrize("pair", [(b'{"x":', b"}"), (b"[", b"]")], ids=["objects", "lists"])
+def test_nesting_is_limited_in_every_version_of_python(pair):
+    def nested(depth):
+        return b'{"y":0,"x":' + pair[0] * (depth - 1) + b"1" + pair[1] * (depth - 1) + b"}"
+
+    assert parsed_json(nested(MOST_NESTING))["y"] == 0
+    with pytest.raises(BadMessage, match="inside each other"):
+        parsed_json(nested(MOST_NESTING + 1))
