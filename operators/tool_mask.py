@@ -192,7 +192,7 @@ class FoundToolMaskOp(Operator):
 
 
 class BuiltInToolMaskOp(FoundToolMaskOp):
-    """Detects tools with the trained network (`NetworkToolFinder`), or by colour if the network cannot be loaded."""
+    """Detects tools with the trained networks (`NetworkToolFinder`), or by colour if no device can run them."""
 
     def __init__(self, fragment: Any, *args: Any, **kwargs: Any) -> None:
         self.device = "cpu"
@@ -215,12 +215,14 @@ class ClassicalToolMaskOp(FoundToolMaskOp):
 
 
 def built_in_finder(device: str = "cpu") -> MaskFinder:
-    """Return the default detector, with its network on `device`."""
-    try:
-        return NetworkToolFinder(device=device)
-    except (cv2.error, InvalidSetting, RuntimeError) as error:
-        log.warning("the tool network cannot be loaded, so tools are found by colour: %s", error)
-        return ToolFinder()
+    """Return the default detector: networks on `device`, else on the CPU, else detection by colour. Each failure is logged."""
+    for each in dict.fromkeys((device, "cpu")):
+        try:
+            return NetworkToolFinder(device=each)
+        except (cv2.error, InvalidSetting, RuntimeError) as error:
+            log.warning("the tool network cannot be loaded on %s: %s", each, error)
+    log.warning("tools are found by colour")
+    return ToolFinder()
 
 
 class NoToolMaskOp(Operator):

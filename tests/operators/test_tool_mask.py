@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from onnx import TensorProto, helper
 
+from gsplat_core.endoscope.tool_network import NetworkToolFinder
 from gsplat_core.errors import InvalidSetting
 from operators.outcome import OutcomeBuilder
 from operators.tool_mask import (
@@ -23,6 +24,7 @@ from operators.tool_mask import (
     check_tool_mask,
     new_tool_mask,
 )
+from tests.gsplat_core.endoscope.tool_pictures import with_rod
 
 
 def notes(operator):
@@ -118,7 +120,7 @@ def test_without_its_network_the_built_in_mask_is_found_by_colour(frame, compute
     operator = new_tool_mask(None, "builtin")
     with caplog.at_level(logging.WARNING):
         operator.start()
-    assert "the tool network cannot be loaded" in caplog.text
+    assert "the tool network cannot be loaded on cpu" in caplog.text and "found by colour" in caplog.text
     (found,) = compute(operator, frame=frame(0, image=np.full((64, 64, 3), (190, 90, 70), np.uint8)))
     assert found.mask.all()
 
@@ -126,9 +128,7 @@ def test_without_its_network_the_built_in_mask_is_found_by_colour(frame, compute
 @pytest.mark.parametrize(
     "error", [RuntimeError("CUDA error: out of memory"), InvalidSetting("its operator Mish is not supported")]
 )
-def test_if_the_gpu_cannot_run_the_network_the_built_in_mask_is_found_by_colour(
-    frame, compute, monkeypatch, caplog, error
-):
+def test_if_the_gpu_cannot_run_the_network_the_cpu_does(frame, compute, monkeypatch, caplog, error):
     asked = []
 
     def fail(path, device):
@@ -139,11 +139,11 @@ def test_if_the_gpu_cannot_run_the_network_the_built_in_mask_is_found_by_colour(
     operator = new_tool_mask(None, "builtin", device="cuda")
     with caplog.at_level(logging.WARNING):
         operator.start()
-    assert (
-        asked == ["cuda"] and f"the tool network cannot be loaded, so tools are found by colour: {error}" in caplog.text
-    )
-    (found,) = compute(operator, frame=frame(0, image=np.full((64, 64, 3), (190, 90, 70), np.uint8)))
-    assert found.mask.all()
+    assert asked == ["cuda"] and f"the tool network cannot be loaded on cuda: {error}" in caplog.text
+    assert "found by colour" not in caplog.text
+    image = with_rod(256, 320)[0]
+    (found,) = compute(operator, frame=frame(0, image=image))
+    assert (found.mask == NetworkToolFinder().find(image)).all() and not found.mask.all()
 
 
 def test_other_errors_are_raised(monkeypatch):

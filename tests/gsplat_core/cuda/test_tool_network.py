@@ -82,11 +82,11 @@ def test_equal_inputs_give_equal_bytes_in_every_order_and_object(gpu, path):
 
 
 def busy(stop, started):
-    """Launch kernels and allocate memory until `stop`."""
+    """Launch kernels and allocate memory until `stop`. CUDA forbids to wait for the whole device during a capture."""
     values = torch.rand(1024, 1024, device="cuda")
     while not stop.is_set():
         values = (values @ values).sigmoid() + torch.rand(values.shape, device="cuda")
-        torch.cuda.synchronize()
+        torch.cuda.current_stream().synchronize()
         started.set()
 
 
