@@ -163,10 +163,12 @@ def structure_of(frame: Frame) -> Structure | None:
 
 def _shown(frame: Frame) -> Structure:
     size = compared_size(frame.width_px, frame.height_px)
+    samples = SAMPLES * size[0], SAMPLES * size[1]
     known = np.ones((size[1], size[0]), bool)
     for mask in (frame.mask, frame.loss_mask):
         if mask is not None:
-            known &= averaged((mask > 0).view(np.uint8) * np.uint8(255), size, SAMPLES) > 127
+            some = cv2.resize(mask, samples, interpolation=cv2.INTER_NEAREST) > 0
+            known &= averaged(some.view(np.uint8) * np.uint8(255), size, SAMPLES) > 127
     return Structure.of(averaged(frame.image, size, SAMPLES).astype(np.float32) / np.float32(255), known)
 
 
