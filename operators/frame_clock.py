@@ -50,6 +50,10 @@ class ClockSettings:
     """Share of the frame interval guaranteed for training with an automatic deadline, even past the
     deadline. None: device default.
     """
+    least_most_ms: float | None = None
+    """Upper limit of that guaranteed time in milliseconds, so that pictures of slow streams are not late. None: device
+    default.
+    """
     at_least_steps: int | None = None
     """Minimum number of optimiser steps per frame, even past the deadline. None: device default."""
     fewest_steps: int | None = None
@@ -69,8 +73,10 @@ class ClockSettings:
             value = getattr(self, name)
             if value is not None and not 0 < value <= 1:
                 raise InvalidSetting(f"{name} is {value}; it must be in (0, 1]")
-        if self.auto_most_ms is not None and not 0 < self.auto_most_ms <= 10_000:
-            raise InvalidSetting(f"auto_most_ms is {self.auto_most_ms}; it must be above 0 and at most 10000")
+        for name in ("auto_most_ms", "least_most_ms"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value <= 10_000:
+                raise InvalidSetting(f"{name} is {value}; it must be above 0 and at most 10000")
         if self.at_least_steps is not None and not 0 < self.at_least_steps <= self.at_most_steps:
             raise InvalidSetting(
                 f"at_least_steps is {self.at_least_steps} and at_most_steps {self.at_most_steps}; they must be in order"
@@ -130,7 +136,7 @@ class FrameClock:
         self._learn_interval(arrived_ns, frame.seq)
         until_ns = arrived_ns + (FIRST_MS * 1e6 if first else self.show_after_ns) - self.display_ns
         if settings.budget_ms is None and not first and not behind:
-            until_ns = max(until_ns, self.now_ns() + (settings.least_share or LEAST_SHARE) * self.interval_ns)
+            until_ns = max(until_ns, self.now_ns() + self.least_ns)
         return Budget.until(
             until_ns * 1e-9,
             at_least=settings.first_at_least_steps or 1 if first else self.least_steps(behind),
@@ -142,6 +148,12 @@ class FrameClock:
         """Return the minimum number of steps of a frame; `behind`: further frames are queued."""
         at_least = self.settings.at_least_steps or 1
         return self.settings.fewest_steps or at_least if behind else at_least
+
+    @property
+    def least_ns(self) -> float:
+        """Time guaranteed for training with an automatic deadline, in nanoseconds."""
+        share_ns = (self.settings.least_share or LEAST_SHARE) * self.interval_ns
+        return min(share_ns, (self.settings.least_most_ms or math.inf) * 1e6)
 
     @property
     def show_after_ns(self) -> float:

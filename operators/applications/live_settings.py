@@ -39,6 +39,8 @@ LIVE_LEAST_STEPS = {"cpu": 1, "cuda": 3}
 """Minimum number of optimiser steps per frame, even past the display deadline."""
 LIVE_LEAST_SHARE = {"cpu": 0.34, "cuda": 0.2}
 """Share of the frame interval guaranteed for training, even past the display deadline."""
+LIVE_LEAST_MOST_MS = {"cpu": None, "cuda": 16.0}
+"""Upper limit of that guaranteed time in milliseconds; None for no limit. See benchmarks/results/live.md."""
 LIVE_SHOW_AFTER = {"cpu": (0.85, 28.3), "cuda": (0.6, 17.0)}
 """Display deadline: share of the frame interval, and upper limit in milliseconds. On a CPU another
 step improves the picture more than an earlier display, up to the next frame.
@@ -94,6 +96,7 @@ class LiveSettings(LiveOptions):
             auto_share=self.clock.auto_share or share,
             auto_most_ms=self.clock.auto_most_ms or most_ms,
             least_share=self.clock.least_share or LIVE_LEAST_SHARE[self.device],
+            least_most_ms=self.clock.least_most_ms or LIVE_LEAST_MOST_MS[self.device],
             at_least_steps=at_least,
             fewest_steps=fewest,
             first_at_least_steps=self.clock.first_at_least_steps or LIVE_FIRST_STEPS[self.device],

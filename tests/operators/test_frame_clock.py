@@ -32,6 +32,15 @@ def test_a_late_frame_still_gets_its_least_share(clock, frame, fake_time):
     assert left_s == pytest.approx(0.1 * short.interval_ns * 1e-9)
 
 
+@pytest.mark.parametrize(("fps", "left_ms"), [(30.0, 0.2e3 / 30), (6.0, 16.0)])
+def test_the_least_share_of_a_long_interval_is_limited(frame, fake_time, fps, left_ms):
+    clock = FrameClock(ClockSettings(least_share=0.2, least_most_ms=16.0), fps, fake_time)
+    arrived_ns = fake_time.ns
+    fake_time.pass_ms(200)
+    left_s = clock.budget(frame(0, arrived_ns=arrived_ns)).deadline_s - fake_time.ns * 1e-9
+    assert left_s == pytest.approx(1e-3 * left_ms)
+
+
 def test_a_late_frame_that_others_wait_behind_gets_no_extra_time(clock, frame, fake_time):
     arrived_ns = fake_time.ns
     fake_time.pass_ms(200)
@@ -181,6 +190,7 @@ def test_settings_out_of_range_are_refused(wrong):
         ([{"budget_ms": 1e-9}, {"budget_ms": 10_000}], [{"budget_ms": 0}, {"budget_ms": 10_000.1}]),
         ([{"auto_share": 1}, {"auto_share": 1e-9}], [{"auto_share": 0}, {"auto_share": 1.01}]),
         ([{"least_share": 1}, {"least_share": 1e-9}], [{"least_share": 0}, {"least_share": 1.01}]),
+        ([{"least_most_ms": 10_000}, {"least_most_ms": 1e-9}], [{"least_most_ms": 0}, {"least_most_ms": 10_001}]),
         ([{"auto_most_ms": 1e-9}, {"auto_most_ms": 10_000}], [{"auto_most_ms": 0}, {"auto_most_ms": 10_000.1}]),
         ([{"at_least_steps": 1}, {"at_least_steps": 80}], [{"at_least_steps": 0}, {"at_least_steps": 81}]),
         ([{"first_at_least_steps": 1}, {"first_at_least_steps": 60}], [{"first_at_least_steps": 0}, {"first_at_least_steps": 61}]),
