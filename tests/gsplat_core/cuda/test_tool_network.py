@@ -82,10 +82,10 @@ def test_equal_inputs_give_equal_bytes_in_every_order_and_object(gpu, path):
 
 
 def busy(stop, started):
-    """Launch kernels and allocate memory until `stop`. CUDA forbids to wait for the whole device during a capture."""
+    """Launch kernels and allocate memory until `stop`. During a capture, CUDA forbids to wait for the whole device, and torch to use its generator."""
     values = torch.rand(1024, 1024, device="cuda")
     while not stop.is_set():
-        values = (values @ values).sigmoid() + torch.rand(values.shape, device="cuda")
+        values = (values @ values).sigmoid() + torch.ones_like(values)
         torch.cuda.current_stream().synchronize()
         started.set()
 
