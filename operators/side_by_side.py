@@ -61,10 +61,13 @@ class SideBySideOp(Operator):
         spec.input("frame", type=Frame)
         spec.output("frame", type=Frame)
 
+    def initialize(self) -> None:
+        for operator in self.parts:
+            operator.initialize()
+
     def start(self) -> None:
         self._pool = ThreadPoolExecutor(1 + len(self.beside), thread_name_prefix=self.name)
         for operator in self.parts:
-            operator.initialize()
             operator.start()
 
     def stop(self) -> None:

@@ -114,7 +114,7 @@ class FoundToolMaskOp(Operator):
         frame: `Frame` whose `mask` is set (1 = tissue, 0 = tool).
 
     Params:
-        make_finder: factory called in `start()`.
+        make_finder: factory called in `initialize()`, before any source starts, and at each restart.
         method: name for `FoundMasks`.
         doubts: True to replace an all-tool mask by an all-tissue mask, unless tissue was detected in
             one of the last `BELIEVED_FRAMES` frames. The detector can mistake grey tissue for steel
@@ -143,8 +143,11 @@ class FoundToolMaskOp(Operator):
         spec.input("frame", type=Frame)
         spec.output("frame", type=Frame)
 
-    def start(self) -> None:
+    def initialize(self) -> None:
         self._finder = self.make_finder()
+
+    def start(self) -> None:
+        self._finder = self._finder or self.make_finder()
         self._found = self._recorded = self._disbelieved = 0
         self._since_tissue = BELIEVED_FRAMES
         self._tool_shares = 0.0
@@ -196,7 +199,7 @@ class BuiltInToolMaskOp(FoundToolMaskOp):
 
     def __init__(self, fragment: Any, *args: Any, **kwargs: Any) -> None:
         self.device = "cpu"
-        """Device of the network, read in `start()`."""
+        """Device of the network, read in `initialize()`."""
         super().__init__(
             fragment,
             *args,

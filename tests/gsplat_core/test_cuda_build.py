@@ -97,10 +97,10 @@ def test_the_library_says_what_it_was_built_for(cuda_library):
     assert re.fullmatch(r"nvcc \d+\.\d+ for \d+\.\d(, \d+\.\d)*", native.cuda_build())
 
 
-def test_ci_builds_for_every_gpu(cuda_library):
+def test_ci_builds_for_the_newest_instructions(cuda_library):
     if os.environ.get("INTRASPLAT_REQUIRE_CUDA_BUILD") != "1":
         pytest.skip("only where CI has built it: others build for the GPU at hand")
-    assert native.cuda_build().endswith(" for 8.0, 9.0")
+    assert native.cuda_build().endswith(" for 9.0"), "one file is compiled for earlier GPUs as well, see .ci/run"
 
 
 @pytest.mark.slow

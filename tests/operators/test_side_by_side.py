@@ -38,6 +38,23 @@ class Changes(Operator):
         outcome.note(self.name)
 
 
+def test_parts_are_initialised_before_a_source_starts_and_once_for_all_restarts():
+    calls = []
+
+    class Watched(Changes):
+        def initialize(self):
+            calls.append(self.name)
+
+    parts = [Watched(None, None, name=name) for name in ("first", "second")]
+    operator = SideBySideOp(None, name="all", gate=[], first=[parts[0]], beside=[[parts[1]]])
+    operator.initialize()
+    assert sorted(calls) == ["first", "second"] and not any(part.running for part in parts)
+    for _ in range(2):
+        operator.start()
+        assert len(calls) == 2 and all(part.running for part in parts)
+        operator.stop()
+
+
 def fields(**values):
     return lambda frame: frame.with_fields(**values)
 

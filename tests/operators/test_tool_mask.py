@@ -146,6 +146,20 @@ def test_if_the_gpu_cannot_run_the_network_the_cpu_does(frame, compute, monkeypa
     assert (found.mask == NetworkToolFinder().find(image)).all() and not found.mask.all()
 
 
+def test_the_network_is_loaded_before_a_source_starts_and_anew_at_a_restart():
+    made = []
+    operator = FoundToolMaskOp(
+        None, name="tool_mask", make_finder=lambda: made.append(FakeFinder()) or made[-1], method="fake"
+    )
+    operator.initialize()
+    assert len(made) == 1
+    operator.start()
+    assert len(made) == 1 and operator._finder is made[0]
+    operator.stop()
+    operator.start()
+    assert len(made) == 2 and operator._finder is made[1]
+
+
 def test_other_errors_are_raised(monkeypatch):
     def fail(path, device):
         raise TypeError("a bug")
