@@ -100,7 +100,7 @@ class Continuation(torch.nn.Module):
 
 
 class ContinuedField(DeformationField):
-    """Base class of fields that apply a `Continuation`. Subclasses define how the continuation is set."""
+    """Base class of fields that extrapolate after the newest frame by a `Continuation`. Subclasses define how it is set."""
 
     def __init__(self, time_window_s: tuple[float, float]) -> None:
         super().__init__(time_window_s)
@@ -114,12 +114,12 @@ class ContinuedField(DeformationField):
         return window_s[0], max(window_s[1], continuation.from_s + continuation.horizon_s)
 
     def stop_continuing(self) -> None:
-        """Remove the continuation."""
+        """Stop the extrapolation after the newest frame."""
         self.continuation = None
 
 
 class NewestState(ContinuedField):
-    """Field that always returns the newest state, plus its continuation.
+    """Field that always returns the newest state, plus the extrapolation after the newest frame.
 
     It is neither trained nor saved.
     """

@@ -200,7 +200,7 @@ def believed_depth(frame: Frame) -> NDArray[np.float32]:
 
 
 def possible_depth(frame: Frame) -> NDArray[np.float32]:
-    """Return depth [H, W] of tissue that is a better start value than extrapolation, 0 elsewhere."""
+    """Return the frame's depth [H, W] of tissue where it is a better start value than extrapolation, 0 elsewhere."""
     depth = _depth_from(frame, None, 0.5)
     if frame.mask is None or frame.depth_origin is None:
         return depth
@@ -208,7 +208,9 @@ def possible_depth(frame: Frame) -> NDArray[np.float32]:
 
 
 def _depth_from(frame: Frame, least: float | None, margin: float) -> NDArray[np.float32]:
-    """Return depth of at least the confidence `least` (None: that of its origin), outside of a share of the edge margin."""
+    """Return the frame's depth [H, W] where its confidence is at least `least` (None: the least one of its origin), without
+    a margin next to unknown depth: the share `margin` of the origin's. 0 elsewhere.
+    """
     origin = frame.depth_origin
     if frame.depth is None or origin is None:
         return np.zeros(frame.image.shape[:2], np.float32)

@@ -42,7 +42,7 @@ from gsplat_core.transfers import HostCopy, tensor_of
 EDGE_ERROR_PX = 1.5
 """Standard deviation of matched disparities near edges and holes, in pixels."""
 SMOOTHNESS, SMOOTH_GREY = 100.0, 5.0
-"""Strength of the edge-aware filter, and the grey-value step across which it does not smooth."""
+"""Strength of the edge-aware filter, and the difference of grey values at which the strength falls to 1/e."""
 LEAST_VARIANCE_PX2 = 0.05
 """Lower bound of a disparity's variance in the filter, in pixels²; limits the weight of the best values."""
 LEAST_WEIGHT = 1e-4

@@ -29,7 +29,7 @@ AGREEMENT = 0.05
 
 @dataclass(frozen=True)
 class Sample:
-    """Reduced picture as log levels with validity."""
+    """Logarithms of a reduced picture, with a mask of the comparable values."""
 
     logs: NDArray[np.float32]
     """Logarithms of the pixels' values, per colour channel [pixels, 3]."""

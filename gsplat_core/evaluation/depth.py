@@ -196,9 +196,9 @@ class DepthShare:
     scaled_rmse_share: float
     """RMSE share after scaling the model's depth by `scale`; measures the shape alone."""
     plane_rmse_share: float
-    """Error of each frame's best-fit plane (`FlatDepths.plane`), a baseline fitted to the truth."""
+    """RMSE share of each frame's best-fit plane (`FlatDepths.plane`), a baseline fitted to the truth."""
     level_rmse_share: float
-    """Error of each frame's level plane (`FlatDepths.level`), a baseline fitted to the truth."""
+    """RMSE share of each frame's level plane (`FlatDepths.level`), a baseline fitted to the truth."""
     median_share: float
     """Median of the absolute error after `scale`, divided by the true depth."""
     rmse: float

@@ -420,7 +420,7 @@ def find_change(grid: Grid, key: Array, change: Change) -> Array:
 
 
 def _finer(grid: Grid) -> Array:
-    """Return the relative prior standard deviations of all cosines."""
+    """Return for each cosine the factor on its prior standard deviation, which is smaller for finer cosines, [cosines]."""
     return np.asarray((1 + (grid.half_waves / FINER_HALF_WAVES) ** 2) ** (-FINER_POWER / 2))
 
 

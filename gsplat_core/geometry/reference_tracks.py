@@ -140,7 +140,7 @@ class _Reference:
         self.missed = 0
         """Number of consecutive pictures in which too few corners were found."""
         self.share = 1.0
-        """Share of the corners that were found in the latest picture with enough of them."""
+        """Share of the corners found in the latest picture in which the reference was found."""
         self._picture = picture
         self._grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), 2).astype(np.float32)
         self._map = self._ahead = self._grid
@@ -192,14 +192,16 @@ class _Reference:
         return self.numbers[kept], at[kept]
 
     def advance(self) -> None:
-        """Let the map lead to the picture of the last call of `found`."""
+        """Replace the map by the one to the picture of the last call of `found`."""
         self._map = self._ahead
 
     def _at(self, values: NDArray[np.float32]) -> Points:
         return _sampled(values, self.corners)
 
     def _smooth(self, kept: NDArray[np.bool_], at: Points) -> NDArray[np.float32]:
-        """Return the map [H, W, 2] from positions of corners: a quadratic polynomial and smoothed residuals."""
+        """Interpolate the positions `at` of the `kept` corners in another picture to a position of every pixel, [H, W, 2]. The
+        displacement is a quadratic polynomial plus smoothed residuals.
+        """
         moved = (at - self.corners)[kept].astype(np.float64)
         basis = self._basis(self.corners[kept])
         square = basis.T @ basis + 1e-3 * np.eye(basis.shape[1])

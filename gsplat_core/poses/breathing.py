@@ -137,7 +137,9 @@ def _frequency_grid(slowest: float, fastest: float, step: float) -> list[float]:
 
 
 BESIDE_CYCLES = 0.5
-"""Distance of the neighbours of the breathing phase, in cycles over the recording."""
+"""Difference of the two neighbouring frequencies from the breathing frequency, in cycles over the recording. Motion at
+these frequencies is scope motion, which shows how much of it is mistaken for breathing.
+"""
 CLEARLY = 2.0
 """Smallest accepted ratio of the motion attributed to the tissue to that at the neighbouring frequencies. Below it the
 separated poses may be worse than the static ones.
@@ -146,8 +148,7 @@ separated poses may be worse than the static ones.
 
 @one_thread()
 def separability(before: Tensor, poses: Tensor, times_s: Tensor, phases: Tensor) -> tuple[bool, float]:
-    """Return whether poses without breathing motion are more reliable than those for static tissue, and the possible
-    error.
+    """Compare poses after separating the breathing motion with those for static tissue.
 
     Args:
         before: poses estimated for static tissue [C, 4, 4].
@@ -166,8 +167,8 @@ def separability(before: Tensor, poses: Tensor, times_s: Tensor, phases: Tensor)
 
 
 def _given_to_tissue(poses: Tensor, like: Tensor, times_s: Tensor, phases: Tensor) -> float:
-    """Return the root mean square motion with the first phase that a trajectory with the prior of `like` does not
-    explain.
+    """Return the root mean square of the camera motion at the breathing phase that a smooth trajectory does not explain.
+    The smoothness is learned from the poses `like`.
     """
     swings = waves_of(phases)
     prior = learned_from(like, times_s, swings)
@@ -177,7 +178,9 @@ def _given_to_tissue(poses: Tensor, like: Tensor, times_s: Tensor, phases: Tenso
 
 
 def _line(prior: TrajectoryPrior, swings: Tensor, y: Tensor, axis: int) -> Tensor:
-    """Return the first phase's part of a coordinate [C] by generalised least squares."""
+    """Return the part [C] of a camera coordinate `y` [C] that varies with the breathing phase, the first one in `swings`, by
+    generalised least squares with the precision of the trajectory prior.
+    """
     pushed = swings.T @ prior.precision[axis]
     return swings[:, :2] @ torch.linalg.solve(pushed @ swings, pushed @ y)[:2]
 
@@ -197,7 +200,9 @@ STAGES = ((0.014, 8), (0.007, 8), (0.0035, 8), *((FINEST, 8),) * 13)
 before each stage.
 """
 FEW_POINTS, FEW_FRAMES, FEW_NODES = 200, 100, 16
-"""Size of the reduced problem on which frequencies are searched. With fewer frames, their rate looks like a heart rate."""
+"""Size of the reduced problem on which frequencies are searched. With fewer frames,
+aliasing at their rate resembles a heartbeat.
+"""
 SAMPLED = 0.4
 """Highest frequency searched, as a share of the frame rate."""
 LEAST_SHARED, PLACE_ROUNDS = 24, 10

@@ -217,7 +217,7 @@ def adjust(
         rounds: maximum number of Levenberg-Marquardt steps.
         spread_px: Cauchy scale in pixels; errors well above it have little influence.
         points_move: optimise the points as well. If False, each camera is optimised independently.
-        flat_px: weight of a prior of little relief, for worlds whose z axis is a camera's viewing direction. A point
+        flat_px: weight of a prior that all points have similar depths, for worlds whose z axis is a camera's viewing direction. A point
             whose z differs from the median by a share x of it costs as much as a squared error of `flat_px` * x pixels.
 
     Returns:

@@ -96,7 +96,7 @@ last one. Such an error means that the points' positions no longer fit.
 """
 OFF_EVERY = 5
 LEFT = 0.7
-"""Share of the last key frame's points below which a new key frame is added."""
+"""Share of the last key frame's points that must still be tracked; with fewer a new key frame is added."""
 ADJUSTED = 2
 """Number of frames after a key frame during which the newest key frames are adjusted."""
 FIRST_KEYS = 6

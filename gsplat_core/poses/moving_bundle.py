@@ -45,7 +45,9 @@ class TrajectoryPrior:
     precision: Tensor
     """Precision matrix of each coordinate, [6, C, C]."""
     uncertain: float
-    """Root mean square uncertainty of the trajectory along the given frequencies."""
+    """Root mean square uncertainty of the camera positions' motion at the given frequencies, in units of the tissue's
+    distance.
+    """
 
     @one_thread()
     def cost(self, poses: Tensor) -> float:
@@ -138,7 +140,7 @@ class _Smoothness:
         return inverse / self.scale[:, None, None]
 
     def variance(self, along: Tensor) -> Tensor:
-        """Return the mean variance over time of each coordinate's component along the waves [6]."""
+        """Return the variance of each coordinate's component along the waves, averaged over time, [6]."""
         projected = torch.linalg.solve_triangular(self.triangle.T, along.T, upper=False)
         return self.scale * projected.square().sum(0).mean()
 

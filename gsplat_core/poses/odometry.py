@@ -7,7 +7,7 @@ near-planar scene need no other initialisation (Yu and Gallup, "3D Reconstructio
 an essential matrix is ill-conditioned there.
 
 In front of tissue that moves, points may drift far away, and rotation then explains a lateral motion of the scope. A
-prior of little relief prevents that, but recordings with much relief do not recover from it. The poses are therefore
+flatness prior prevents that, but recordings with much relief do not recover from it. The poses are therefore
 estimated without the prior and with it (removed after the last key frame), and those with the lower robust error are
 used.
 
@@ -50,7 +50,7 @@ NEIGHBOURS = 5
 """Number of known points around a new point whose median depth initialises it."""
 POSE_ROUNDS, ROUNDS = 10, 25
 FLAT_PX = 33.0
-"""Weight of the prior of little relief (`flat_px` of `adjust`)."""
+"""Weight of the prior that all points have similar depths (`flat_px` of `adjust`)."""
 GROWTH = 1.3
 """Growth factor of the number of key frames from one bundle adjustment to the next."""
 
@@ -138,7 +138,7 @@ def followed_part(frame: Frame) -> NDArray[np.uint8] | None:
 
 
 class _Followed(NamedTuple):
-    """Poses of all frames from one start of the relief."""
+    """Poses of all frames, estimated with one weight of the flatness prior."""
 
     poses: Tensor
     """World-to-camera, [N, 4, 4]."""
@@ -172,7 +172,7 @@ class _Odometry:
 
     @one_thread()
     def run(self, separate_breathing: bool) -> Trajectory:
-        """Estimate the poses with both starts of the relief, and keep those with the lower robust error."""
+        """Estimate the poses once with and once without the flatness prior, and keep those with the lower robust error."""
         found = [self._followed(flat_px) for flat_px in (0.0, FLAT_PX)]
         best = min(found, key=lambda each: each.error)
         self._poses, self._points, self._lost = best.poses, best.points, best.lost
@@ -187,7 +187,7 @@ class _Odometry:
         """Process all frames in order, then place the frames between key frames again with the final points.
 
         Args:
-            flat_px: weight of the prior of little relief until the last key frame.
+            flat_px: weight of the prior that all points have similar depths; it is used until the last key frame.
         """
         self._poses = torch.eye(4, dtype=torch.float64).repeat(self._count, 1, 1)
         self._points = torch.zeros_like(self._points)

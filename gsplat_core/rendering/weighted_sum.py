@@ -189,7 +189,7 @@ class DirectWeightedSumRenderer(WeightedSumRenderer):
 
     @classmethod
     def first_values(cls, distance: float) -> dict[str, float]:
-        """Return the values for the whole scene before training; the weights have none."""
+        """Return initial values of the scene-wide scalars, by name. No scalar belongs to the weights, which are constant."""
         return {"background": 0.1, "distance": distance}
 
     @classmethod
@@ -208,7 +208,7 @@ class ExpWeightedSumRenderer(WeightedSumRenderer):
 
     @classmethod
     def first_values(cls, distance: float) -> dict[str, float]:
-        """Return the values for the whole scene before training, with σ = 1 and β = 1."""
+        """Return initial values of the scene-wide scalars, by name, with σ = 1 and β = 1."""
         return {**super().first_values(distance), "sigma": 1.0, "beta": 1.0}
 
     @classmethod

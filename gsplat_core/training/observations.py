@@ -53,7 +53,7 @@ class Observation:
         return None if self.right_eye is None else self.right_eye.observation
 
     def to_rehearse(self) -> Observation:
-        """Return the observation as it is trained on again later."""
+        """Return the observation as it is trained on again later: without the pixels that `rehearsal_mask` excludes."""
         right = None if self.right_eye is None else self.right_eye.to_rehearse()
         if self.rehearsal_mask is None:
             return self if right is None else replace(self, right_eye=right)
@@ -113,7 +113,7 @@ class RightEye:
         return self._make()
 
     def to_rehearse(self) -> RightEye:
-        """Return the eye as it is trained on again later."""
+        """Return the eye as it is trained on again later: without the pixels that its rehearsal mask excludes."""
         return RightEye(lambda: self.observation.to_rehearse())
 
 

@@ -223,7 +223,7 @@ class Placement:
         self._postponed: tuple[Frame, Observation] | None = None
 
     def catch_up(self, step: TrainingStep) -> None:
-        """Apply a postponed correction by the newest frame's depth."""
+        """Move the scene to the newest frame's depth if that correction was postponed."""
         if self._postponed is not None:
             frame, observation = self._postponed
             self._postponed = None

@@ -93,7 +93,7 @@ class Reconstructor:
             self._schedule = NewestFirstSchedule(live, config, self.device)
             self._growth = PostponedGrowth(config, self.device, self._covering)
         self._placement = Placement(postpones=live is not None)
-        # If training starts from the predicted motion, the prior must process each frame first.
+        # If training starts from the predicted motion, the prior must process each frame before it is trained on.
         self._motion = Following(config, at_once=live is None or config.start_from_motion)
         self._start_here: StartOnDevice | None = None
         self._slots, self._version = SnapshotSlots(self.device, rows=self._fixed_rows), 0

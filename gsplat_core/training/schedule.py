@@ -25,11 +25,13 @@ JUMP_RATIO = 1.8
 JUMP_EXTRA = 4
 """Extra steps for a jump, in multiples of the frame's own steps."""
 USUAL_DECAY = 0.1
-"""Weight of the newest frames in the usual first loss."""
+"""Weight of a new frame in the moving average of the loss before the first step on a frame."""
 STEP_TIME_DECAY = 0.3
-"""Weight of the newest frames in the estimated step time of timed budgets."""
+"""Weight of a new frame in the moving average of the step time, for budgets with a deadline."""
 LONGER_STEP_DECAY = 0.1
-"""Weight of longer steps in the estimated step time of a live stream."""
+"""Weight of a frame with longer steps in the moving average of the step time of a live stream. Shorter steps replace the
+average.
+"""
 REHEARSED_IN_FLIGHT = 2
 """Largest number of rehearsal steps queued on a GPU. The next frame's first step waits for them."""
 REHEARSED_CORRECTION = 0.5

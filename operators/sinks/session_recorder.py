@@ -204,12 +204,12 @@ class SessionRecorder:
                 self._put(part)
 
     def line(self, line: ScheduleLine) -> None:
-        """Queue a schedule line."""
+        """Queue a schedule line: the record of a call that changes the model."""
         with self._changed:
             self._put(_Part(lambda writer: writer.line(line)))
 
     def depth(self, frame: Frame) -> None:
-        """Queue the late depth of an earlier frame, in its position among the schedule lines."""
+        """Queue depth that arrived after its frame had been passed on. It keeps its position among the queued lines."""
         size = sum(plane.nbytes for plane in (frame.depth, frame.depth_confidence) if plane is not None)
         with self._changed:
             self._put(_Part(lambda writer: writer.late_depth(frame), "depth", frame.seq, size))

@@ -310,7 +310,7 @@ _BOOT = (
 
 
 class ChildLost(Exception):
-    """The capture process ended, does not respond, or sent an invalid message."""
+    """The process that reads the source ended, does not respond, or sent an invalid message."""
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,7 @@ def igtl_command(
     stream: str, config: Path | None, runtime: Path | None, *, kind: str, host: str, port: int, name: str | None,
     spacing_mm: float, plaintext: bool,
 ) -> int:  # fmt: skip
-    """Send a stream's pictures until interrupted."""
+    """Send a stream's pictures to OpenIGTLink clients until interrupted."""
     if kind not in KINDS:
         raise InvalidSetting(f"there is no picture {kind!r:.60}; choose {', '.join(KINDS)}")
     check_host(host, plaintext, "OpenIGTLink has no keys and sends unencrypted pictures to every client")

@@ -147,7 +147,7 @@ Steps = Annotated[int, Field(ge=0, le=10_000_000)]
 
 
 class ReconstructorMade(Record):
-    """Creation of a reconstructor: at the start, or after a restart of an operator."""
+    """Schedule line of the creation of a reconstructor: at the start, or after a restart of an operator."""
 
     event: Literal["reconstructor"] = "reconstructor"
     device: Text
@@ -172,7 +172,7 @@ class SceneBegun(Record):
 
 
 class Observed(Record):
-    """Calls of `Reconstructor.observe` and then `publish`."""
+    """Schedule line of a call of `Reconstructor.observe`, followed by `publish`."""
 
     event: Literal["observe"] = "observe"
     seq: Count
@@ -181,7 +181,7 @@ class Observed(Record):
 
 
 class DepthTaken(Record):
-    """Call of `Reconstructor.take_depth` with an already observed frame and its late depth."""
+    """Schedule line of a call of `Reconstructor.take_depth` with an already observed frame and its late depth."""
 
     event: Literal["take_depth"] = "take_depth"
     seq: Count
@@ -195,7 +195,7 @@ class DepthTaken(Record):
 
 
 class Grown(Record):
-    """Call of `Reconstructor.grow` with the last observed frame."""
+    """Schedule line of a call of `Reconstructor.grow` with the last observed frame."""
 
     event: Literal["grow"] = "grow"
     seq: Count

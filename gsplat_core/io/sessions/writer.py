@@ -298,7 +298,7 @@ class SessionWriter:
         )
 
     def line(self, line: Record) -> None:
-        """Append a record, such as a training step or a loss, to the log."""
+        """Append a record to the log, such as a training call or a marker of data that was not written."""
         self._go_on()
         self._segment.line(line)
 

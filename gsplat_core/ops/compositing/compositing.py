@@ -151,7 +151,7 @@ def _composite_fake(
     isect_offsets: Tensor,
     *rest: Any,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    width, height = rest[4:6]  # max_alpha is left out at its default
+    width, height = rest[4:6]  # torch does not pass max_alpha if it has its default
     shape = (isect_offsets.shape[0], height, width)
     last = isect_offsets.new_empty(shape)
     return colors.new_empty(*shape, colors.shape[-1]), colors.new_empty(*shape, 1), last

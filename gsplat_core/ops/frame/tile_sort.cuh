@@ -72,7 +72,7 @@ __device__ inline void barrier_after(int distance) {
   }
 }
 
-// Run the exchanges at `distance`, distance / 2, ..., 1.
+// Merge step of the bitonic sort: compare and exchange keys at `distance`, distance / 2, ..., 1.
 __device__ inline void merge_down(uint64_t* keys, int count, int pairs, int distance) {
   for (; distance > 0; distance /= 2) {
     for (int i = threadIdx.x; i < pairs; i += int(blockDim.x)) {

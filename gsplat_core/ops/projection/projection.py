@@ -148,7 +148,8 @@ def _check_float32(
 
 @torch.library.register_fake("gsplat_core::project_gaussians")
 def _fake(*arguments: Any) -> tuple[Tensor, ...]:
-    means, viewmats, compensate = arguments[0], arguments[5], arguments[13]  # arguments at their defaults are left out
+    # torch does not pass trailing arguments that have their defaults.
+    means, viewmats, compensate = arguments[0], arguments[5], arguments[13]
     b, n, _ = means.shape
     c = viewmats.shape[1]
     return (

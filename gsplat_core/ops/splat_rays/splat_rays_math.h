@@ -113,8 +113,8 @@ GSPLAT_INLINE void rays_of(const State& s, vfloat rays[10], vfloat normal[3]) {
   for (int i = 0; i < 3; ++i) normal[i] = chosen[0] * s.axes.m[i][0] + chosen[1] * s.axes.m[i][1] + chosen[2] * s.axes.m[i][2];
 }
 
-// Propagate gradients to mean, rotation and scales. The coefficients do not change with a common factor of the scales,
-// so `largest` is constant in u.
+// Propagate gradients to mean, rotation and scales. The coefficients that depend on u do not change with a common factor
+// of u, so that `largest` in u needs no gradient.
 GSPLAT_INLINE void rays_backward(const View& view, const State& s, const vfloat v[10], const vfloat v_normal[3], vfloat v_mean[3],
                                  vfloat v_quat[4], vfloat v_scale[3]) {
   const vfloat none = splat(0.0f);

@@ -67,14 +67,16 @@ struct alignas(16) Splat {
   float u, v, z;   // centre in pixels, camera z
   float conic[3];  // log2(e) / 2 times the coefficients of x^2, 2 xy and y^2
   float log2_opacity;
-  float plane[3];     // kFragments: 1 / z of the plane at (x, y) is its product with (x, y, 1).
-                      // For kPoints: upper Cholesky factor of the inverse covariance (11, 12, 22)
+  // kFragments: 1 / z of the plane at (x, y) is the product with (x, y, 1). kPoints: upper Cholesky factor of the inverse
+  // covariance (11, 12, 22).
+  float plane[3];
   uint32_t row, key;  // key: index in the file
   uint32_t corner;    // first column and row of sub-pixels, 16 bits each
   uint32_t size;      // columns and rows minus 1, 16 bits each
   uint32_t count;     // fragments or points
-  float extra;        // kFragments: largest distance of the plane's depth from z.
-                      // For kPoints: dilogarithm of the opacity, or -1 if each fragment draws its own points
+  // kFragments: largest distance of the plane's depth from z. kPoints: dilogarithm of the opacity, or -1 if each fragment
+  // draws its own points.
+  float extra;
 };
 static_assert(sizeof(Splat) == 64);
 

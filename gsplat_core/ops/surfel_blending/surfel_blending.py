@@ -189,7 +189,7 @@ def _blend_fake(
     isect_offsets: Tensor,
     *rest: Any,
 ) -> tuple[Tensor, ...]:
-    width, height = rest[4:6]  # max_alpha is left out at its default
+    width, height = rest[4:6]  # torch does not pass max_alpha if it has its default
     shape = (isect_offsets.shape[0], height, width)
     return (
         *(colors.new_empty(*shape, size) for size in (colors.shape[-1], 1, 3, 1, 1)),

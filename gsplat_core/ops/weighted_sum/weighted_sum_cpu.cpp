@@ -72,7 +72,8 @@ struct Listed {
   double factors[D + 1];
 };
 
-// Add the terms of one row of pixels, as integers in the low bits of doubles: each adds kMagicBits as well.
+// Add the terms of one row of pixels to `sums`, as integers: the bits of a double after adding kMagic. Each addition also
+// adds kMagicBits, which is subtracted at the end.
 template <int D>
 GSPLAT_INLINE void add_terms(vfloat term, const double* factors, vlong (*sums)[2]) {
   for (int half = 0; half < 2; ++half) {

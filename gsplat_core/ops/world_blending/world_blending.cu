@@ -119,7 +119,7 @@ __global__ void __launch_bounds__(kStaged)
     last = from.last[place.pixel];
     through = from.through[place.pixel];
     if (first_channel == 0) behind = through * from.v_through[place.pixel];
-    // A pixel that the lens does not see has no Gaussian; its ray stays 0.
+    // A pixel without a ray (NaN, outside of the lens) has no Gaussian. It gets a ray of 0, because NaN would spread.
     for (int k = 0; k < kRayNumbers && last >= 0; ++k) ray[k] = in.rays[place.pixel * kRayNumbers + k];
     for (int d = 0; d < V; ++d)
       if (d < channels) v_color[d] = from.v_colors[place.pixel * in.channels + first_channel + d];

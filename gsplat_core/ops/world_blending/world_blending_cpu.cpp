@@ -133,7 +133,7 @@ static void window_backward(const Inputs& in, const Tile& t, int x0, int y0, boo
       last[at] = from.last[pixel];
       columns.through[at] = from.through[pixel];
       columns.behind[at] = from.through[pixel] * from.v_through[pixel];
-      // A pixel that the lens does not see has no Gaussian; its ray stays 0.
+      // A pixel without a ray (NaN, outside of the lens) has no Gaussian. It gets a ray of 0, because NaN would spread.
       for (int k = 0; k < kRayNumbers && last[at] >= 0; ++k) columns.rays[k * kPixels + at] = in.rays[pixel * kRayNumbers + k];
       for (int d = 0; d < channels; ++d) columns.v_colors[d * kPixels + at] = from.v_colors[pixel * channels + d];
       int32_t& most = furthest_of[at / kLanes];

@@ -38,9 +38,9 @@ from gsplat_core.transfers import tensor_of
 AT_FIRST = 0.6
 """Assumed share of a motion that continues, before any observation. See benchmarks/results/constants.md."""
 FOLLOWS = 0.15
-"""Weight of the newest frame in the moving average of the share."""
+"""Weight of the newest frame in the moving average of the share of motion that continues."""
 ONE_FRAME = (-0.5, 1.5)
-"""Bounds of the share observed in one frame, which limit the effect of optical-flow outliers."""
+"""Bounds of the share of motion observed to continue in one frame, which limit the effect of optical-flow outliers."""
 
 
 class Damping:
@@ -52,8 +52,8 @@ class Damping:
         self._share: Tensor | None = None
 
     def learn(self, last: Tensor, realised: Tensor) -> None:
-        """Update the share with the velocities [N, 3] of the Gaussians in two successive intervals.
-        A frame without motion changes nothing.
+        """Update the share of motion that continues with the velocities [N, 3] of the Gaussians in two successive
+        intervals. A frame without motion changes nothing.
         """
         # Summed in float64, where the order of summation does not affect the result.
         last, realised = last.double(), realised.double()

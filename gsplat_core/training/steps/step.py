@@ -315,7 +315,7 @@ class TrainingStep:
         return self._adam.first_moments[name][: self.gaussians.count]
 
     def idle(self, part: float) -> Tensor:
-        """Return which Gaussians have mean squared gradients below `part` times the usual ones, bool [N]."""
+        """Return which Gaussians have a mean squared opacity gradient below `part` times the mean over all, bool [N]."""
         squared = self._adam.second_moments["logit_opacities"][: self.gaussians.count]
         return squared < part * squared.mean()
 

@@ -20,7 +20,9 @@ from gsplat_core.training.strategies.scene import StrategyKind
 from gsplat_core.training.strategies.streaming import UNSEEN_PX, Rounds, Shares, halves
 
 RATE = 0.05
-"""Deaths per Gaussian and round at one standard deviation of φ."""
+"""Death rate per round of a Gaussian whose φ is one standard deviation above the mean of all Gaussians. φ is the mean
+gradient of the loss by the logarithm of the opacity.
+"""
 MOST_DEATHS = 0.05
 """Largest share of Gaussians that die in a round."""
 
