@@ -42,7 +42,7 @@ from gsplat_core.value_ranges import IntegerIn, NumberIn
 
 class BasisSlot:
     """Preallocated copy of a basis field (see `FieldSlot`) with spare capacity for Gaussians and bumps. Unused rows and
-    columns are inert.
+    columns have deltas of 0.
     """
 
     def __init__(self, source: BasisField, rows: int) -> None:

@@ -21,7 +21,7 @@ LONGEST_STEP_S = 10.0
 ARRIVAL_AGREES_S = 1.0
 """Largest difference in seconds between a forward step and the difference of arrival times."""
 LATE_FRAMES = 4
-"""Consecutive frames earlier than the newest one from which the clock was set back; fewer are late frames."""
+"""Number of consecutive frames with earlier timestamps that mean that the clock was set back; fewer are late frames."""
 GAP_INTERVALS = 4.0
 """Step in usual intervals above which a gap is reported."""
 

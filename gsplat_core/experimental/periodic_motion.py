@@ -271,7 +271,7 @@ def _at_one_distance(tracks: GridTracks) -> Array:
     rotation = tracks.poses[:, :3, :3]
     turned = np.einsum("tij,nj->tni", rotation, along)
     moved = np.einsum("tij,nj->tni", rotation, centre) + tracks.poses[:, None, :3, 3]
-    # A point of inverse depth w satisfies c w = d in the picture.
+    # A point at the distance 1 / w along its first ray is at the observed pixel where c w = d.
     c = moved[..., :2] - tracks.rays * moved[..., 2:]
     d = tracks.rays * turned[..., 2:] - turned[..., :2]
     c, d = c[tracks.seen], d[tracks.seen]

@@ -49,7 +49,7 @@ NODES = 16
 REACH = 0.12
 """Standard deviation of the map's smoothing kernel, as a share of the longer side."""
 HELD = 0.5
-"""Weight of the polynomial part of the map against one match at a node."""
+"""Weight of a residual of 0 in the mean of the residuals at a node; a match at the node has the weight 1."""
 FLOOR = 0.02
 """Contrast, as the standard deviation of logarithmic brightness, that is regarded as noise."""
 

@@ -215,7 +215,7 @@ def deformation_gradients(first: Gaussians, second: Gaussians, neighbours: Tenso
     after = second.means[neighbours] - second.means[:, None]
     spread = (before.square().sum((1, 2)) / count)[:, None, None]
     apart = spread > 0
-    # In units of the neighbours' mean square distance, so that no product is too small for float32.
+    # Divided by the sum of the neighbours' squared distances, so that no product is too small for float32.
     unit = torch.where(apart, count * spread, 1)
     moments = before.transpose(1, 2) @ before / unit
     moments.diagonal(dim1=1, dim2=2).add_(STIFFNESS)
@@ -243,7 +243,7 @@ def _inverse(matrices: Tensor) -> Tensor:
 
 
 def _moved_planes(means_1: Tensor, means_2: Tensor, gradients: Tensor, camera_1: Camera, camera_2: Camera) -> Tensor:
-    """Return a and B [N, 12] of the motion X -> means_2 + F (X - means_1), from camera to camera."""
+    """Return the motion X -> means_2 + F (X - means_1) as X -> a + B X in camera coordinates: a and B by rows, [N, 12]."""
     view_1, _ = camera_1.matrices(means_1.device, means_1.dtype)
     view_2, _ = camera_2.matrices(means_1.device, means_1.dtype)
     local_1 = means_1 @ view_1[:3, :3].T + view_1[:3, 3]
@@ -253,7 +253,9 @@ def _moved_planes(means_1: Tensor, means_2: Tensor, gradients: Tensor, camera_1:
 
 
 def _screen_planes(first: DenseProjection, second: DenseProjection, camera_1: Camera, camera_2: Camera) -> Tensor:
-    """Return a and B [N, 12] of the map between screen ellipses, for points at depth 1 on the first camera's rays."""
+    """Return the map between screen ellipses as X -> a + B X from points at depth 1 on the first camera's rays to the
+    second camera's coordinates: a and B by rows, [N, 12].
+    """
     _, K_1 = camera_1.matrices(first.depths.device, first.depths.dtype)
     _, K_2 = camera_2.matrices(first.depths.device, first.depths.dtype)
     focal, centre = K_2[[0, 1], [0, 1]], K_2[:2, 2]

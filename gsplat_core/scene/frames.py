@@ -76,7 +76,7 @@ class Frame:
     labels: NDArray[np.uint8] | None = None
     """Class of each pixel uint8 [H, W] for the loss `semantics`; 255 = unknown. None for a frame without labels."""
     exposure: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """Gain of red, green and blue relative to the scene's colours at the start of the stream."""
+    """Gain of red, green and blue relative to the start of the scene."""
     withheld: str | None = None
     """Reason for withholding the frame from training and scores ("blur", "out of body"); None for a usable frame. A live
     model is trained on some of them all the same (`is_followed`)."""

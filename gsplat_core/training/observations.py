@@ -161,7 +161,7 @@ class ObservationWindow:
         self._frames: deque[Observation] = deque(maxlen=capacity)
         """Frames of the window, with the rehearsal masks applied."""
         self._whole_newest: Observation | None = None
-        """Newest frame before its display."""
+        """Newest frame with its full mask, for the steps before its display."""
         self._random = np.random.default_rng(seed)
 
     def add(self, observation: Observation) -> None:

@@ -218,7 +218,7 @@ def _check_camera(made: Camera, seen: Camera, name: str) -> None:
 def _playback(
     model: Model, description: SourceDescription, fps: float | None, shortened: bool
 ) -> tuple[Playback, list[str]]:
-    """Derive the mapping of timestamps from the model's time window.
+    """Return the mapping of the recording's timestamps to those of the run, of which the model's time window is known.
 
     Args:
         model: the finished model.

@@ -211,7 +211,7 @@ def render_model(
         renderer: name of the renderer.
         options: options of the renderer.
         outputs: names of the renderer's outputs, as in `OUTPUTS`, or `image`, `alpha` and `depth`.
-        view: camera path.
+        view: the requested view; by default that of the recorded camera.
         overwrite: replace an existing video of this program.
         progress: called after each frame.
         stop_requested: polled; True ends the rendering.

@@ -47,7 +47,7 @@ _GIVE_UP_MS = 500
 
 
 class Gate(_Condition):
-    """Conditions and outputs of an operator, combined as one condition of the SDK."""
+    """Conditions and outputs of an operator, combined as one condition of the Holoscan SDK."""
 
     def __init__(self, fragment: Any, task: OperatorTask, scheduler: HoloscanScheduler) -> None:
         self.task, self.scheduler = task, scheduler
@@ -109,7 +109,7 @@ class Gate(_Condition):
 
 
 class Bridge(_Operator):
-    """Adapter that presents an operator task as an operator of the SDK."""
+    """Adapter that presents an operator task as an operator of the Holoscan SDK."""
 
     def __init__(self, fragment: Any, task: OperatorTask, gate: Gate) -> None:
         self.task, self.gate = task, gate

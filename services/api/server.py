@@ -177,14 +177,14 @@ class _Connection(socket.socket):
     left: Callable[[], None] | None = None
 
     def close(self) -> None:
-        """Close the connection and uncount it."""
+        """Close the connection and call `left`."""
         super().close()
         left, self.left = self.left, None
         if left is not None:
             left()
 
     def detach(self) -> int:
-        """Release the descriptor and uncount the connection."""
+        """Release the descriptor and call `left`."""
         left, self.left = self.left, None
         if left is not None:
             left()

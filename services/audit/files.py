@@ -249,7 +249,7 @@ class Segment:
 
 
 def closed_segments(log: Path) -> list[Segment]:
-    """Return the retained segments, oldest first.
+    """Return the closed segments that retention has not removed, oldest first.
 
     Raises:
         ValueError: if the anchor is malformed.

@@ -84,7 +84,7 @@ class VirtualCamera(BaseModel):
 
 
 class SnapshotRequest(BaseModel):
-    """Use of a snapshot."""
+    """Body of a request for a snapshot: where it is stored."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
     model: ResourceName | None = Field(

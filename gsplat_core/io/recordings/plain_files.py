@@ -408,7 +408,7 @@ def decode_plane(path: Path) -> NDArray[np.generic]:
 
 
 def _read(path: Path) -> tuple[bytes, tuple[int, int]]:
-    """Read a file up to its end mark; return the bytes and the (width, height) of its header."""
+    """Return the bytes of an image file with a checked end mark, and the (width, height) of its header."""
     size = image_size(path)
     with open_plain(path) as stream:
         data = stream.read(MAX_FILE_BYTES + 1)

@@ -90,7 +90,7 @@ struct Kernels {
                uint64_t* frame);
   // Adds red, green, blue, hits and z of the pixels of rows `begin` to `end` - 1 to `sums` [H, W, 5].
   void (*resolve)(const Scene&, const Request&, const uint64_t* frame, float* sums, int64_t begin, int64_t end);
-  // Writes `count` draws from each of `rates` as out[rate, count]; `key` is the number of the rate.
+  // Writes `count` Poisson numbers for each of `rates` as out[rate, count]. The index of the rate is their random key.
   void (*poisson)(const double* rates, int64_t rate_count, int64_t count, uint64_t seed, int64_t* out);
 };
 

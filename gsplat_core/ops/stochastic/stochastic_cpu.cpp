@@ -8,7 +8,7 @@ namespace GSPLAT_ISA::stochastic {
 
 constexpr int kMaxBases = 25;
 
-// exp(x) for any x.
+// exp(x), limited to 2^-126 ... 2^126.
 GSPLAT_INLINE vfloat exponential(vfloat x) {
   const vfloat power = min(max(x * kLog2e, splat(-126.0f)), splat(126.0f));
   return select(x == x, exp2(power), x);

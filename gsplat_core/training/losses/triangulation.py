@@ -31,7 +31,7 @@ LARGEST_ANGLE_DEG = 15.0
 """Largest angle of views that are chosen; beyond it optical flow finds few matches."""
 MOST_VIEWS = 8
 LEAST_VIEWS = 2
-"""Smallest and largest number of other views in which a point is matched."""
+"""Largest and smallest number of other views in which a point is matched."""
 SIGMA = 0.01
 """Scale of the robust loss relative to a point's depth."""
 FAR = 0.25
