@@ -74,7 +74,9 @@ class LiveDisplayResult:
     settled_age: DurationSummary
     """Distribution of these ages after the first `SETTLING_S` seconds of the stream."""
     used_age: DurationSummary
-    """Distribution of `settled_age` without pictures of withheld frames, which show the content of an earlier frame."""
+    """Distribution of `settled_age` without pictures of withheld and damaged frames, which show the content of an
+    earlier frame.
+    """
     states: dict[str, int]
     """Number of transitions into each state, by name."""
     first_picture_ms: float | None

@@ -173,7 +173,10 @@ class _TimeInStates:
         self._since_s = 0.0
 
     def saw(self, source: FrameSource, frame_came: bool) -> None:
-        """Add the time since the last read to the source's state; `frame_came` is True if the read returned a frame."""
+        """Add the time since the last call to the state that the source was in, except `live`, and log a new state.
+
+        `frame_came` is True if the read returned a frame; the state is then `live`.
+        """
         state = SourceState.LIVE if frame_came else source.state
         if state is self._state is SourceState.LIVE:
             return

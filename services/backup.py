@@ -386,8 +386,8 @@ def _moves(places: Places, data: Path) -> list[tuple[Path, Path]]:
 def _stage(source: Path, target: Path, files: dict[str, tuple[int, str]], apart: set[str]) -> Iterator[Path]:
     """Copy a folder of the backup into a new staging folder in its target, verifying each digest.
 
-    The staging folder is locked while the block runs, and removed at its end. `apart` names folders with a target of
-    their own."""
+    The staging folder is locked while the block runs, and removed at its end. Folders named in `apart`
+    have targets of their own and are left out."""
     target.mkdir(mode=0o700, parents=True, exist_ok=True)
     stage_ = target / f"{STAGE}{os.getpid()}"
     stage_.mkdir(mode=0o700)

@@ -67,7 +67,9 @@ SURFACE_CELL_PX = 2
 NEAR_PX, FAR_PX = 9.0, 24.0
 """Standard deviations in pixels of the fit's window, where points are dense and where they are sparse."""
 ENOUGH = 1.5
-"""Effective number of points in the narrow window from which the wide one is ignored."""
+"""Effective number of points in the narrow window from which the wide one has its smallest weight, 0.02; with fewer
+points the weight grows linearly to 1.
+"""
 FLOOR = 0.005
 """Relative error added to every point so that none dominates."""
 LEVEL = 1e-3

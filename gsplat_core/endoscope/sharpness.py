@@ -68,9 +68,11 @@ class Appearance:
     """Sharpness and clarity measures of a picture."""
 
     rows: float
-    """Sharpness along rows, typically 0.3 to 0.5."""
+    """Mean difference of neighbouring rows over that of rows `APART_PX` apart, typically 0.3 to 0.5; large in a sharp
+    picture.
+    """
     columns: float
-    """Sharpness along columns."""
+    """The same for columns."""
     contrast: float
     """Standard deviation of log brightness."""
     saturation: float
@@ -90,7 +92,7 @@ class SharpnessGate:
     def start_scene(self) -> None:
         """Discard the usual sharpness and clarity, at the start of a scene."""
         self._recent: deque[tuple[float, float, float]] = deque(maxlen=LONGEST_RECENT)
-        """Interval in seconds and sharpness along rows and columns of recent frames."""
+        """Interval in seconds, and `Appearance.rows` and `Appearance.columns`, of recent frames."""
         self._last_ns: int | None = None
         self._clear_count = 0
         self._fault: str | None = None
@@ -145,7 +147,7 @@ class SharpnessGate:
             together_s -= self._recent.popleft()[0]
 
     def _usual_sharpness(self) -> tuple[float, float]:
-        """Return the median sharpness along rows and columns, weighted by the frames' intervals."""
+        """Return the medians of `Appearance.rows` and `Appearance.columns`, weighted by the frames' intervals."""
         elapsed_s, *values = np.array(self._recent).T
         usual = []
         for sharpness in values:

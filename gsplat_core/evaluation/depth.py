@@ -106,10 +106,10 @@ def _descended(plane: Array, rays: Array, z: Array) -> tuple[Array, float]:
 
 
 def pixels_to_compare(camera: Camera, where: NDArray[np.bool_], most: int, *planes: NDArray[Any]) -> tuple[Array, ...]:
-    """Return the rays (x/z, y/z, 1) [N, 3] of at most `most` evenly spaced pixels in the mask `where`, and the values
-    [N] of each plane there.
+    """Return the rays (x/z, y/z, 1) [N, 3] of evenly spaced pixels in the mask `where` [H, W], and the values [N] of
+    each plane there.
 
-    At most about `most` pixels of `where` [H, W] are used.
+    All pixels of the mask are used if there are fewer than 2 `most`, otherwise between `most` and 1.5 `most` of them.
     """
     chosen = np.flatnonzero(where)
     chosen = chosen[:: max(1, len(chosen) // most)]

@@ -55,17 +55,17 @@ PART_FRAMES = 8
 
 @dataclass(frozen=True)
 class PartShares:
-    """Shares of the squared change of the recorded pictures over time that motion, size and colour of the Gaussians
-    explain. The reference is the model frozen at `reference_s`.
+    """Shares of the squared error of the model frozen at `reference_s` that the change of motion, size and colour of
+    the Gaussians over time removes (Shapley values).
     """
 
     motion: float
-    """Share explained by changes of positions and orientations."""
+    """Share of positions and orientations."""
     colour: float
     size: float
-    """Share explained by changes of sizes and opacities."""
+    """Share of sizes and opacities."""
     explained: float
-    """Sum of the three shares. The rest of the change is explained by none of the parts."""
+    """Sum of the three shares. The rest is the error of the complete model."""
     reference_s: float
     frames: int
 

@@ -131,7 +131,7 @@ LEAST_CYCLES = 1.0
 """Minimum number of breathing cycles in a window. With fewer, the motion may be the scope's."""
 FEWEST_POINTS = 100
 MOST_ERROR = 0.04
-"""Relative error of a distance at which its confidence is one half."""
+"""Relative error of a distance at which its confidence is one half. A window with a larger median error is rejected."""
 MOST_OFF_PX = 1.0
 """Median error in pixels of the fitted motion above which it is rejected."""
 OWN_MOTION = 3.0
@@ -161,7 +161,9 @@ class _Window:
 
 
 class MovingTissue:
-    """Depth of a recording's frames, computed on request. Equal frames give bit-identical results."""
+    """Depth of a recording's frames from the periodic motion of the tissue, fitted in windows. Equal frames give
+    bit-identical results.
+    """
 
     def __init__(self, frames: Sequence[Frame], cameras: Sequence[Camera]) -> None:
         """Fit all windows of a recording.

@@ -246,7 +246,7 @@ class Lens:
         return Rays(torch.zeros_like(directions), directions, valid)
 
     def undistort(self, pixels: Tensor, Ks: Tensor) -> Pixels:
-        """Return the pixels [..., C, M, 2] of the same rays in a pinhole camera without distortion."""
+        """Return the pixels of the same rays in a pinhole camera with the intrinsics `Ks`, without distortion."""
         directions, valid = self.rays(pixels, Ks)[1:]
         valid = valid & (directions[..., 2] > math.cos(WIDEST_PINHOLE_RAD))
         z = torch.where(valid, directions[..., 2], torch.ones_like(directions[..., 2]))

@@ -253,7 +253,9 @@ class PacedTissue(ThreadedSource):
                     return
 
     def shown(self, picture: ShownPicture) -> None:
-        """Record the display of a picture."""
+        """Store the latency of the newest frame when its picture is displayed, which lets `frames` yield the next
+        frame.
+        """
         if picture.new and self._given is not None and picture.rendered.frame.seq == self._given[0]:
             self.took_s[self._given[0]] = (picture.shown_ns - self._given[1]) * 1e-9
             self._shown.set()

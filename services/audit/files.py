@@ -38,7 +38,9 @@ class Entry:
     event: str
     """Event as `resource.verb`, such as `model.activate`."""
     actor: str
-    """Name and id of the API key, or `system` for the service itself."""
+    """Name and id of an API key or OpenID Connect user, `shell` for a change of keys by the command line, or `system`
+    for the service itself.
+    """
     role: str
     subject: str
     """Affected object, such as `liver/3`."""

@@ -206,7 +206,7 @@ class TrajectoryFacts(Part):
 
 
 class PartFacts(Part):
-    """Shares of the squared picture change explained by each part of the deformation."""
+    """Shares of the frozen model's squared picture error that each part of the deformation removes (`PartShares`)."""
 
     motion: float
     colour: float

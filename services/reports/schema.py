@@ -214,7 +214,9 @@ class LiveFacts(Part):
     settled_age_p99_ms: float | None = None
     """99th percentile of these ages after the first second, in milliseconds; None in older reports and shorter runs."""
     used_age_p99_ms: float | None = None
-    """99th percentile after the first second without pictures of withheld frames, which show the content of an earlier frame."""
+    """99th percentile after the first second without pictures of withheld and damaged frames, which show the content of
+    an earlier frame.
+    """
     first_picture_ms: float | None
     states: dict[str, Count]
     """Number of transitions into each display state."""

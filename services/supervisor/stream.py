@@ -167,8 +167,9 @@ def overall(capture: ProcessState, engine: ProcessState) -> tuple[str, str | Non
 
 
 def _withheld(engine: ProcessState) -> str | None:
-    """Return the reason why a running engine has displayed no picture: frames arrived and all were withheld; None
-    otherwise."""
+    """Return the counts of withheld frames by reason, as a sentence about a running engine that has displayed no
+    picture; None if no frame was withheld.
+    """
     frames, withheld = engine.figures.get("frames"), engine.figures.get("withheld")
     if not frames or not isinstance(withheld, Mapping) or not withheld:
         return None
@@ -176,7 +177,9 @@ def _withheld(engine: ProcessState) -> str | None:
 
 
 def _withheld_now(engine: ProcessState) -> str | None:
-    """Return the reason why a displayed picture is old: the last frames were withheld; None otherwise."""
+    """Return the counts of the newest frames by the reason for withholding them, as a sentence about a displayed
+    picture that is old; None if the newest `WITHHELD_FRAMES` frames were not all withheld.
+    """
     withheld = engine.figures.get("withheld_now")
     if not isinstance(withheld, Mapping) or sum(withheld.values()) < WITHHELD_FRAMES:
         return None

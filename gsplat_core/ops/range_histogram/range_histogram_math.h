@@ -80,7 +80,7 @@ GSPLAT_HOST_DEVICE Depth depth_of(const Inputs& in, int64_t id, const Hit& hit, 
   return d;
 }
 
-// Gradients of <v, mass in the bins> for a splat, v [bins].
+// <v, mass in the bins> of a splat for v [bins], and its gradients by the depth and its spread, in bins.
 struct BinGradients {
   float value;  // <v, mass>
   float v_at, v_spread;

@@ -93,7 +93,7 @@ def _without_tools(frame: Frame, image: Tensor) -> Tensor:
     bare = (tissue == 0).float()[None, None]
     margin = 2 * TOOL_MARGIN_PX + 1
     tool = max_pool2d(bare, margin, stride=1, padding=TOOL_MARGIN_PX)
-    tool = torch.where(tool.min() > 0, bare, tool)[0]  # no margin if it would cover all tissue
+    tool = torch.where(tool.min() > 0, bare, tool)[0]  # without the margin if no tissue would be left
     return torch.where(tool > 0, filled(picture, 1 - tool), picture)
 
 

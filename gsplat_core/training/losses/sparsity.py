@@ -35,7 +35,9 @@ class MeanScale:
         self._distance: Tensor | None = None
 
     def __call__(self, scene: Gaussians, observation: Observation, context: LossContext) -> Tensor | None:
-        """Return the mean standard deviation of the scene's Gaussians, relative to the first observation's distance."""
+        """Return the mean standard deviation of the scene's Gaussians, relative to the scene's median distance at the
+        first call.
+        """
         if not scene.count:
             return None
         if self._distance is None:

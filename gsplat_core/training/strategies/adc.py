@@ -254,4 +254,4 @@ class SceneAdc:
 
 
 KIND = StrategyKind(SceneAdc, DefaultStrategy, screen_gradients=True)
-"""The strategy's entry in `STRATEGIES`."""
+"""Entry of this module's strategy in the registry `STRATEGIES`."""

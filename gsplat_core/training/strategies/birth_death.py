@@ -76,4 +76,4 @@ def relocated(parents: Gaussians) -> tuple[Gaussians, Gaussians]:
 
 
 KIND = StrategyKind(lambda plan: Rounds(plan, birth_death))
-"""The strategy's entry in `STRATEGIES`."""
+"""Entry of this module's strategy in the registry `STRATEGIES`."""

@@ -155,4 +155,4 @@ class SceneMcmc:
 
 
 KIND = StrategyKind(SceneMcmc, MCMCStrategy, losses={"opacity": 0.01, "scale": 0.01})
-"""The strategy's entry in `STRATEGIES`."""
+"""Entry of this module's strategy in the registry `STRATEGIES`."""

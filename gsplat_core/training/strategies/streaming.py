@@ -165,4 +165,4 @@ def _turned(quats: Tensor, vectors: Tensor) -> Tensor:
 
 
 KIND = StrategyKind(lambda plan: Rounds(plan, densify))
-"""The strategy's entry in `STRATEGIES`."""
+"""Entry of this module's strategy in the registry `STRATEGIES`."""

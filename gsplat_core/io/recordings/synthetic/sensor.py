@@ -113,7 +113,7 @@ class Sensor:
     white: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """White balance: factors on red, green and blue."""
     contrast: float = 1.45
-    """Steepness of the tone curve."""
+    """Factor on the radiance in the tone curve (`develop`), its slope in the dark."""
     blur_px: float = 0.0
     """Standard deviation of the lens blur, in pixels of a picture 320 pixels wide."""
     shot_noise: float = 0.0
