@@ -20,7 +20,7 @@ from operators.messages import RenderedFrame
 from operators.outcome import OutcomeBuilder
 
 SCORED_EVERY = 4
-"""One in this many frames is scored against the ground truth."""
+"""At most one in this many frames is scored against the ground truth."""
 MOST_SCORED = 64
 """Maximum number of scored frames; longer recordings are sampled evenly."""
 FEWEST_PIXELS = 64

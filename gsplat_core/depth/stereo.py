@@ -169,8 +169,8 @@ MOST_SLOPE_PX = 1.0
 MOST_OFFSET = 0.03
 """Largest accepted common row offset, as a share of the picture's height."""
 LEAST_DISPARITY_PX = 0.5
-"""Median disparity in pixels, after subtracting the calibration's, below which a pair has no
-parallax: the same picture twice, or tissue at infinity.
+"""Disparity in pixels, after subtracting the calibration's, up to which a point has no depth. A pair whose median is
+smaller shows the same picture twice, or tissue at infinity.
 """
 
 
@@ -324,7 +324,7 @@ MARGIN_SHARE, MARGIN_PX = 0.2, 4
 HALF_BELIEVED_PX = 0.5
 """Standard deviation of a disparity at which its confidence is one half, in pixels of the matched pictures."""
 SAMPLED_PX = 200
-"""Number of samples along a row for the depth range of a picture."""
+"""Number of samples along a row (up to twice as many) for the depth range and the typical error of a picture."""
 LEAST_BELIEVED = 0.05
 """Share of the pixels that must be confident."""
 ROWS_FROM_PX = 0.05

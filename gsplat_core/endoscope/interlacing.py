@@ -32,7 +32,9 @@ JUDGED_FRAMES = 12
 FORGOTTEN_FRAMES = 600
 """Consecutive pictures without combs after which a stream is no longer interlaced."""
 STAND_OUT_LEVELS = 4
-"""Excess over both neighbouring lines, in levels, from which a pixel of an odd line is replaced."""
+"""Excess over both neighbouring lines, in levels, above which a pixel of an odd line and its neighbours in the line are
+replaced.
+"""
 
 
 class Deinterlacer:

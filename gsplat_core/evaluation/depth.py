@@ -181,7 +181,7 @@ class DepthSums:
 
 
 MOST_DEPTH_PIXELS = 8192
-"""Maximum number of evenly spaced pixels compared per frame, to bound memory."""
+"""Number of evenly spaced pixels compared per frame (up to twice as many), to bound memory."""
 
 
 @dataclass(frozen=True)
@@ -251,7 +251,7 @@ class DepthShareSums:
 
 
 MOST_PLANE_PIXELS = 8192
-"""Number of evenly spaced pixels per frame used to fit its plane."""
+"""Number of evenly spaced pixels per frame (up to twice as many) used to fit its plane."""
 SMOOTH_PX = 5
 """Width in pixels of the smoothing before differentiation; quantised depth has steps."""
 

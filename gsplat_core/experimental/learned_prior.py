@@ -119,7 +119,7 @@ def blurred(field: NDArray[np.float32], deviation: float) -> NDArray[np.float32]
 REMEMBERED = 256
 """Number of remembered frames: some seconds, several heartbeats."""
 SOONEST = 6
-"""Smallest distance in frames between compared moments, because neighbouring frames are always similar."""
+"""Distance in frames that a compared moment must exceed, because neighbouring frames are always similar."""
 EARLIER_COUNTS = 0.64
 """Weight of the preceding moments in the dissimilarity of two moments."""
 FOLLOWED = 6

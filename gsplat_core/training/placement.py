@@ -81,7 +81,7 @@ class LateDepth:
 
 
 LARGEST_STEP = 1.4
-"""Largest change of a Gaussian's depth by one frame, as a factor, once the scene's distance is known."""
+"""Largest change of a Gaussian's depth by one frame, as a factor."""
 SHARE = 0.5
 """Share of a correction (of log depth) that one frame applies. Several frames are thus averaged."""
 CORRECTED_PX = 16

@@ -31,7 +31,7 @@ SH_EVERY = 1000
 """Number of steps, of a training with `FULL_STEPS`, after which another degree of the spherical harmonics is used."""
 EPSILON = 1e-15
 NEIGHBOURS = 3
-"""Number of neighbours whose root mean squared distance is the initial scale of a Gaussian."""
+"""Number of neighbours whose root mean squared distance, times `Start.scale`, is the initial scale of a Gaussian."""
 LEAST_SCALE = 1e-7
 """Minimum initial scale, for points that coincide."""
 NEAR_PLANE = 0.01
