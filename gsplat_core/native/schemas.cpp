@@ -17,6 +17,16 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "adam_at_(Tensor(a!) parameter, Tensor gradient, Tensor(b!) first_moment, Tensor(c!) second_moment, Tensor rate, "
       "Tensor step, float beta1, float beta2, float epsilon, int row_size, Tensor(d!) skipped) -> ()");
 
+  // In place: lengths of the screen gradients [C, N, 2] of one step, added to statistics [N] of the visible Gaussians.
+  m.def(
+      "accumulate_gradient_norms_(Tensor gradients, Tensor radii, float scale_x, float scale_y, float extent_scale, "
+      "Tensor(a!) sums, Tensor(b!) counts, Tensor(c!)? largest) -> ()");
+
+  // In place: covariance times noise, added to positions, less for visible Gaussians.
+  m.def(
+      "diffuse_positions_(Tensor(a!) means, Tensor quats, Tensor log_scales, Tensor logits, Tensor noise, float scale, "
+      "float opacity_at_half, float steepness) -> ()");
+
   // Projection of N Gaussians in B batches to C cameras. The covariance is given as [B, N, 6] or as quats and scales.
   m.def(
       "project_gaussians(Tensor means, Tensor? covars, Tensor? quats, Tensor? scales, Tensor? opacities, Tensor viewmats, "

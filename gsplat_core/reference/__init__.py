@@ -19,6 +19,7 @@ from gsplat_core.reference.deformation import (
     hexplane_modulate,
     hexplane_space,
 )
+from gsplat_core.reference.densification import accumulate_gradient_norms_, diffuse_positions_
 from gsplat_core.reference.disparity_fit import fit_disparities
 from gsplat_core.reference.edge_aware_filter import smooth_within_edges
 from gsplat_core.reference.flow_blending import blend_flow
@@ -41,6 +42,7 @@ from gsplat_core.reference.tiles import isect_offset_encode, isect_tiles
 from gsplat_core.reference.weighted_sum import weighted_sums
 
 __all__ = [
+    "accumulate_gradient_norms_",
     "adam_step",
     "basis_field",
     "basis_field_add_colours_",
@@ -50,6 +52,7 @@ __all__ = [
     "blend_flow",
     "blend_rays",
     "correct_colours",
+    "diffuse_positions_",
     "fit_disparities",
     "frame_loss",
     "fully_fused_projection",

@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Literal
 import torch
 from torch import Tensor
 
+from gsplat_core.ops.densification.densification import accumulate_gradient_norms_
 from gsplat_core.training.strategies.operations import duplicate, remove, reset_opa, split
 from gsplat_core.training.strategies.scene import Plan, StrategyKind, change_rows, every_of, views_of
 from gsplat_core.training.strategies.strategy import GEOMETRY, InvalidParameters, Optimizers, Params, Strategy
@@ -128,29 +129,37 @@ class DefaultStrategy(Strategy):
                 f"{self.key_for_gradient} has no gradient; call step_pre_backward before backward, and render with absgrad"
                 " if the strategy uses it"
             )
-        scale = gradients.new_tensor([width / 2 * cameras, height / 2 * cameras])
-        norms = (gradients * scale).norm(dim=-1)
+        scale = (width / 2 * cameras, height / 2 * cameras)
+        extent_scale = 1 / max(width, height)
         count = len(next(iter(params.values())))
         for name in ("grad2d", "count", *(("radii",) if self.refine_scale2d_stop_iter > 0 else ())):
             if state.get(name) is None:
-                state[name] = torch.zeros(count, device=norms.device)
-        extent = radii if radii.dim() == norms.dim() else radii.amax(-1)
-        extent = extent / float(max(width, height))
+                state[name] = torch.zeros(count, device=gradients.device)
+        radii = (radii if radii.dim() == gradients.dim() else radii[..., None]).int().expand(gradients.shape)
         if packed:
-            rows = self._needed(info, "gaussian_ids")
-            state["grad2d"].index_put_((rows,), norms, accumulate=True)
-            state["count"].index_put_((rows,), torch.ones_like(norms), accumulate=True)
-        else:
-            # A sum over cameras has a fixed order, unlike additions by index.
-            visible = radii > 0 if radii.dim() == norms.dim() else (radii > 0).all(-1)
-            visible, norms, extent = (each.reshape(-1, count) for each in (visible, norms, extent))
-            state["grad2d"] += torch.where(visible, norms, 0).sum(0)
-            state["count"] += visible.sum(0)
+            self._add_packed(state, gradients, radii, scale, extent_scale, self._needed(info, "gaussian_ids"))
+            return
+        shape = (gradients.shape[:-2].numel(), count, 2)
+        accumulate_gradient_norms_(
+            gradients.float().reshape(shape), radii.reshape(shape), scale, extent_scale, state["grad2d"], state["count"],
+            state["radii"] if self.refine_scale2d_stop_iter > 0 else None,
+        )  # fmt: skip
+
+    def _add_packed(
+        self,
+        state: dict[str, Any],
+        gradients: Tensor,
+        radii: Tensor,
+        scale: tuple[float, float],
+        extent_scale: float,
+        rows: Tensor,
+    ) -> None:
+        """Add gradients and radii [M, 2] of visible Gaussians to the rows [M] of the statistics."""
+        norms = torch.hypot(gradients[:, 0] * scale[0], gradients[:, 1] * scale[1])
+        state["grad2d"].index_put_((rows,), norms, accumulate=True)
+        state["count"].index_put_((rows,), torch.ones_like(norms), accumulate=True)
         if self.refine_scale2d_stop_iter > 0:
-            if packed:
-                state["radii"].scatter_reduce_(0, rows, extent, "amax")
-            else:
-                torch.maximum(state["radii"], torch.where(visible, extent, 0).amax(0), out=state["radii"])
+            state["radii"].scatter_reduce_(0, rows, radii.amax(-1) * extent_scale, "amax")
 
     @torch.no_grad()
     def _grow_gs(self, params: Params, optimizers: Optimizers, state: dict[str, Any], step: int) -> tuple[int, int]:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn import Parameter
 
-from gsplat_core.ops.covariance.covariance import quat_scale_to_covar_preci
+from gsplat_core.ops.densification.densification import diffuse_positions_
 from gsplat_core.training.strategies.relocation import compute_relocation
 from gsplat_core.training.strategies.strategy import InvalidParameters, Optimizers, Params
 
@@ -251,12 +251,13 @@ def inject_noise_to_position(
     """
     means = params["means"]
     noise = torch.randn(means.shape, dtype=means.dtype, device=means.device, generator=generator)
-    opacities = params["opacities"].detach().flatten().sigmoid()
-    share = torch.sigmoid(-steepness * (opacities - opacity_at_half))
-    covars, _ = quat_scale_to_covar_preci(
-        params["quats"].detach(), params["scales"].detach().exp(), compute_covar=True, compute_preci=False
-    )
-    means.add_(torch.einsum("nij,nj->ni", covars, noise * (share * scaler)[:, None]))
+    moved = means.detach().contiguous()
+    diffuse_positions_(
+        moved, params["quats"].detach(), params["scales"].detach(), params["opacities"].detach().flatten(), noise, scaler,
+        opacity_at_half, steepness,
+    )  # fmt: skip
+    if not means.is_contiguous():
+        means.copy_(moved)
 
 
 def draw(weights: Tensor, count: int, generator: torch.Generator | None = None) -> Tensor:
