@@ -46,10 +46,10 @@ __device__ __forceinline__ float power_at(const Contour& r, float dx, float dy) 
 // Sum D channels from `first` on in one tile per block. With `total`, also the sum of the terms.
 template <int D>
 __global__ void __launch_bounds__(kBatch) sum_tiles(const Inputs in, int first, bool total, float* __restrict__ sums) {
-  __shared__ float4 places[kBatch];  // x, y, half width, half height
-  __shared__ float4 forms[kBatch];   // a, b, c, l
-  __shared__ float2 levels[kBatch];  // threshold, signed weight
-  __shared__ double factors[D][kBatch];
+  __shared__ float4 places[kBatch];                 // x, y, half width, half height
+  __shared__ float4 forms[kBatch];                  // a, b, c, l
+  __shared__ float2 levels[kBatch];                 // threshold, signed weight
+  __shared__ double2 factors[(D + 1) / 2][kBatch];  // channels in units of the quantum, in pairs
   const int tile = blockIdx.x, thread = threadIdx.x;
   const int64_t tiles = int64_t(in.tile_width) * in.tile_height;
   // A warp has 8x4 pixels, so that small splats concern few warps.
@@ -57,7 +57,8 @@ __global__ void __launch_bounds__(kBatch) sum_tiles(const Inputs in, int first, 
   const int px = tile % in.tile_width * kTileSize + warp % 2 * 8 + lane % 8;
   const int py = tile / in.tile_width * kTileSize + warp / 2 * 4 + lane / 8;
   const float x = float(px) + 0.5f, y = float(py) + 0.5f;
-  long long added[D + 1] = {};
+  // Sums of the doubles' bits, whose number is counted: each also adds kMagicBits.
+  unsigned long long added[D + 1] = {}, terms = 0;
   const int64_t begin = max(int64_t(in.offsets[tile]), int64_t(0));
   const int64_t end = min(tile + 1 < tiles ? int64_t(in.offsets[tile + 1]) : in.instances, in.instances);
   for (int64_t batch = begin; batch < end; batch += kBatch) {
@@ -70,7 +71,9 @@ __global__ void __launch_bounds__(kBatch) sum_tiles(const Inputs in, int first, 
         places[thread] = {s.x, s.y, s.contour.half_width, s.contour.half_height};
         forms[thread] = {s.contour.a, s.contour.b, s.contour.c, s.contour.l};
         levels[thread] = {s.contour.threshold, s.contour.sign * s.weight};
-        for (int k = 0; k < D; ++k) factors[k][thread] = double(limited(in.channels[i * in.channel_count + first + k])) * kScale;
+        const float* const own = in.channels + i * in.channel_count + first;
+        const auto factor = [&](int k) { return k < D ? double(limited(own[k])) * kScale : 0.0; };
+        for (int k = 0; k < D; k += 2) factors[k / 2][thread] = {factor(k), factor(k + 1)};
       }
     }
     __syncthreads();
@@ -85,14 +88,21 @@ __global__ void __launch_bounds__(kBatch) sum_tiles(const Inputs in, int first, 
       if (!(power >= level.x)) continue;
       const float term = fminf(fmaxf(exp2f(fminf(power, form.w)) * level.y, -kMostTerm), kMostTerm);
       const double wide = double(term);
-      for (int k = 0; k < D; ++k) added[k] += __double_as_longlong(wide * factors[k][j] + kMagic) - kMagicBits;
-      added[D] += __double_as_longlong(wide * kScale + kMagic) - kMagicBits;
+      const auto quanta = [wide](double factor) { return (unsigned long long)__double_as_longlong(wide * factor + kMagic); };
+      for (int k = 0; k < D; k += 2) {
+        const double2 pair = factors[k / 2][j];
+        added[k] += quanta(pair.x);
+        if (k + 1 < D) added[k + 1] += quanta(pair.y);
+      }
+      added[D] += quanta(kScale);
+      ++terms;
     }
   }
   if (px >= in.width || py >= in.height) return;
   const int64_t pixels = int64_t(in.width) * in.height, pixel = int64_t(py) * in.width + px;
-  for (int k = 0; k < D; ++k) sums[(first + k) * pixels + pixel] = __ll2float_rn(added[k]) * kInverseScale;
-  if (total) sums[in.channel_count * pixels + pixel] = __ll2float_rn(added[D]) * kInverseScale;
+  const auto sum = [&](int k) { return __ll2float_rn((long long)(added[k] - terms * kMagicBits)) * kInverseScale; };
+  for (int k = 0; k < D; ++k) sums[(first + k) * pixels + pixel] = sum(k);
+  if (total) sums[in.channel_count * pixels + pixel] = sum(D);
 }
 
 __device__ __forceinline__ float warp_sum(float v) {
