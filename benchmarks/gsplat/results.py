@@ -248,8 +248,8 @@ TRAINER_VARIANTS = {
 }
 
 
-def trainer(logs: Logs) -> str:
-    """Return scores, memory and times of gsplat's example trainer with gsplat and with this package."""
+def trainings(logs: Logs) -> str:
+    """Return scores, memory and times of trainings by gsplat's example trainer with gsplat and with this package."""
     rows, texts = [], []
     for device, log in logs.items():
         for strategy, variants in log["summary"].items():
@@ -267,6 +267,12 @@ def trainer(logs: Logs) -> str:
             f" {'the package fused-ssim' if installed else 'ours, because fused-ssim was not installed'}."
             f" Replaced packages: {', '.join(sorted({each for run in log['runs'] for each in run['replaced']}))}."
         )
+    head = ("strategy", "package", "device", "PSNR", "SSIM", "splats", "peak memory", "training time", "waiting", "ratio", "ratio without waiting")  # fmt: skip
+    return "\n\n".join([*texts, table(head, rows)])
+
+
+def trainer(logs: Logs) -> str:
+    """Return how gsplat's example trainer was run, and its results."""
     said = (
         "`simple_trainer.py` of gsplat's examples, abridged to what it uses without a viewer, on a synthetic scene in COLMAP's"
         " format. Each training is a process of its own, with the same arguments and seeds for all variants of a strategy, but"
@@ -278,8 +284,7 @@ def trainer(logs: Logs) -> str:
         " the first step, which takes seconds and moves the ratios towards 1. Required: at most 0.65"
         " of gsplat's time, and 0.5 with our optimiser and SSIM. gsplat needs CUDA."
     )
-    head = ("strategy", "package", "device", "PSNR", "SSIM", "splats", "peak memory", "training time", "waiting", "ratio", "ratio without waiting")  # fmt: skip
-    return "\n\n".join([said, *texts, table(head, rows)])
+    return f"{said}\n\n{trainings(logs)}"
 
 
 def _trained(each: Mapping[str, Any]) -> list[str]:
@@ -306,6 +311,7 @@ SECTIONS: tuple[tuple[str, str, Callable[[Logs], str]], ...] = (
     ("Several processes", "processes", processes),
     ("Static scenes: `intrasplat train`", "static", static),
     ("gsplat's example trainer", "trainer", trainer),
+    ("gsplat's example trainer, 1280x960 pixels", "trainer_wide", trainings),
     ("Cameras", "cameras", cameras),
     ("ADC and MCMC", "strategies", strategies),
 )

@@ -1,6 +1,6 @@
 """gsplat's example trainer with gsplat and with this package, on a synthetic scene in COLMAP's format.
 
-    PYTHONPATH=build/peers python benchmarks/gsplat/trainer.py EXAMPLES [--device cuda] [--full] [--seeds 0 1 2] --out FILE
+    PYTHONPATH=build/peers python benchmarks/gsplat/trainer.py EXAMPLES [--device cuda] [--full] [--wide] [--seeds 0 1 2] --out FILE
 
 EXAMPLES is the folder `examples` of gsplat's sources with `simple_trainer.py`. `build/peers` holds gsplat, compiled by
 `benchmarks/peers/build_gsplat.py`. Every training is a process of its own. The variants of one seed run one after the
@@ -43,8 +43,12 @@ ROOT = Path(__file__).resolve().parents[2]
 STRATEGIES = ("default", "mcmc")
 STEPS_OF_TRAINER = 30_000
 FEWEST_STEPS = 300
+WIDE = {"views": 120, "width_px": 1280, "height_px": 960, "points": 100_000, "per_unit": 440}
+"""Size of the scene of `--wide`, at which the GPU rather than the host determines the time of a step."""
 STEPS, CAP = {False: 300, True: 6000}, {False: 5000, True: 200_000}
 """Steps, and the cap of mcmc, for the small and the large scene."""
+WIDE_CAP = 1_000_000
+"""Cap of mcmc for the scene of `--wide`."""
 
 
 @dataclass(frozen=True)
@@ -161,19 +165,25 @@ def main() -> None:
     parser.add_argument("examples", type=Path, help="folder examples of gsplat's sources")
     parser.add_argument("--steps", type=int, help="steps of a training; 300, or 6,000 with --full")
     parser.add_argument("--cap", type=int, help="cap of mcmc; 5,000, or 200,000 with --full")
+    parser.add_argument(
+        "--wide", action="store_true", help="pictures of 1280x960 and up to a million splats; with --full"
+    )
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--strategies", nargs="+", choices=STRATEGIES, default=STRATEGIES)
     parser.add_argument("--variants", nargs="+", choices=list(VARIANTS), help=f"by default {', '.join(USUAL)}")
     parser.add_argument("--earlier", type=Path, help="log of an earlier call; its runs are kept and not repeated")
     chosen = parser.parse_args()
-    chosen.steps, chosen.cap = chosen.steps or STEPS[chosen.full], chosen.cap or CAP[chosen.full]
+    chosen.steps, chosen.cap = (
+        chosen.steps or STEPS[chosen.full],
+        chosen.cap or (WIDE_CAP if chosen.wide else CAP[chosen.full]),
+    )
     if chosen.steps < FEWEST_STEPS:
         parser.error(f"--steps is {chosen.steps}; give at least {FEWEST_STEPS}, where the trainer refines at each step")
     places = {str(chosen.examples): "EXAMPLES", str(chosen.earlier): "FILE"}
     sys.argv[1:] = [places.get(word, word) for word in sys.argv[1:]]
     chosen.examples = chosen.examples.resolve()
     names = chosen.variants or [name for name in USUAL if chosen.device == "cuda" or VARIANTS[name].ours]
-    size = LARGE if chosen.full else SMALL
+    size = WIDE if chosen.wide else LARGE if chosen.full else SMALL
     stated = {"scene": size, "steps": chosen.steps, "cap": chosen.cap}
     runs = earlier_runs(chosen.earlier, stated)
     known = {(run["strategy"], run["variant"], run["seed"]) for run in runs}
