@@ -274,7 +274,7 @@ def _summary(report: RunReport, facts: LiveFacts) -> str:
     if facts.settled_age_p99_ms is not None:
         lines.append(f"age after the first second: p99 {facts.settled_age_p99_ms:.1f} ms")
     if facts.used_age_p99_ms is not None and facts.withheld:
-        lines.append(f"without pictures of withheld frames: p99 {facts.used_age_p99_ms:.1f} ms")
+        lines.append(f"of used frames, not withheld or damaged: p99 {facts.used_age_p99_ms:.1f} ms")
     name = "displayed frame (training error)"
     lines += quality_line(name, facts.settled_psnr_tissue_db, facts.previous_frame_db)
     lines += quality_line(f"worst {name}", facts.worst_psnr_tissue_db, None)

@@ -540,7 +540,7 @@ def _counts(live: LiveFacts) -> str:
     ages = f"p50 {live.age_p50_ms:,.1f}, p95 {live.age_p95_ms:,.1f}, p99 {live.age_p99_ms:,.1f}, max {live.age_max_ms:,.1f} ms"
     later = {
         "p99 after the first second": live.settled_age_p99_ms,
-        "p99 after it without withheld frames": live.used_age_p99_ms,
+        "p99 after it, of used frames (not withheld or damaged)": live.used_age_p99_ms,
     }
     ages += "".join(f", {name} {value:,.1f} ms" for name, value in later.items() if value is not None)
     facts = {
