@@ -15,6 +15,8 @@ from gsplat_core.errors import InvalidInput
 
 MOST_COPIES = 51
 """Largest number of copies in the table of `binomials`."""
+ROWS_AT_ONCE = 1 << 16
+"""Gaussians whose sums are computed together, with three temporary values of 8 bytes per Gaussian and coefficient."""
 
 
 def binomials(count: int = MOST_COPIES) -> Tensor:
@@ -23,10 +25,10 @@ def binomials(count: int = MOST_COPIES) -> Tensor:
 
 
 @functools.cache
-def _factors(count: int) -> Tensor:
+def _factors(count: int, device: torch.device) -> Tensor:
     """Return C(n + 1, k + 1) (-1)^k / √(k + 1) for n, k < `count`, float64 [count, count]."""
     rows = [[(-1) ** k * math.comb(n + 1, k + 1) / math.sqrt(k + 1) for k in range(count)] for n in range(count)]
-    return torch.tensor(rows, dtype=torch.float64)
+    return torch.tensor(rows, dtype=torch.float64, device=device)
 
 
 @torch.no_grad()
@@ -59,11 +61,11 @@ def compute_relocation(opacities: Tensor, scales: Tensor, ratios: Tensor, binoms
     before = opacities.reshape(-1).double()
     copies = ratios.long().clamp(1, len(binoms))
     after = -torch.expm1(torch.log1p(-before) / copies)
-    factors = _factors(len(binoms)).to(before.device)
-    total, power = torch.zeros_like(before), torch.ones_like(before)
-    for column in factors.unbind(1):
-        power = power * after
-        total += column[copies - 1] * power
+    factors = _factors(len(binoms), before.device)
+    # In parts, because a part has a value per row and coefficient.
+    parts = zip(after.split(ROWS_AT_ONCE), copies.split(ROWS_AT_ONCE), strict=True)
+    sums = [(factors[n - 1] * a[:, None].expand(-1, len(binoms)).cumprod(1)).sum(1) for a, n in parts]
+    total = torch.cat(sums)
     # An invisible Gaussian keeps its size: the quotient's limit for o = 0 is 1.
     ratio = torch.where(before > 0, before / torch.where(before > 0, total, 1.0), 1.0)
     return after.to(opacities.dtype).reshape(opacities.shape), (ratio[:, None] * scales.double()).to(scales.dtype)
