@@ -36,6 +36,7 @@ from gsplat_core.rendering.surface import render_surface
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.growth.initialisation import gaussians_from_frame
+from gsplat_core.training.losses.rendered_rays import EVERY
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.steps.step import TrainingStep
@@ -44,6 +45,8 @@ from operators.applications.reconstruct import reconstruct
 from operators.applications.replay import ReplaySettings
 
 PARTS = ("wall", "step", "stereo", "semantics")
+WARM_UP = EVERY
+"""Untimed steps."""
 TRAINED = ("ray_depth", "normal_consistency")
 
 
@@ -91,22 +94,23 @@ def step(device: str, full: bool) -> dict[str, Any]:
             makers[name] = TrainingStep(gaussians.to(device), field.to(device), config, recording.camera)
         times: dict[str, list[float]] = {name: [] for name in makers}
         clock = time.process_time if device == "cpu" else time.perf_counter  # other load of the machine does not count
-        for turn in range(28 if device == "cpu" else 204):
+        for turn in range(WARM_UP + EVERY * (6 if device == "cpu" else 25)):
             for name, one in makers.items():
                 begun = clock()
                 one(observation)
                 if device != "cpu":
                     torch.cuda.synchronize()
-                if turn >= 4:
+                if turn >= WARM_UP:
                     times[name].append(1e3 * (clock() - begun))
-        # Losses of rays are evaluated in one of four steps: the median of the means of four.
-        fours = {
-            name: [statistics.mean(each[k : k + 4]) for k in range(0, len(each), 4)] for name, each in times.items()
+        # Losses of rays are evaluated in one of `EVERY` steps: the median of the means of as many.
+        means = {
+            name: [statistics.mean(each[k : k + EVERY]) for k in range(0, len(each), EVERY)]
+            for name, each in times.items()
         }
-        for name, each in fours.items():
+        for name, each in means.items():
             figures[f"step: losses {name}, ms"] = round(statistics.median(each), 3)
         for name in ("both", "ray_depth", "normals"):
-            ratio = statistics.median(fours[name]) / statistics.median(fours["none"])
+            ratio = statistics.median(means[name]) / statistics.median(means["none"])
             figures[f"step: extra cost of {name} %"] = round(100 * (ratio - 1), 1)
     return figures
 
