@@ -18,9 +18,9 @@ import numpy as np
 import torch
 
 from gsplat_core.depth.stereo import SMOOTH_GREY, SMOOTHNESS, StereoDepth
-from gsplat_core.ops.disparity_fit.disparity_fit import fit_disparities
-from gsplat_core.ops.edge_aware_filter.edge_aware_filter import smooth_within_edges
-from gsplat_core.ops.stereo_matching.stereo_matching import UNKNOWN, match_disparities
+from gsplat_core.ops.disparity_fit import fit_disparities
+from gsplat_core.ops.edge_aware_filter import smooth_within_edges
+from gsplat_core.ops.stereo_matching import UNKNOWN, match_disparities
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 

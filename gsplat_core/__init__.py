@@ -20,20 +20,21 @@ if TYPE_CHECKING:
     from gsplat_core.io.recordings import open_recording
     from gsplat_core.models.model import Model
     from gsplat_core.models.snapshots import Snapshot, SnapshotSlots
-    from gsplat_core.ops.compositing.compositing import rasterize_to_pixels
-    from gsplat_core.ops.compositing.indices import accumulate, rasterize_to_indices_in_range
-    from gsplat_core.ops.covariance.covariance import quat_scale_to_covar_preci
+    from gsplat_core.ops.compositing import accumulate, rasterize_to_indices_in_range, rasterize_to_pixels
+    from gsplat_core.ops.covariance import quat_scale_to_covar_preci
     from gsplat_core.ops.projection.projection import fully_fused_projection
     from gsplat_core.ops.projection.separate_steps import proj, world_to_cam
-    from gsplat_core.ops.spherical_harmonics.spherical_harmonics import spherical_harmonics
-    from gsplat_core.ops.ssim.ssim import fused_ssim
-    from gsplat_core.ops.surfel_blending.indices import accumulate_2dgs, rasterize_to_indices_in_range_2dgs
-    from gsplat_core.ops.surfel_blending.surfel_blending import rasterize_to_pixels_2dgs
+    from gsplat_core.ops.spherical_harmonics import spherical_harmonics
+    from gsplat_core.ops.ssim import fused_ssim
+    from gsplat_core.ops.surfel_blending import (
+        accumulate_2dgs,
+        rasterize_to_indices_in_range_2dgs,
+        rasterize_to_pixels_2dgs,
+    )
     from gsplat_core.ops.surfel_projection.surfel_projection import fully_fused_projection_2dgs
     from gsplat_core.ops.tiles.tiles import isect_offset_encode, isect_tiles
-    from gsplat_core.ops.unscented_projection.parameters import UnscentedTransformParameters
-    from gsplat_core.ops.unscented_projection.unscented_projection import fully_fused_projection_with_ut
-    from gsplat_core.ops.world_blending.world_blending import rasterize_to_pixels_eval3d
+    from gsplat_core.ops.unscented_projection import UnscentedTransformParameters, fully_fused_projection_with_ut
+    from gsplat_core.ops.world_blending import rasterize_to_pixels_eval3d
     from gsplat_core.poses.rolling_shutter import RollingShutterType
     from gsplat_core.rendering.frame_renderer import FrameRenderer
     from gsplat_core.rendering.inria import rasterization_inria_wrapper
@@ -141,14 +142,14 @@ _HOME = {
     "Snapshot": "models.snapshots",
     "SnapshotSlots": "models.snapshots",
     "Strategy": "training.strategies.strategy",
-    "UnscentedTransformParameters": "ops.unscented_projection.parameters",
-    "accumulate": "ops.compositing.indices",
-    "accumulate_2dgs": "ops.surfel_blending.indices",
+    "UnscentedTransformParameters": "ops.unscented_projection",
+    "accumulate": "ops.compositing",
+    "accumulate_2dgs": "ops.surfel_blending",
     "export_splats": "io.exports.splats",
     "fully_fused_projection": "ops.projection.projection",
     "fully_fused_projection_2dgs": "ops.surfel_projection.surfel_projection",
-    "fully_fused_projection_with_ut": "ops.unscented_projection.unscented_projection",
-    "fused_ssim": "ops.ssim.ssim",
+    "fully_fused_projection_with_ut": "ops.unscented_projection",
+    "fused_ssim": "ops.ssim",
     "isect_offset_encode": "ops.tiles.tiles",
     "isect_tiles": "ops.tiles.tiles",
     "load_bundle": "io.bundle",
@@ -156,21 +157,21 @@ _HOME = {
     "new_renderer": "rendering.registry",
     "open_recording": "io.recordings",
     "proj": "ops.projection.separate_steps",
-    "quat_scale_to_covar_preci": "ops.covariance.covariance",
+    "quat_scale_to_covar_preci": "ops.covariance",
     "rasterization": "rendering.rasterization",
     "rasterization_2dgs": "rendering.surfels",
     "rasterization_2dgs_inria_wrapper": "rendering.surfels",
     "rasterization_inria_wrapper": "rendering.inria",
-    "rasterize_to_indices_in_range": "ops.compositing.indices",
-    "rasterize_to_indices_in_range_2dgs": "ops.surfel_blending.indices",
-    "rasterize_to_pixels": "ops.compositing.compositing",
-    "rasterize_to_pixels_2dgs": "ops.surfel_blending.surfel_blending",
-    "rasterize_to_pixels_eval3d": "ops.world_blending.world_blending",
+    "rasterize_to_indices_in_range": "ops.compositing",
+    "rasterize_to_indices_in_range_2dgs": "ops.surfel_blending",
+    "rasterize_to_pixels": "ops.compositing",
+    "rasterize_to_pixels_2dgs": "ops.surfel_blending",
+    "rasterize_to_pixels_eval3d": "ops.world_blending",
     "render": "rendering.rasterization",
     "save_bundle": "io.bundle",
     "save_gaussians": "io.exports.export",
     "save_ply": "io.ply",
-    "spherical_harmonics": "ops.spherical_harmonics.spherical_harmonics",
+    "spherical_harmonics": "ops.spherical_harmonics",
     "world_to_cam": "ops.projection.separate_steps",
 }
 """Import path of the module that defines each public name."""

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsplat_core.io.recordings.colmap import read_colmap
-from gsplat_core.ops.ssim.ssim import fused_ssim
+from gsplat_core.ops.ssim import fused_ssim
 
 LPIPS = "torchmetrics.image.lpip"
 

@@ -16,7 +16,7 @@ import log
 import torch
 
 from gsplat_core import reference
-from gsplat_core.ops.splat_regression.splat_regression import splat_regression
+from gsplat_core.ops.splat_regression import splat_regression
 from gsplat_core.regression import FitOptions, Splats, fit
 from gsplat_core.regression.fit import adam_alone
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.geometry.neighbours import nearest_others
-from gsplat_core.ops.ssim.ssim import fused_ssim
+from gsplat_core.ops.ssim import fused_ssim
 
 LEAST_VARIANCE = 1e-12
 """Minimum product of both sums of squares in the correlation of depths."""

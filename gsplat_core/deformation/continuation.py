@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gsplat_core.deformation.field import DeformationField, displaced
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.scalars.scalars import store_scalars_
+from gsplat_core.ops.scalars import store_scalars_
 from gsplat_core.scene.gaussians import RAW_COLUMNS, Gaussians
 
 DeltasAt = Callable[[Tensor], Tensor]

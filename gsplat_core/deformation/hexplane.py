@@ -23,8 +23,8 @@ from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.hexplane import hexplane as compiled
 from gsplat_core.ops.hexplane import plain_torch
 from gsplat_core.ops.hexplane.plain_torch import HEAD_COLUMNS, HEAD_GROUPS, PLANE_AXES
-from gsplat_core.ops.hexplane_deltas.hexplane_deltas import hexplane_deltas, takes_layers
-from gsplat_core.ops.hexplane_training.hexplane_training import (
+from gsplat_core.ops.hexplane_deltas import hexplane_deltas, takes_layers
+from gsplat_core.ops.hexplane_training import (
     AdamOnDevice,
     FieldGradient,
     TrainingState,

@@ -25,9 +25,9 @@ from torch import Tensor
 
 from gsplat_core.depth.maps import DepthMap, Estimator, doubted
 from gsplat_core.geometry.tracks import Points, followed
-from gsplat_core.ops.disparity_fit.disparity_fit import fit_disparities
-from gsplat_core.ops.edge_aware_filter.edge_aware_filter import smooth_within_edges
-from gsplat_core.ops.stereo_matching.stereo_matching import (
+from gsplat_core.ops.disparity_fit import fit_disparities
+from gsplat_core.ops.edge_aware_filter import smooth_within_edges
+from gsplat_core.ops.stereo_matching import (
     COUNT_STEP,
     MOST_DISPARITIES,
     SIXTEENTHS,

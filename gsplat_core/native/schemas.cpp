@@ -179,7 +179,7 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "Tensor v_ray_transforms, Tensor v_colors, Tensor v_opacities, Tensor v_normals, Tensor v_densify, Tensor v_backgrounds, "
       "Tensor v_means2d_abs)");
 
-  // Fused `rasterization()`, CUDA only; gsplat_core/ops/rasterization/rasterization.py documents the list arguments.
+  // Fused `rasterization()`, CUDA only; gsplat_core/ops/rasterization/__init__.py documents the list arguments.
   m.def("rasterize(Tensor?[] inputs, int[] image_dims, int[] options, float[] ranges, bool training) -> Tensor[]");
   m.def(
       "rasterize_splats_backward(Tensor?[] saved, Tensor? v_image, Tensor? v_alphas, int[] image_dims, int[] options, "
@@ -336,7 +336,7 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
   m.def(
       "hexplane_deltas(Tensor[] spaces, Tensor coordinates, Tensor? order, Tensor time, Tensor[] time_planes, Tensor[] weights, "
       "Tensor[] biases) -> Tensor");
-  // Training of the whole field without autograd, CUDA only; ops/hexplane_training/hexplane_training.py documents the
+  // Training of the whole field without autograd, CUDA only; ops/hexplane_training/__init__.py documents the
   // lists. `state` is the tensors that hexplane_train returns after the deltas. `gradient` is the tensors that its backward
   // pass returns after the network's gradient, plus starts.
   m.def(
@@ -355,7 +355,7 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "Tensor? status, float beta1, float beta2, float epsilon) -> ()");
 
   // Random samples of splats without sorting: adds red, green, blue, hits and z of each pixel to `sums` [H, W, 5].
-  // ops/stochastic/stochastic.py documents the lists.
+  // ops/stochastic/__init__.py documents the lists.
   m.def("splat_samples_(Tensor?[] scene, Tensor viewmat, Tensor intrinsics, Tensor(a!) sums, int[] options) -> ()");
   // `count` Poisson draws for each of the rates (float64 [R]), as int64 [R, count].
   m.def("poisson_draws(Tensor rates, int count, int seed) -> Tensor");

@@ -20,7 +20,7 @@ def adam_step(
     epsilon: float = 1e-8,
     row_size: int = 1,
 ) -> int:
-    """Take one step of Adam (Kingma and Ba 2015, algorithm 1); see `gsplat_core.ops.adam.adam.adam_step`."""
+    """Take one step of Adam (Kingma and Ba 2015, algorithm 1); see `gsplat_core.ops.adam.adam_step`."""
     beta1, beta2 = betas
     usable = gradient.square().isfinite().reshape(-1, row_size).all(dim=1, keepdim=True)
     keep = usable.expand(-1, row_size).reshape(gradient.shape)

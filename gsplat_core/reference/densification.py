@@ -1,4 +1,4 @@
-"""Updates of strategies in plain torch, any floating dtype; see `gsplat_core.ops.densification.densification`."""
+"""Updates of strategies in plain torch, any floating dtype; see `gsplat_core.ops.densification`."""
 
 from __future__ import annotations
 

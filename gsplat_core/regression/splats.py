@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gsplat_core.ops.splat_regression.splat_regression import check_splats, splat_regression
+from gsplat_core.ops.splat_regression import check_splats, splat_regression
 
 SMALLEST_MASS = 1e-4
 """Lower bound of the mass that gradients are divided by, relative to the largest mass."""

@@ -34,7 +34,7 @@ from gsplat_core.ops.frame.frame import (
     View,
     render_frame,
 )
-from gsplat_core.ops.scalars.scalars import store_scalars_
+from gsplat_core.ops.scalars import store_scalars_
 from gsplat_core.rendering.rasterization import RenderOutput
 from gsplat_core.rendering.renderer import Precision, check_background, check_camera
 from gsplat_core.scene.cameras import Camera

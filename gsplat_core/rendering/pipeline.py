@@ -39,7 +39,7 @@ from gsplat_core.rendering.settings import (
 )
 
 if TYPE_CHECKING:
-    from gsplat_core.ops.rasterization.rasterization import Rasterized
+    from gsplat_core.ops.rasterization import Rasterized
     from gsplat_core.rendering.single_call import SingleCall
 
 

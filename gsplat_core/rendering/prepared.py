@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gsplat_core.ops.covariance.covariance import quat_scale_to_covar_preci
-from gsplat_core.ops.stochastic.stochastic import CHUNK, CHUNK_FLOATS, COLOUR_CHUNK, SplatScene
+from gsplat_core.ops.covariance import quat_scale_to_covar_preci
+from gsplat_core.ops.stochastic import CHUNK, CHUNK_FLOATS, COLOUR_CHUNK, SplatScene
 from gsplat_core.scene.gaussians import Gaussians
 
 ALPHA_CUTOFF = 1.0 / 255.0

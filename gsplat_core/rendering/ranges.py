@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gsplat_core.ops.range_histogram.range_histogram import Bins, range_histogram
-from gsplat_core.ops.splat_rays.splat_rays import splat_rays
+from gsplat_core.ops.range_histogram import Bins, range_histogram
+from gsplat_core.ops.splat_rays import splat_rays
 from gsplat_core.ops.tiles.grid import TileGrid
 from gsplat_core.ops.tiles.tiles import bin_splats
 from gsplat_core.rendering.flow import projected

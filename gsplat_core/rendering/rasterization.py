@@ -13,11 +13,11 @@ import torch
 from torch import Tensor
 
 from gsplat_core.argument_checks import require_shape
-from gsplat_core.ops.compositing.compositing import rasterize_to_pixels
+from gsplat_core.ops.compositing import rasterize_to_pixels
 from gsplat_core.ops.frame.frame import STATUS_NEEDED, STATUS_OVERFLOW, View, render_frame
-from gsplat_core.ops.packed_projection.packed_projection import values_of_rows, visible_harmonics
+from gsplat_core.ops.packed_projection import values_of_rows, visible_harmonics
 from gsplat_core.ops.projection.projection import fully_fused_projection
-from gsplat_core.ops.spherical_harmonics.spherical_harmonics import spherical_harmonics
+from gsplat_core.ops.spherical_harmonics import spherical_harmonics
 from gsplat_core.ops.tiles.tiles import bin_splats
 from gsplat_core.rendering.pipeline import Operations
 from gsplat_core.rendering.settings import Arguments, RenderSettings
@@ -31,13 +31,13 @@ __all__ = ["RenderOutput", "rasterization", "render"]
 
 def _splat_rays(*arguments: Any) -> tuple[Tensor, Tensor]:
     # The op is loaded when it is first needed, so that pictures alone do not depend on it.
-    from gsplat_core.ops.splat_rays.splat_rays import splat_rays
+    from gsplat_core.ops.splat_rays import splat_rays
 
     return splat_rays(*arguments)
 
 
 def _blend_rays(*arguments: Any, **options: Any) -> tuple[Tensor, ...]:
-    from gsplat_core.ops.ray_blending.ray_blending import blend_rays
+    from gsplat_core.ops.ray_blending import blend_rays
 
     return blend_rays(*arguments, **options)
 

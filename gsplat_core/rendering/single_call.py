@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.ops.native import CUDA_MISSING
-from gsplat_core.ops.rasterization.rasterization import (
+from gsplat_core.ops.rasterization import (
     DEPTH_SUM,
     EXPECTED_DEPTH,
     MOST_PIXELS,
@@ -20,7 +20,7 @@ from gsplat_core.ops.rasterization.rasterization import (
     View,
     rasterize,
 )
-from gsplat_core.ops.rasterization.rasterization import TILE_SIZE as NATIVE_TILE_SIZE
+from gsplat_core.ops.rasterization import TILE_SIZE as NATIVE_TILE_SIZE
 from gsplat_core.rendering.pipeline import camera_centers
 from gsplat_core.rendering.settings import PLAIN_TENSORS, Arguments, RenderSettings, is_transformed
 from gsplat_core.scene.cameras import CAMERA_MODELS

@@ -12,7 +12,7 @@ from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.models.model import Model
 from gsplat_core.models.snapshots import Snapshot
 from gsplat_core.ops.native import CUDA_MISSING
-from gsplat_core.ops.stochastic.stochastic import Method, SplatScene, new_sums, picture_of, sample_splats
+from gsplat_core.ops.stochastic import Method, SplatScene, new_sums, picture_of, sample_splats
 from gsplat_core.rendering.prepared import prepared_splats, quantised_splats, raw_splats
 from gsplat_core.rendering.renderer import (
     PROGRESSIVE_SAMPLES,

@@ -25,7 +25,7 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 
 if TYPE_CHECKING:
-    from gsplat_core.ops.ray_blending.ray_blending import BlendedRays
+    from gsplat_core.ops.ray_blending import BlendedRays
 
 COVERED = 0.1
 """Minimum opacity of an observed pixel."""
@@ -102,8 +102,8 @@ def blend_view_rays(
         The rays, and the required capacity, int64 [1]; None without `capacity`.
     """
     # The compiled ops are loaded when they are first needed, so that pictures alone do not depend on them.
-    from gsplat_core.ops.ray_blending.ray_blending import MAX_CHANNELS, blend_rays
-    from gsplat_core.ops.splat_rays.splat_rays import splat_rays
+    from gsplat_core.ops.ray_blending import MAX_CHANNELS, blend_rays
+    from gsplat_core.ops.splat_rays import splat_rays
 
     scales, opacities = gaussians.scales, gaussians.opacities
     means2d, conics, *lists, needed = _projected(gaussians, scales, opacities, view, capacity)
@@ -143,7 +143,7 @@ def _projected(
 @torch.no_grad()
 def contribution(gaussians: Gaussians, cameras: Iterable[Camera]) -> Tensor:
     """Return the largest blending weight [N] of each Gaussian over all pixels of all views; 0 if it is in none."""
-    from gsplat_core.ops.ray_blending.ray_blending import splat_contributions
+    from gsplat_core.ops.ray_blending import splat_contributions
 
     scales, opacities = gaussians.scales, gaussians.opacities
     most = torch.zeros_like(opacities)

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.surfel_blending.surfel_blending import rasterize_to_pixels_2dgs
+from gsplat_core.ops.surfel_blending import rasterize_to_pixels_2dgs
 from gsplat_core.ops.surfel_projection.arguments import (
     DenseSurfels,
     PackedSurfels,

@@ -20,10 +20,10 @@ from gsplat_core.models.model import Model
 from gsplat_core.models.snapshots import Snapshot
 from gsplat_core.ops.projection.arguments import DenseProjection
 from gsplat_core.ops.projection.projection import fully_fused_projection
-from gsplat_core.ops.spherical_harmonics.spherical_harmonics import spherical_harmonics
+from gsplat_core.ops.spherical_harmonics import spherical_harmonics
 from gsplat_core.ops.tiles.grid import TileGrid
 from gsplat_core.ops.tiles.tiles import bin_splats
-from gsplat_core.ops.weighted_sum.weighted_sum import weighted_sums
+from gsplat_core.ops.weighted_sum import weighted_sums
 from gsplat_core.rendering.rasterization import RenderOutput
 from gsplat_core.rendering.renderer import (
     STANDARD_OUTPUTS,

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.ssim.ssim import ssim_map
+from gsplat_core.ops.ssim import ssim_map
 
 ImageLike: TypeAlias = NDArray[np.generic] | Tensor
 """RGB [H, W, 3], uint8 or floats in 0..1."""

@@ -33,7 +33,7 @@ def test_every_listed_file_is_there(listed):
 
 def test_the_ops_folder_has_no_other_kind_of_file(listed):
     folder = ROOT / "gsplat_core" / "ops" / OP
-    names = {path.name for path in folder.iterdir() if path.is_file()} - {"__init__.py"}
+    names = {path.name for path in folder.iterdir() if path.is_file()}
     assert names == {Path(name).name for name in listed if f"ops/{OP}/" in name and "tests" not in name}
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled op
 from gsplat_core.ops.image_loss.result import ImageLoss
-from gsplat_core.ops.ssim.ssim import MAX_CHANNELS
+from gsplat_core.ops.ssim import MAX_CHANNELS
 
 STEEP_AS_L1 = 0.01
 """Difference at which the squared error has the slope of L1; `kSteepAsL1` of `image_loss.h`."""

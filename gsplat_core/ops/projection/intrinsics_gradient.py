@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gsplat_core.ops.covariance.covariance import quat_scale_to_covar_preci
+from gsplat_core.ops.covariance import quat_scale_to_covar_preci
 from gsplat_core.ops.projection.arguments import FOV_MARGIN
 
 NEAR_AXIS = 0.0625

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gsplat_core.argument_checks import require_float32
 from gsplat_core.ops import native  # noqa: F401  registers the compiled op
-from gsplat_core.ops.packed_projection.packed_projection import project_visible
+from gsplat_core.ops.packed_projection import project_visible
 from gsplat_core.ops.projection.arguments import (
     COMPENSATION_FLOOR,
     DenseProjection,

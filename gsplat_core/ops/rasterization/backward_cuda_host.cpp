@@ -13,7 +13,7 @@ Sizes sizes_of(const Tensor& t) {
   return sizes;
 }
 
-// Indices of the tensors that the forward pass saves for the gradient. `Saved` in rasterization.py has the same order.
+// Indices of the tensors that the forward pass saves for the gradient. `Saved` in __init__.py has the same order.
 enum SavedTensor { kRecords, kConics, kOffsets, kSplatIds, kSorted, kStarts, kRowOf, kBehind, kAlphas, kExpected, kLast, kSaved };
 
 // Return the gradients of the splats' records and of means2d, and the sums of |dL/dmeans2d|, which are empty unless

@@ -9,7 +9,7 @@ namespace gsplat::rasterization {
 constexpr int64_t kMostInts = (int64_t(1) << 31) - 1;
 enum DepthMode : int64_t { kNoDepth = 0, kDepthSum = 1, kExpectedDepth = 2 };
 
-// Indices into the tensor lists that the ops receive. `Inputs` and `View` in rasterization.py have the same order.
+// Indices into the tensor lists that the ops receive. `Inputs` and `View` in __init__.py have the same order.
 enum Input { kMeans, kCovars, kQuats, kScales, kOpacities, kColors, kViewmats, kIntrinsics, kCenters, kBackgrounds, kInputs };
 enum Option {
   kWidth,

@@ -2,7 +2,7 @@
 // interface between the host code and the kernels of both devices.
 //
 // The density of a splat along a ray is highest at t = (z + n.d) / (1 + l.d + d'M d), where d is the offset in pixels from
-// the splat's mean to the pixel (ray_blending.py). The depth t is limited to z +- reach.
+// the splat's mean to the pixel (__init__.py). The depth t is limited to z +- reach.
 #pragma once
 
 #include <cstdint>

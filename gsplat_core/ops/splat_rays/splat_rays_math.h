@@ -1,4 +1,4 @@
-// Ray coefficients and normal of one Gaussian per lane, and their gradient (splat_rays.py states the formula).
+// Ray coefficients and normal of one Gaussian per lane, and their gradient (__init__.py states the formula).
 #pragma once
 
 #include "../covariance/covariance_math.h"

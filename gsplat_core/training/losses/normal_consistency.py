@@ -6,7 +6,7 @@ from typing import ClassVar
 
 from torch import Tensor
 
-from gsplat_core.ops.ray_losses.ray_losses import ray_normal_loss
+from gsplat_core.ops.ray_losses import ray_normal_loss
 from gsplat_core.training.losses.rendered_rays import RenderedRays
 
 

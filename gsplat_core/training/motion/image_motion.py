@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gsplat_core.ops.surface_motion.surface_motion import surface_motion
+from gsplat_core.ops.surface_motion import surface_motion
 from gsplat_core.scene.cameras import Camera
 
 Flow: TypeAlias = NDArray[np.float32]

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from gsplat_core.depth.maps import possible_depth
 from gsplat_core.depth.plane_fits import filled_depth
-from gsplat_core.ops.surface_motion.surface_motion import surface_path
+from gsplat_core.ops.surface_motion import surface_path
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.threads import usable_cores

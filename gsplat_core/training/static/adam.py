@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsplat_core.ops.adam.adam import adam_step_queued
+from gsplat_core.ops.adam import adam_step_queued
 
 
 class CompiledAdam(torch.optim.Optimizer):

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.deformation.kinds import CapturedTraining
-from gsplat_core.ops.adam.adam import adam_step_at_
+from gsplat_core.ops.adam import adam_step_at_
 from gsplat_core.ops.frame.frame import (
     GAUSSIAN_TENSORS,
     STATUS_NEEDED,

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.adam.adam import adam_step_queued
+from gsplat_core.ops.adam import adam_step_queued
 from gsplat_core.scene.rows import RowMoves
 
 

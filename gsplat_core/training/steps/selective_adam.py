@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.adam.adam import adam_step_queued
+from gsplat_core.ops.adam import adam_step_queued
 
 NO_BIAS_CORRECTION = 1 << 40
 """Step number at which Adam's corrections of the first steps have ended."""

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn import Parameter
 
-from gsplat_core.ops.densification.densification import diffuse_positions_
+from gsplat_core.ops.densification import diffuse_positions_
 from gsplat_core.training.strategies.relocation import compute_relocation
 from gsplat_core.training.strategies.strategy import InvalidParameters, Optimizers, Params
 

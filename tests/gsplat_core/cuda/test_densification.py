@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from gsplat_core import reference
-from gsplat_core.ops.densification.densification import accumulate_gradient_norms_, diffuse_positions_
+from gsplat_core.ops.densification import accumulate_gradient_norms_, diffuse_positions_
 
 NOISE = (0.7, 0.01, 100.0)
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from gsplat_core.ops.disparity_fit.disparity_fit import fit_disparities
-from gsplat_core.ops.stereo_matching.stereo_matching import UNKNOWN, match_disparities
+from gsplat_core.ops.disparity_fit import fit_disparities
+from gsplat_core.ops.stereo_matching import UNKNOWN, match_disparities
 from tests.gsplat_core.ops.stereo_cases import every_case, pair
 from tests.gsplat_core.ops.test_disparity_fit import check_against_reference
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gsplat_core.ops.edge_aware_filter.edge_aware_filter import smooth_within_edges
+from gsplat_core.ops.edge_aware_filter import smooth_within_edges
 from tests.gsplat_core.ops.test_edge_aware_filter import SHAPES, case, check_against_reference
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gsplat_core import Camera, reference
-from gsplat_core.ops.flow_blending.flow_blending import blend_flow, intrinsics_of
+from gsplat_core.ops.flow_blending import blend_flow, intrinsics_of
 from tests.gsplat_core.ops.flow_scenes import AFTER, BEFORE, FlowScene, flow_scene
 
 

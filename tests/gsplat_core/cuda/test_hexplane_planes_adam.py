@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from gsplat_core.ops.frame.frame import STATUS_OVERFLOW
-from gsplat_core.ops.hexplane_training.hexplane_training import AdamOnDevice, Penalties, hexplane_planes_adam_
+from gsplat_core.ops.hexplane_training import AdamOnDevice, Penalties, hexplane_planes_adam_
 from gsplat_core.reference import plane_penalties
 from gsplat_core.reference.adam import adam_step
 from tests.gsplat_core.cuda.hexplane_cases import Case

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.hexplane_training.hexplane_training import (
+from gsplat_core.ops.hexplane_training import (
     AdamOnDevice,
     Penalties,
     hexplane_planes_adam_,

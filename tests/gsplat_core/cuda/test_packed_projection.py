@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gsplat_core import fully_fused_projection, rasterization
-from gsplat_core.ops.packed_projection.packed_projection import values_of_rows, visible_harmonics
+from gsplat_core.ops.packed_projection import values_of_rows, visible_harmonics
 from gsplat_core.ops.projection.arguments import Pairs
 
 LEAVES = ("means", "quats", "scales", "viewmats")

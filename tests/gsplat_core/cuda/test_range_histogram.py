@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gsplat_core.ops.range_histogram.range_histogram import Bins
+from gsplat_core.ops.range_histogram import Bins
 from tests.gsplat_core.ops.range_scenes import BINS, TENSORS, assert_close, pixel_factors, run
 from tests.gsplat_core.ops.ray_scenes import ray_scene
 

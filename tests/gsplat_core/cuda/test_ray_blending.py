@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from gsplat_core.ops.ray_blending.ray_blending import MAX_CHANNELS, blend_rays, splat_contributions
+from gsplat_core.ops.ray_blending import MAX_CHANNELS, blend_rays, splat_contributions
 from tests.gsplat_core.ops.ray_scenes import INPUTS, assert_close, exact_contributions, ray_scene, with_bad_values
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gsplat_core.ops.ray_losses.ray_losses import ray_depth_loss, ray_normal_loss
+from gsplat_core.ops.ray_losses import ray_depth_loss, ray_normal_loss
 from tests.gsplat_core.ops.ray_planes import compared, planes
 
 

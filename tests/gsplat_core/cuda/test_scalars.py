@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gsplat_core import InvalidInput
-from gsplat_core.ops.scalars.scalars import MOST_SCALARS, store_scalars_
+from gsplat_core.ops.scalars import MOST_SCALARS, store_scalars_
 
 
 @pytest.mark.parametrize("count", [0, 1, 26, MOST_SCALARS])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gsplat_core.ops.splat_rays.splat_rays import splat_rays
+from gsplat_core.ops.splat_rays import splat_rays
 from tests.gsplat_core.ops.ray_scenes import gaussians, intrinsics, splat_results
 
 

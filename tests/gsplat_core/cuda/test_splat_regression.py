@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gsplat_core import reference
-from gsplat_core.ops.splat_regression.splat_regression import splat_regression
+from gsplat_core.ops.splat_regression import splat_regression
 
 
 def scene(points, splats, dims, channels, seed=1):

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gsplat_core import reference
-from gsplat_core.ops.ssim.ssim import ssim_map
+from gsplat_core.ops.ssim import ssim_map
 
 SHAPES = [
     (1, 1, 3),

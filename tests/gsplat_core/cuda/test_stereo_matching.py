@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gsplat_core.ops.stereo_matching.stereo_matching import match_disparities
+from gsplat_core.ops.stereo_matching import match_disparities
 from tests.gsplat_core.ops.stereo_cases import every_case, pair
 
 

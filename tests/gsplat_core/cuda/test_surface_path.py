@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gsplat_core.ops.surface_motion.surface_motion import surface_path
+from gsplat_core.ops.surface_motion import surface_path
 from tests.gsplat_core.ops.test_surface_motion import exact_path, path_scene
 
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core import reference
-from gsplat_core.ops.range_histogram.range_histogram import Bins, range_histogram
+from gsplat_core.ops.range_histogram import Bins, range_histogram
 from tests.gsplat_core.ops.ray_scenes import RayScene
 
 TENSORS = ("means2d", "conics", "opacities", "rays")

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core import reference
-from gsplat_core.ops.ray_losses.ray_losses import ray_depth_loss, ray_normal_loss
+from gsplat_core.ops.ray_losses import ray_depth_loss, ray_normal_loss
 
 
 def planes(size: tuple[int, int], dtype: torch.dtype = torch.float32) -> tuple[Tensor, ...]:

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from gsplat_core import reference
-from gsplat_core.ops.ray_blending.ray_blending import blend_rays
-from gsplat_core.ops.splat_rays.splat_rays import splat_rays
+from gsplat_core.ops.ray_blending import blend_rays
+from gsplat_core.ops.splat_rays import splat_rays
 from gsplat_core.ops.tiles.grid import TileGrid
 from gsplat_core.ops.tiles.tiles import bin_splats
 

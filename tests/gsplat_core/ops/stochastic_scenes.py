@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from gsplat_core.ops.stochastic.stochastic import SplatScene, new_sums, sample_splats
+from gsplat_core.ops.stochastic import SplatScene, new_sums, sample_splats
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 

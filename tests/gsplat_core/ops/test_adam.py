@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.adam.adam import adam_step, adam_step_at_
+from gsplat_core.ops.adam import adam_step, adam_step_at_
 from gsplat_core.reference.adam import adam_step as reference_adam_step
 
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.compositing.compositing import rasterize_to_pixels
+from gsplat_core.ops.compositing import rasterize_to_pixels
 from gsplat_core.reference import compositing as reference
 from tests.gsplat_core.ops.compositing_scenes import Scene, assert_close, scene
 

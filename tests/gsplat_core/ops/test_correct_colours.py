@@ -7,8 +7,8 @@ import torch
 
 from gsplat_core import reference
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.compositing.compositing import rasterize_to_pixels
-from gsplat_core.ops.correct_colours.correct_colours import correct_colours
+from gsplat_core.ops.compositing import rasterize_to_pixels
+from gsplat_core.ops.correct_colours import correct_colours
 from tests.gsplat_core.ops.ray_scenes import RayScene, ray_scene, with_bad_values
 
 OPTIONS = dict(relaxation=1.5, least_weight=0.3)

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gsplat_core import InvalidInput, reference
-from gsplat_core.ops.densification.densification import accumulate_gradient_norms_, diffuse_positions_
+from gsplat_core.ops.densification import accumulate_gradient_norms_, diffuse_positions_
 
 
 def screen(images, count, seed=0):

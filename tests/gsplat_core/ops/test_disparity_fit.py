@@ -5,8 +5,8 @@ import torch
 
 from gsplat_core import reference
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.disparity_fit.disparity_fit import fit_disparities
-from gsplat_core.ops.stereo_matching.stereo_matching import UNKNOWN, match_disparities
+from gsplat_core.ops.disparity_fit import fit_disparities
+from gsplat_core.ops.stereo_matching import UNKNOWN, match_disparities
 from tests.gsplat_core.ops.stereo_cases import SHIFT_PX, every_case, pair
 
 

@@ -5,7 +5,7 @@ import torch
 
 from gsplat_core import reference
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.edge_aware_filter.edge_aware_filter import smooth_within_edges
+from gsplat_core.ops.edge_aware_filter import smooth_within_edges
 
 # planes, height, width, channels of the guide (0: [H, W])
 SHAPES = [(1, 1, 1, 0), (1, 1, 40, 3), (2, 40, 1, 1), (2, 17, 33, 3), (3, 65, 16, 4), (1, 100, 129, 3), (2, 3, 1100, 0)]

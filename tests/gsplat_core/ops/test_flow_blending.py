@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core import Camera, InvalidInput, reference
-from gsplat_core.ops.flow_blending.flow_blending import blend_flow, intrinsics_of
+from gsplat_core.ops.flow_blending import blend_flow, intrinsics_of
 from tests.gsplat_core.ops.flow_scenes import AFTER, BEFORE, FlowScene, flow_scene
 
 

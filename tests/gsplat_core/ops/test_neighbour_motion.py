@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gsplat_core import Gaussians, InvalidInput
-from gsplat_core.ops.neighbour_motion.neighbour_motion import neighbour_motion
+from gsplat_core.ops.neighbour_motion import neighbour_motion
 from gsplat_core.rendering.flow import STIFFNESS, deformation_gradients
 
 

@@ -9,7 +9,7 @@ import torch
 
 from gsplat_core import reference
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.range_histogram.range_histogram import Bins, range_histogram
+from gsplat_core.ops.range_histogram import Bins, range_histogram
 from tests.gsplat_core.ops.range_scenes import BINS, TENSORS, assert_close, pixel_factors, run
 from tests.gsplat_core.ops.ray_scenes import ray_scene, with_bad_values
 

@@ -10,7 +10,7 @@ import torch
 
 from gsplat_core import reference
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.ray_blending.ray_blending import MAX_CHANNELS, blend_rays, splat_contributions
+from gsplat_core.ops.ray_blending import MAX_CHANNELS, blend_rays, splat_contributions
 from tests.gsplat_core.ops.ray_scenes import INPUTS, assert_close, exact_contributions, ray_scene, with_bad_values
 
 

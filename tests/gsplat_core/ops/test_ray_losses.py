@@ -7,7 +7,7 @@ import torch
 
 from gsplat_core import reference
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.ray_losses.ray_losses import ray_depth_loss, ray_normal_loss
+from gsplat_core.ops.ray_losses import ray_depth_loss, ray_normal_loss
 from tests.gsplat_core.ops.ray_planes import compared, planes
 
 SIZES = [(37, 45), (3, 3), (5, 2), (1, 1), (2, 9), (0, 7), (70, 130)]

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gsplat_core import InvalidInput, reference
-from gsplat_core.ops.splat_regression.splat_regression import splat_regression
+from gsplat_core.ops.splat_regression import splat_regression
 
 
 def scene(points=60, splats=7, dims=2, channels=3, dtype=torch.float32):

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.ssim.ssim import fused_ssim, ssim_map
+from gsplat_core.ops.ssim import fused_ssim, ssim_map
 from gsplat_core.reference.ssim import gaussian_window
 from gsplat_core.reference.ssim import ssim_map as reference_ssim_map
 

@@ -5,7 +5,7 @@ import torch
 
 from gsplat_core import reference
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.stereo_matching.stereo_matching import UNKNOWN, match_disparities
+from gsplat_core.ops.stereo_matching import UNKNOWN, match_disparities
 from tests.gsplat_core.ops.stereo_cases import SHIFT_PX, every_case, pair
 
 

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from gsplat_core import InvalidInput
-from gsplat_core.ops.covariance.covariance import quat_scale_to_covar_preci
-from gsplat_core.ops.stochastic.stochastic import SplatScene, new_sums, picture_of, sample_splats
+from gsplat_core.ops.covariance import quat_scale_to_covar_preci
+from gsplat_core.ops.stochastic import SplatScene, new_sums, picture_of, sample_splats
 from gsplat_core.reference.points import dilogarithm, point_moments
 from gsplat_core.reference.rendering import rasterization
 from gsplat_core.reference.stochastic import sample_moments

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.surface_motion.surface_motion import surface_motion, surface_path
+from gsplat_core.ops.surface_motion import surface_motion, surface_path
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.training.motion.image_motion import SurfaceMotion
 

@@ -7,9 +7,12 @@ import math
 import pytest
 import torch
 
-from gsplat_core.ops.unscented_projection.compiled import CAMERA_COLUMNS, camera_rows
-from gsplat_core.ops.unscented_projection.parameters import UnscentedTransformParameters
-from gsplat_core.ops.unscented_projection.unscented_projection import fully_fused_projection_with_ut
+from gsplat_core.ops.unscented_projection import (
+    CAMERA_COLUMNS,
+    UnscentedTransformParameters,
+    camera_rows,
+    fully_fused_projection_with_ut,
+)
 from gsplat_core.poses.rolling_shutter import RollingShutterType, Shutter
 from gsplat_core.poses.se3 import exp
 from gsplat_core.scene.distortion import Lens

@@ -11,7 +11,7 @@ from gsplat_core import reference
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.tiles.grid import TileGrid
 from gsplat_core.ops.tiles.tiles import bin_splats
-from gsplat_core.ops.weighted_sum.weighted_sum import weighted_sums
+from gsplat_core.ops.weighted_sum import weighted_sums
 
 NAMES = ("means2d", "conics", "channels", "opacities", "weights")
 

@@ -10,8 +10,8 @@ import torch
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.tiles.grid import TileGrid
 from gsplat_core.ops.tiles.tiles import bin_splats
-from gsplat_core.ops.unscented_projection.unscented_projection import fully_fused_projection_with_ut
-from gsplat_core.ops.world_blending.world_blending import rasterize_to_pixels_eval3d
+from gsplat_core.ops.unscented_projection import fully_fused_projection_with_ut
+from gsplat_core.ops.world_blending import rasterize_to_pixels_eval3d
 from gsplat_core.poses.rolling_shutter import RollingShutterType
 from gsplat_core.poses.se3 import exp
 from gsplat_core.reference.compositing import rasterize_to_pixels
@@ -117,14 +117,14 @@ def test_gradients_of_all_tensors_in_double_precision(kind):
 
 
 def test_long_lists_end_at_low_transmittance_and_masked_tiles_show_the_background(monkeypatch):
-    from gsplat_core.ops.world_blending import plain_torch
+    from gsplat_core.ops import world_blending
 
     given, colors = small_scene(40, size=0.4)
     given["opacities"] = torch.full((40,), 0.9, dtype=torch.float64)
     _, offsets, ids = lists(given)
     image, alphas = blend(given, colors, offsets, ids)
     assert 0.999 < alphas.max() < 1 - 1e-4
-    monkeypatch.setattr(plain_torch, "PAIRS_AT_A_TIME", 1)
+    monkeypatch.setattr(world_blending, "PAIRS_AT_A_TIME", 1)
     again = blend(given, colors, offsets, ids)
     torch.testing.assert_close(again[0], image)
     masks = torch.ones(1, 2, 3, dtype=torch.bool)
@@ -240,7 +240,6 @@ def test_the_compiled_op_refuses_lists_out_of_range():
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor:UserWarning")  # read by opcheck itself
 def test_opcheck():
-    from gsplat_core.ops.world_blending import compiled  # noqa: F401  registers the gradients
 
     given, colors = small_scene(5)
     _, offsets, ids = lists(given)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gsplat_core.ops.rasterization.rasterization import Rasterized
+from gsplat_core.ops.rasterization import Rasterized
 from gsplat_core.rendering import single_call
 from gsplat_core.rendering.settings import Arguments, RenderSettings
 from gsplat_core.rendering.single_call import FEWEST_RESERVED_ENTRIES, MOST_RESERVED_ENTRIES, SingleCall, next_capacity

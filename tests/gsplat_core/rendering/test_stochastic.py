@@ -11,7 +11,7 @@ import torch
 from gsplat_core.deformation import new_field
 from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.models.model import Model
-from gsplat_core.ops.stochastic.stochastic import new_sums, picture_of, sample_splats
+from gsplat_core.ops.stochastic import new_sums, picture_of, sample_splats
 from gsplat_core.rendering.prepared import dequantised, morton_codes, prepared_splats, quantised_splats, raw_splats
 from gsplat_core.rendering.registry import new_renderer
 from gsplat_core.rendering.renderer import RendererOptions
