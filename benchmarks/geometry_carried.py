@@ -19,7 +19,7 @@ import numpy as np
 from gsplat_core.evaluation.views import seen_by_both
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.io.recordings.truth import open_truth
-from gsplat_core.scene.projection import inverse, moved, pixels_of, points_of
+from gsplat_core.scene.cameras import inverse, moved, pixels_of, points_of
 
 
 def main() -> None:

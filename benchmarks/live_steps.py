@@ -24,7 +24,7 @@ import numpy as np
 import torch
 
 from gsplat_core.io.recordings import open_recording
-from gsplat_core.rendering.registry import new_renderer
+from gsplat_core.rendering.renderer import new_renderer
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.budget import Budget

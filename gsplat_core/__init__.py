@@ -10,6 +10,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from gsplat_core.choices import RENDERERS
     from gsplat_core.deformation import DeformationField
     from gsplat_core.errors import CoreError, InvalidInput
     from gsplat_core.io.bundle import load_bundle, save_bundle
@@ -37,11 +38,9 @@ if TYPE_CHECKING:
     from gsplat_core.ops.world_blending import rasterize_to_pixels_eval3d
     from gsplat_core.poses.rolling_shutter import RollingShutterType
     from gsplat_core.rendering.frame_renderer import FrameRenderer
-    from gsplat_core.rendering.inria import rasterization_inria_wrapper
     from gsplat_core.rendering.rasterization import RenderOutput, rasterization, render
-    from gsplat_core.rendering.rasterizer import Rasterizer
-    from gsplat_core.rendering.registry import RENDERERS, new_renderer
-    from gsplat_core.rendering.renderer import Renderer
+    from gsplat_core.rendering.rasterizer import Rasterizer, rasterization_inria_wrapper
+    from gsplat_core.rendering.renderer import Renderer, new_renderer
     from gsplat_core.rendering.surfels import rasterization_2dgs, rasterization_2dgs_inria_wrapper
     from gsplat_core.scene.cameras import Camera
     from gsplat_core.scene.collection import GaussianCollection
@@ -50,7 +49,7 @@ if TYPE_CHECKING:
     from gsplat_core.scene.gaussians import Gaussians
     from gsplat_core.training.config import ReconstructorConfig
     from gsplat_core.training.reconstructor import Reconstructor
-    from gsplat_core.training.steps.selective_adam import SelectiveAdam
+    from gsplat_core.training.steps.optimiser import SelectiveAdam
     from gsplat_core.training.strategies.adc import DefaultStrategy
     from gsplat_core.training.strategies.mcmc import MCMCStrategy
     from gsplat_core.training.strategies.strategy import Strategy
@@ -116,7 +115,7 @@ __all__ = [
 ]
 
 _HOME = {
-    "RENDERERS": "rendering.registry",
+    "RENDERERS": "choices",
     "Camera": "scene.cameras",
     "CoreError": "errors",
     "DefaultStrategy": "training.strategies.adc",
@@ -138,7 +137,7 @@ _HOME = {
     "RenderOutput": "rendering.rasterization",
     "Renderer": "rendering.renderer",
     "RollingShutterType": "poses.rolling_shutter",
-    "SelectiveAdam": "training.steps.selective_adam",
+    "SelectiveAdam": "training.steps.optimiser",
     "Snapshot": "models.snapshots",
     "SnapshotSlots": "models.snapshots",
     "Strategy": "training.strategies.strategy",
@@ -154,14 +153,14 @@ _HOME = {
     "isect_tiles": "ops.tiles.tiles",
     "load_bundle": "io.bundle",
     "load_ply": "io.ply",
-    "new_renderer": "rendering.registry",
+    "new_renderer": "rendering.renderer",
     "open_recording": "io.recordings",
     "proj": "ops.projection.separate_steps",
     "quat_scale_to_covar_preci": "ops.covariance",
     "rasterization": "rendering.rasterization",
     "rasterization_2dgs": "rendering.surfels",
     "rasterization_2dgs_inria_wrapper": "rendering.surfels",
-    "rasterization_inria_wrapper": "rendering.inria",
+    "rasterization_inria_wrapper": "rendering.rasterizer",
     "rasterize_to_indices_in_range": "ops.compositing",
     "rasterize_to_indices_in_range_2dgs": "ops.surfel_blending",
     "rasterize_to_pixels": "ops.compositing",

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from gsplat_core.rendering.renderer import RendererKind
     from gsplat_core.scene.range_sensors import RangeSensor
     from gsplat_core.training.losses.loss import LossKind
-    from gsplat_core.training.strategies.scene import StrategyKind
+    from gsplat_core.training.strategies.strategy import StrategyKind
 
 FIELDS: Registry[FieldKind[Any]] = Registry(
     "deformation field",

@@ -12,10 +12,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from gsplat_core.choices import RENDERERS
 from gsplat_core.models.model import Model
 from gsplat_core.models.snapshots import Snapshot
-from gsplat_core.rendering.registry import RENDERERS, new_renderer
-from gsplat_core.rendering.renderer import STANDARD_OUTPUTS, Renderer, RendererOptions, standard_outputs
+from gsplat_core.rendering.renderer import STANDARD_OUTPUTS, Renderer, RendererOptions, new_renderer, standard_outputs
 from gsplat_core.scene.frames import Frame
 from gsplat_core.transfers import HostCopy
 from operators.graph import Operator, OperatorSpec
@@ -79,7 +79,7 @@ class Rasterizer:
         """Create the operator for one renderer.
 
         Args:
-            renderer: name in `gsplat_core.rendering.registry.RENDERERS`.
+            renderer: name in `gsplat_core.choices.RENDERERS`.
             options: options of the renderer; None for its defaults.
             outputs: outputs in addition to the standard ones.
         """
@@ -162,7 +162,7 @@ class RasterizeOp(Operator):
         predicted: `Prediction` for each frame, if `predict_every` is set; its image may be None.
 
     Params:
-        renderer: name in `gsplat_core.rendering.registry.RENDERERS`.
+        renderer: name in `gsplat_core.choices.RENDERERS`.
         renderer_options: `RendererOptions`; None for the renderer's defaults.
         outputs: outputs of `RenderedFrame.outputs`.
         predict_every: predict one in this many frames; 0 disables prediction.

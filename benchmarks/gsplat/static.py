@@ -26,7 +26,7 @@ import numpy as np
 
 from gsplat_core.io.recordings.colmap import read_colmap
 from gsplat_core.training.metrics import frame_quality
-from gsplat_core.training.static.pictures import TrainingPicture, read_pictures
+from gsplat_core.training.static import TrainingPicture, read_pictures
 
 SEEDS = (0, 1, 2)
 STRATEGIES = ("adc", "mcmc")

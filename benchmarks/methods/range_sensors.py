@@ -18,13 +18,12 @@ import numpy as np
 import torch
 
 from gsplat_core.choices import SENSORS
-from gsplat_core.rendering.ranges import render_ranges
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
 from gsplat_core.scene.range_sensors import simulate_scan
 from gsplat_core.training.losses.loss import LossContext
-from gsplat_core.training.losses.ranges import RangeLoss
+from gsplat_core.training.losses.ranges import RangeLoss, render_ranges
 from gsplat_core.training.observations import Observation
 
 DISTANCE, RELIEF, BASELINE, VIEWS = 60.0, 8.0, 1.0, 8

@@ -17,8 +17,7 @@ import torch
 
 from gsplat_core import reference
 from gsplat_core.ops.splat_regression import splat_regression
-from gsplat_core.regression import FitOptions, Splats, fit
-from gsplat_core.regression.fit import adam_alone
+from gsplat_core.regression import FitOptions, Splats, adam_alone, fit
 
 SPLATS, POINTS, BUMPS = 32, 400, 6
 ADAM_RATES = (2e-2, 1e-2, 5e-3, 2.5e-3, 1e-3)

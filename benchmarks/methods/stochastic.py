@@ -29,6 +29,7 @@ from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
+from gsplat_core.choices import RENDERERS
 from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.io.bundle import load_bundle
 from gsplat_core.io.recordings import open_recording
@@ -36,10 +37,9 @@ from gsplat_core.models.model import Model, TrainedBy
 from gsplat_core.ops.stochastic import QUEUE_BYTES, Method, SplatScene, new_sums, picture_of, sample_splats
 from gsplat_core.reference.points import point_moments
 from gsplat_core.reference.stochastic import sample_moments
-from gsplat_core.rendering.prepared import dequantised, prepared_splats, quantised_splats, raw_splats
 from gsplat_core.rendering.rasterization import render
-from gsplat_core.rendering.registry import RENDERERS, new_renderer
-from gsplat_core.rendering.renderer import RendererOptions
+from gsplat_core.rendering.renderer import RendererOptions, new_renderer
+from gsplat_core.rendering.stochastic import dequantised, prepared_splats, quantised_splats, raw_splats
 from gsplat_core.rendering.weighted_sum import WeightedSumRenderer
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians

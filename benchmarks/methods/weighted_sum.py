@@ -29,7 +29,7 @@ from gsplat_core.choices import RENDERERS
 from gsplat_core.io.recordings import is_heldout, open_recording
 from gsplat_core.models.model import Model
 from gsplat_core.rendering.rasterization import RenderOutput, render
-from gsplat_core.rendering.registry import new_renderer
+from gsplat_core.rendering.renderer import new_renderer
 from gsplat_core.rendering.weighted_sum import WeightedSumRenderer
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import SH_C0, Gaussians

@@ -43,7 +43,7 @@ _RENDERING = {
     "rasterization": "gsplat_core.rendering.rasterization",
     "rasterization_2dgs": "gsplat_core.rendering.surfels",
     "rasterization_2dgs_inria_wrapper": "gsplat_core.rendering.surfels",
-    "rasterization_inria_wrapper": "gsplat_core.rendering.inria",
+    "rasterization_inria_wrapper": "gsplat_core.rendering.rasterizer",
 }
 
 MODULES: Mapping[str, Mapping[str, str]] = {
@@ -52,7 +52,7 @@ MODULES: Mapping[str, Mapping[str, str]] = {
         **_RENDERING,
         **_STRATEGIES,
         "PngCompression": "gsplat_core.io.png_compression",
-        "SelectiveAdam": "gsplat_core.training.steps.selective_adam",
+        "SelectiveAdam": "gsplat_core.training.steps.optimiser",
         "__version__": "gsplat_core.as_gsplat.names:VERSION",
         "accumulate": "gsplat_core.ops.compositing",
         "accumulate_2dgs": "gsplat_core.ops.surfel_blending",
@@ -119,10 +119,10 @@ MODULES: Mapping[str, Mapping[str, str]] = {
         "masked_ssim": _SURGICAL,
         "pearson_depth_loss": _SURGICAL,
     },
-    "gsplat.optimizers": {"SelectiveAdam": "gsplat_core.training.steps.selective_adam"},
-    "gsplat.optimizers.selective_adam": {"SelectiveAdam": "gsplat_core.training.steps.selective_adam"},
+    "gsplat.optimizers": {"SelectiveAdam": "gsplat_core.training.steps.optimiser"},
+    "gsplat.optimizers.selective_adam": {"SelectiveAdam": "gsplat_core.training.steps.optimiser"},
     "gsplat.regularizers": {"compute_tv_loss_targeted": _SURGICAL},
-    "gsplat.relocation": {"compute_relocation": "gsplat_core.training.strategies.relocation"},
+    "gsplat.relocation": {"compute_relocation": "gsplat_core.training.strategies.operations"},
     "gsplat.rendering": {
         **_RENDERING,
         **_CUDA,
@@ -137,7 +137,7 @@ MODULES: Mapping[str, Mapping[str, str]] = {
     "gsplat.strategy.ops": {
         "_multinomial_sample": _FUNCTIONS,
         "_update_param_with_optimizer": f"{_OPERATIONS}:update_rows",
-        "compute_relocation": "gsplat_core.training.strategies.relocation",
+        "compute_relocation": "gsplat_core.training.strategies.operations",
         "duplicate": _OPERATIONS,
         "inject_noise_to_position": _OPERATIONS,
         "relocate": _OPERATIONS,
@@ -148,8 +148,8 @@ MODULES: Mapping[str, Mapping[str, str]] = {
     },
     "gsplat.training": {"TwoStageScheduleStep": _SURGICAL, "TwoStageScheduler": _SURGICAL},
     "gsplat.utils": {
-        "depth_to_normal": "gsplat_core.rendering.depth_maps",
-        "depth_to_points": "gsplat_core.rendering.depth_maps",
+        "depth_to_normal": "gsplat_core.rendering.surface",
+        "depth_to_points": "gsplat_core.rendering.surface",
         "get_projection_matrix": _FUNCTIONS,
         "inverse_log_transform": _FUNCTIONS,
         "log_transform": _FUNCTIONS,

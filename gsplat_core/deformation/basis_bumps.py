@@ -15,8 +15,7 @@ from gsplat_core.deformation.continuation import ContinuedField
 from gsplat_core.deformation.field import checked_window
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.basis_field.plain_torch import BASIS_CHANNELS, BUMP_REACH
-from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.scene.rows import RowMoves
+from gsplat_core.scene.gaussians import Gaussians, RowMoves
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,7 @@ from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.native import CUDA_MISSING
-from gsplat_core.scene.gaussians import COLOUR, LOG_SCALE, OPACITY, POSITION, ROTATION, Gaussians
-from gsplat_core.scene.rows import RowMoves
+from gsplat_core.scene.gaussians import COLOUR, LOG_SCALE, OPACITY, POSITION, ROTATION, Gaussians, RowMoves
 from gsplat_core.transfers import copy_each
 
 

@@ -23,10 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.cameras import Camera, moved, pixel_rays, pixels_of
 from gsplat_core.scene.depth_origin import BELIEVED, DepthOrigin
 from gsplat_core.scene.frames import Frame
-from gsplat_core.scene.projection import moved, pixel_rays, pixels_of
 
 
 @dataclass(frozen=True)

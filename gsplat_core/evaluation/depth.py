@@ -15,10 +15,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.cameras import Camera, pixel_rays, points_of
 from gsplat_core.scene.depth_origin import BELIEVED
 from gsplat_core.scene.frames import Frame
-from gsplat_core.scene.projection import pixel_rays, points_of
 from gsplat_core.training.metrics import ScoredMean
 
 Array = NDArray[np.float64]

@@ -36,7 +36,7 @@ from gsplat_core.evaluation.trajectory import TrajectoryErrors, evaluate_traject
 from gsplat_core.evaluation.views import NovelView, Pose, Shown, ViewSums
 from gsplat_core.io.recordings.truth import GroundTruth
 from gsplat_core.models.model import Model
-from gsplat_core.rendering.registry import picture_of
+from gsplat_core.rendering.renderer import picture_of
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_origin import BELIEVED
 from gsplat_core.scene.frames import Frame

@@ -22,10 +22,9 @@ from torch import Tensor
 from gsplat_core.io.recordings.truth import MotionFiles, Tracks, TrueMotion
 from gsplat_core.models.model import Model
 from gsplat_core.rendering.rasterization import rasterization
-from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.cameras import Camera, Points, at_pixels, inverse, moved, pixel_rays, pixels_of, points_of
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.scene.projection import Points, at_pixels, inverse, moved, pixel_rays, pixels_of, points_of
 
 WITHIN_PX = (4, 8, 16, 32, 64)
 WITHIN_MM = (2, 4, 8, 16, 32)

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from gsplat_core.choices import RENDERERS
 from gsplat_core.errors import InvalidInput
 from gsplat_core.evaluation.baselines import BaselineScore
 from gsplat_core.evaluation.depth import DepthErrors, DepthSums
@@ -23,8 +24,7 @@ from gsplat_core.evaluation.scores import Entry, Record, Score, ScoreSums, finit
 from gsplat_core.io.recordings.split import is_heldout
 from gsplat_core.models.model import Model
 from gsplat_core.models.snapshots import Snapshot
-from gsplat_core.rendering.registry import RENDERERS, new_renderer
-from gsplat_core.rendering.renderer import STANDARD_OUTPUTS, Renderer, standard_outputs
+from gsplat_core.rendering.renderer import STANDARD_OUTPUTS, Renderer, new_renderer, standard_outputs
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.metrics import ScoredMean, psnr_tissue_db, psnrs_db

@@ -24,9 +24,8 @@ from gsplat_core.evaluation.baselines import BaselineScore
 from gsplat_core.evaluation.protocols import OUTSIDE, Picture
 from gsplat_core.evaluation.scores import Record, Score, ScoreSums, finite, why_left_out
 from gsplat_core.io.recordings.truth import GroundTruth
-from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.cameras import Camera, at_pixels, inverse, moved, pixel_rays, pixels_of, points_of
 from gsplat_core.scene.frames import Frame
-from gsplat_core.scene.projection import at_pixels, inverse, moved, pixel_rays, pixels_of, points_of
 from gsplat_core.training.metrics import PSNR_CAP_DB, ScoredMean
 from gsplat_core.training.right_eye import right_tissue, typical_shift
 

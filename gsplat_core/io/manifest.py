@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from gsplat_core.deformation.field import DeformationField
-from gsplat_core.deformation.registry import field_from_config, kind_of
+from gsplat_core.deformation.kinds import field_from_config, kind_of
 from gsplat_core.errors import BundleCorrupt, InvalidInput, InvalidSetting, UnknownFormatVersion
 from gsplat_core.io.json_object import JsonObject
 from gsplat_core.models.model import Model, TrainedBy

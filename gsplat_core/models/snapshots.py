@@ -22,8 +22,7 @@ from gsplat_core.errors import InvalidInput
 from gsplat_core.models.model import Model, clamp_time
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_source import DepthSource
-from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.scene.rows import inert_gaussians
+from gsplat_core.scene.gaussians import Gaussians, inert_gaussians
 from gsplat_core.transfers import copy_each
 
 ROW_STEP = 1024

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gsplat_core.rendering.depth_maps import normals_of_depth
+from gsplat_core.rendering.surface import normals_of_depth
 
 
 def ray_depth_loss(depths: Tensor, known: Tensor, tissue: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Rasterizer with fixed options, for repeated pictures of Gaussians."""
+"""Rasterizers with fixed options, for repeated pictures of Gaussians, and with the arguments of gsplat's wrapper of the INRIA trainer's renderer."""
 
 from __future__ import annotations
 
@@ -155,3 +155,32 @@ def _same_graph(kept: Gaussians, frames: FrameRenderer, gaussians: Gaussians, ca
     shape = frames.picture_shape
     same_tensors = all(a is b for a, b in zip(kept.left_tensors, gaussians.left_tensors, strict=True))
     return same_tensors and shape == (camera.width_px, camera.height_px, camera.model)
+
+
+def rasterization_inria_wrapper(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    near_plane: float = NEAR_PLANE,
+    far_plane: float = 100.0,
+    eps2d: float = EPS2D,
+    sh_degree: int | None = None,
+    backgrounds: Tensor | None = None,
+    **kwargs: Any,
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """Render with `rasterization`, as a stand-in for the renderer of the INRIA trainer, which is not part of this package.
+
+    Arguments and results are those of gsplat's function of this name: a picture, its opacities and an empty dict.
+    Further arguments are ignored, as there.
+    """
+    colours, alphas, _ = rasterization(
+        means, quats, scales, opacities, colors, viewmats, Ks, width, height, near_plane, far_plane, eps2d=eps2d,
+        sh_degree=sh_degree, packed=False, backgrounds=backgrounds,
+    )  # fmt: skip
+    return colours, alphas, {}

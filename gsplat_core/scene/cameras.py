@@ -1,16 +1,16 @@
-"""A camera: intrinsics, pose, size and projection model."""
+"""A camera: intrinsics, pose, size and projection model; projection between its pixels and points, and orbits around its target."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gsplat_core.errors import InvalidInput
+from gsplat_core.errors import InvalidInput, InvalidSetting
 
-# Imported lazily, because a process that only reads frames needs no torch and then starts three times as fast.
 if TYPE_CHECKING:
     import torch
     from torch import Tensor
@@ -165,3 +165,94 @@ class Camera:
         # Adding 0.0 gives -0.0 and 0.0 identical bytes.
         pose = self.world_to_camera + 0.0
         return (self.K + 0.0).tobytes(), pose.tobytes(), self.width_px, self.height_px, self.model
+
+
+Points = NDArray[np.float64]
+
+
+def pixel_rays(camera: Camera) -> Points:
+    """Return the rays (x/z, y/z, 1) through the pixel centres [H, W, 3]."""
+    column = (np.arange(camera.width_px) + 0.5 - camera.K[0, 2]) / camera.K[0, 0]
+    row = (np.arange(camera.height_px) + 0.5 - camera.K[1, 2]) / camera.K[1, 1]
+    x, y = np.meshgrid(column, row)
+    return np.stack([x, y, np.ones_like(x)], axis=-1)
+
+
+def points_of(camera: Camera, depth: NDArray[Any]) -> Points:
+    """Unproject a depth map z [H, W] to camera-space points [H, W, 3]."""
+    return pixel_rays(camera) * np.asarray(depth, np.float64)[..., None]
+
+
+def inverse(pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the inverse of a rigid pose [4, 4]."""
+    return np.asarray(np.linalg.inv(pose), np.float64)
+
+
+def moved(pose: NDArray[np.float64], points: Points) -> Points:
+    """Transform points [..., 3] by a rigid pose [4, 4]."""
+    return np.asarray(points @ pose[:3, :3].T + pose[:3, 3])
+
+
+def pixels_of(camera: Camera, points: Points) -> Points:
+    """Project camera-space points [..., 3] to pixels [..., 2]; NaN for points not in front."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        slopes = points[..., :2] / np.where(points[..., 2:] > 0, points[..., 2:], np.nan)
+    return np.asarray(slopes * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2])
+
+
+def at_pixels(plane: NDArray[Any], pixels: Points) -> NDArray[Any]:
+    """Sample a plane at the pixels [...] containing the positions [..., 2]; 0 outside the picture."""
+    height, width = plane.shape[:2]
+    inside = np.isfinite(pixels).all(axis=-1)
+    column, row = (np.floor(np.where(inside, pixels[..., k], -1)).astype(np.int64) for k in (0, 1))
+    inside &= (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    found = plane[row.clip(0, height - 1), column.clip(0, width - 1)]
+    return np.where(inside, found, np.zeros((), plane.dtype))
+
+
+MOST_DEG = 75.0
+"""Maximum rotation in degrees; beyond it, surfaces are seen edge-on."""
+LEAST_ZOOM, MOST_ZOOM = 0.25, 4.0
+
+
+@dataclass(frozen=True)
+class Orbit:
+    """Pose of a virtual camera relative to a start camera.
+
+    Raises:
+        InvalidSetting: if a value is out of range.
+    """
+
+    azimuth_deg: float = 0.0
+    """Rotation to the right around the point at the centre of the picture, in degrees."""
+    elevation_deg: float = 0.0
+    """Upward rotation around the point at the centre of the picture, in degrees."""
+    zoom: float = 1.0
+    """Factor by which the camera is closer to that point."""
+
+    def __post_init__(self) -> None:
+        for name, value in (("azimuth", self.azimuth_deg), ("elevation", self.elevation_deg)):
+            if not abs(value) <= MOST_DEG:
+                raise InvalidSetting(f"{name} is {value:g} degrees; it must be from -{MOST_DEG:g} to {MOST_DEG:g}")
+        if not LEAST_ZOOM <= self.zoom <= MOST_ZOOM:
+            raise InvalidSetting(f"zoom is {self.zoom:g}; it must be from {LEAST_ZOOM:g} to {MOST_ZOOM:g}")
+
+    def camera(self, start: Camera, distance: float) -> Camera:
+        """Return the virtual camera orbiting the point `distance` in front of `start`, in scene units.
+
+        Without rotation and zoom this is `start`.
+
+        Raises:
+            InvalidInput: if the distance is not positive.
+        """
+        if not 0 < distance < math.inf:
+            raise InvalidInput(f"the distance of the orbit is {distance}; it must be positive")
+        azimuth, elevation = math.radians(self.azimuth_deg), math.radians(self.elevation_deg)
+        sin_a, cos_a, sin_e, cos_e = math.sin(azimuth), math.cos(azimuth), math.sin(elevation), math.cos(elevation)
+        turn = np.eye(4)
+        turn[:3, :3] = np.array([[1, 0, 0], [0, cos_e, -sin_e], [0, sin_e, cos_e]]) @ np.array(
+            [[cos_a, 0, sin_a], [0, 1, 0], [-sin_a, 0, cos_a]]
+        )
+        to_pivot, back = np.eye(4), np.eye(4)
+        to_pivot[2, 3], back[2, 3] = -distance, distance / self.zoom
+        return start.with_pose(back @ turn @ to_pivot @ start.world_to_camera)

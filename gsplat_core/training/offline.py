@@ -26,7 +26,7 @@ from gsplat_core.scene.frames import Frame
 from gsplat_core.training.motion.surface_tracks import SurfaceTracks
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.steps.step import TrainingStep
-from gsplat_core.training.strategies.scene import Plan
+from gsplat_core.training.strategies.strategy import Plan
 
 NOISE_LEVELS = 2.5
 """Standard deviation of noise in compressed video, in grey levels of 255."""

@@ -12,9 +12,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from gsplat_core.choices import FIELDS
 from gsplat_core.deformation.continuation import NewestState
 from gsplat_core.deformation.kinds import NewField
-from gsplat_core.deformation.registry import FIELDS
 from gsplat_core.errors import InvalidInput
 from gsplat_core.models.model import Model
 from gsplat_core.models.snapshots import Snapshot, SnapshotSlots
@@ -26,8 +26,7 @@ from gsplat_core.training.budget import Budget, ObserveReport
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.depth_errors import depth_errors
 from gsplat_core.training.growth.covering import Covering
-from gsplat_core.training.growth.initialisation import gaussians_from_frame
-from gsplat_core.training.growth.start_on_device import StartOnDevice
+from gsplat_core.training.growth.initialisation import StartOnDevice, gaussians_from_frame
 from gsplat_core.training.motion.prior import Following, continued, newest_state
 from gsplat_core.training.observations import Observation, ObservationWindow
 from gsplat_core.training.offline import OfflineTraining, ToFit, least_spacing_s, to_fit

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.model_sources import load_model
 from gsplat_core.memory import peak_bytes
-from gsplat_core.rendering.registry import check_renderer, new_renderer
-from gsplat_core.rendering.renderer import RendererOptions
+from gsplat_core.rendering.renderer import RendererOptions, check_renderer, new_renderer
 from operators.applications.device import check_device
 from operators.applications.limits import check_picture, render_bytes, require_memory
 from operators.applications.progress import Progress, ProgressCallback

@@ -37,7 +37,7 @@ from gsplat_core.io.recordings.calibration import read_poses
 from gsplat_core.io.recordings.findings import Findings
 from gsplat_core.io.recordings.truth import GroundTruth, open_truth
 from gsplat_core.models.model import Model
-from gsplat_core.rendering.registry import check_renderer
+from gsplat_core.rendering.renderer import check_renderer
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.reconstructor import Reconstructor

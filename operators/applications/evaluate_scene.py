@@ -13,8 +13,7 @@ import torch
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.model_sources import load_model
 from gsplat_core.io.recordings.colmap import HELD_OUT_EVERY, read_colmap
-from gsplat_core.rendering.registry import check_renderer, new_renderer
-from gsplat_core.rendering.renderer import Renderer, RendererOptions
+from gsplat_core.rendering.renderer import Renderer, RendererOptions, check_renderer, new_renderer
 from gsplat_core.training.metrics import frame_quality
 from operators.applications.device import check_device
 from operators.applications.limits import check_picture, render_bytes, require_memory

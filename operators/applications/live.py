@@ -16,7 +16,7 @@ import cv2
 
 from gsplat_core.models.model import Model
 from gsplat_core.models.snapshots import Snapshot
-from gsplat_core.rendering.registry import check_renderer
+from gsplat_core.rendering.renderer import check_renderer
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.reconstructor import Reconstructor
 from operators.applications.device import check_device, seeded

@@ -22,10 +22,8 @@ from gsplat_core.io.files import PartialFile
 from gsplat_core.io.model_sources import is_scene_file, load_model
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.models.model import Model
-from gsplat_core.rendering.registry import check_renderer, new_renderer
-from gsplat_core.rendering.renderer import Renderer, RendererOptions
-from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.orbit import Orbit
+from gsplat_core.rendering.renderer import Renderer, RendererOptions, check_renderer, new_renderer
+from gsplat_core.scene.cameras import Camera, Orbit
 from gsplat_core.transfers import HostCopy
 from operators.applications.device import check_device
 from operators.applications.limits import (

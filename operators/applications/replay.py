@@ -22,7 +22,7 @@ from gsplat_core.io.recordings import is_heldout, open_recording
 from gsplat_core.io.recordings.truth import open_behind
 from gsplat_core.io.sessions import SessionReader, is_session
 from gsplat_core.io.sessions.records import ReconstructorMade
-from gsplat_core.rendering.registry import check_renderer
+from gsplat_core.rendering.renderer import check_renderer
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.schedule import LiveTraining

@@ -16,8 +16,7 @@ from gsplat_core.io.ply import save_ply
 from gsplat_core.io.recordings.colmap import HELD_OUT_EVERY, read_colmap
 from gsplat_core.memory import peak_bytes
 from gsplat_core.models.model import Model
-from gsplat_core.training.static.pictures import read_pictures, read_points
-from gsplat_core.training.static.trainer import FULL_STEPS, StaticConfig, StaticTrainer
+from gsplat_core.training.static import FULL_STEPS, StaticConfig, StaticTrainer, read_pictures, read_points
 from operators.applications.device import check_device, seeded
 from operators.applications.evaluate_scene import SceneScore, SceneSettings, evaluate_scene
 from operators.applications.limits import check_picture

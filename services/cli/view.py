@@ -13,8 +13,7 @@ from gsplat_core.errors import BundleError, InvalidSetting
 from gsplat_core.io.model_files import open_model_file
 from gsplat_core.io.model_sources import load_model
 from gsplat_core.models.model import Model
-from gsplat_core.rendering.registry import check_renderer
-from gsplat_core.rendering.renderer import RendererOptions
+from gsplat_core.rendering.renderer import RendererOptions, check_renderer
 from operators.applications.device import check_device
 from services.cli.exit_codes import OK
 from services.cli.igtl import check_host

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.models.model import Model
-from gsplat_core.scene.orbit import Orbit
+from gsplat_core.scene.cameras import Orbit
 from operators.metrics import ScoredFrame
 from operators.rasterize import displayed
 from operators.remembered import marked

@@ -23,7 +23,7 @@ from gsplat_core.errors import UserError
 from gsplat_core.io.bundle import save_bundle
 from gsplat_core.models.model import Model
 from gsplat_core.models.snapshots import Snapshot
-from gsplat_core.rendering.registry import check_renderer
+from gsplat_core.rendering.renderer import check_renderer
 from gsplat_core.transfers import StagedCopies
 from operators.applications.device import check_device
 from operators.applications.limits import check_picture

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidInput, UserError
 from gsplat_core.io.bundle import load_bundle
-from gsplat_core.rendering.registry import new_renderer
-from gsplat_core.rendering.renderer import RendererOptions
+from gsplat_core.rendering.renderer import RendererOptions, new_renderer
 from gsplat_core.scene.frames import Frame
 from operators.applications.limits import check_picture
 from operators.messages import PictureState

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
+from gsplat_core.choices import RENDERERS
 from gsplat_core.models.model import Model
 from gsplat_core.models.snapshots import SnapshotSlots
-from gsplat_core.rendering.registry import RENDERERS
 from gsplat_core.rendering.renderer import Capabilities, FinishedFrame
 from gsplat_core.scene.frames import FrameStatus
 from operators.messages import DeformedScene

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 
+from gsplat_core.choices import RENDERERS
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings import synthesize
 from gsplat_core.models.model import Model
-from gsplat_core.rendering.registry import RENDERERS, new_renderer
 from gsplat_core.rendering.renderer import (
     STANDARD_OUTPUTS,
     Capabilities,
@@ -20,6 +20,7 @@ from gsplat_core.rendering.renderer import (
     PendingFrame,
     check_camera,
     checked_outputs,
+    new_renderer,
 )
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import SH_C0

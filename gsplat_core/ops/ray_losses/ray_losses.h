@@ -10,7 +10,7 @@ class CudaScratch;
 
 namespace gsplat::ray_losses {
 
-constexpr float kLargestJump = 0.02f;  // LARGEST_JUMP in gsplat_core/rendering/depth_maps.py
+constexpr float kLargestJump = 0.02f;  // LARGEST_JUMP in gsplat_core/rendering/surface.py
 constexpr double kLeastInverse = 1e-12;
 constexpr int kPinhole = 0, kOrtho = 1, kFisheye = 2;  // CAMERA_MODELS in Python
 

@@ -3,7 +3,7 @@
 // Bits of the four words, from the lowest: position 3 x 16, log-scales 3 x 8, rotation 2 + 3 x 10 (index of the largest
 // component and the others), opacity 8, colour 5 + 6 + 5. The colour is stored as (green - red) / 2, the mean, and
 // blue / 2 - (red + green) / 4, because the colours of neighbours mostly differ in brightness; its ranges belong to
-// kColourChunk splats. rendering/prepared.py writes them.
+// kColourChunk splats. rendering/stochastic.py writes them.
 #pragma once
 
 #include "simd.h"

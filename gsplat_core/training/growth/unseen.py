@@ -6,8 +6,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.scene.rows import RowMoves
+from gsplat_core.scene.gaussians import Gaussians, RowMoves
 from gsplat_core.training.observations import Observation
 
 

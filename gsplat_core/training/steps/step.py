@@ -14,19 +14,16 @@ from torch import Tensor
 
 from gsplat_core.choices import RENDERERS, STRATEGIES
 from gsplat_core.deformation.field import DeformationField
-from gsplat_core.deformation.kinds import FieldRates, FieldTraining
-from gsplat_core.deformation.registry import kind_of
+from gsplat_core.deformation.kinds import FieldRates, FieldTraining, kind_of
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.models.model import TrainedBy
 from gsplat_core.rendering.rasterization import RenderOutput, render
 from gsplat_core.rendering.renderer import TrainableRenderer
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.gaussians import EXTRA_PREFIX, Gaussians
-from gsplat_core.scene.rows import GaussianRows, RowMoves
+from gsplat_core.scene.gaussians import EXTRA_PREFIX, GaussianRows, Gaussians, RowMoves
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.growth.unseen import depth_of
-from gsplat_core.training.losses.loss import LossContext
-from gsplat_core.training.losses.registry import WeightedLosses, loss_weights
+from gsplat_core.training.losses.loss import LossContext, WeightedLosses, loss_weights
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.steps.fused_step import FusedStep
 from gsplat_core.training.steps.optimiser import FusedAdam

@@ -10,8 +10,18 @@ from torch import Tensor
 
 from gsplat_core.ops.densification import accumulate_gradient_norms_
 from gsplat_core.training.strategies.operations import duplicate, remove, reset_opa, split
-from gsplat_core.training.strategies.scene import Plan, StrategyKind, change_rows, every_of, views_of
-from gsplat_core.training.strategies.strategy import GEOMETRY, InvalidParameters, Optimizers, Params, Strategy
+from gsplat_core.training.strategies.strategy import (
+    GEOMETRY,
+    InvalidParameters,
+    Optimizers,
+    Params,
+    Plan,
+    Strategy,
+    StrategyKind,
+    change_rows,
+    every_of,
+    views_of,
+)
 
 
 @dataclass

@@ -1,6 +1,6 @@
 """The strategy `birth_death`, birth-death moves between offline training steps: Gaussians that raise the loss make place for copies of others.
 
-Births and deaths are drawn from φ = ∂L/∂ln o (`gsplat_core.regression.birth_death`), which follows from the gradients that the
+Births and deaths are drawn from φ = ∂L/∂ln o (`gsplat_core.regression`), which follows from the gradients that the
 optimiser has averaged. Copies take the opacities and scales that keep the picture (Kheradmand et al. 2024, "3D Gaussian
 Splatting as Markov Chain Monte Carlo", eq. 9, for two copies).
 """
@@ -13,10 +13,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from gsplat_core.regression.birth_death import probabilities
+from gsplat_core.regression import probabilities
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.steps.step import TrainingStep
-from gsplat_core.training.strategies.scene import StrategyKind
+from gsplat_core.training.strategies.strategy import StrategyKind
 from gsplat_core.training.strategies.streaming import UNSEEN_PX, Rounds, Shares, halves
 
 RATE = 0.05

@@ -8,10 +8,18 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from gsplat_core.training.strategies.operations import inject_noise_to_position, relocate, sample_add
-from gsplat_core.training.strategies.relocation import binomials
-from gsplat_core.training.strategies.scene import Plan, StrategyKind, change_rows, every_of, views_of
-from gsplat_core.training.strategies.strategy import GEOMETRY, Optimizers, Params, Strategy
+from gsplat_core.training.strategies.operations import binomials, inject_noise_to_position, relocate, sample_add
+from gsplat_core.training.strategies.strategy import (
+    GEOMETRY,
+    Optimizers,
+    Params,
+    Plan,
+    Strategy,
+    StrategyKind,
+    change_rows,
+    every_of,
+    views_of,
+)
 
 GROWTH = 1.05
 """Factor of the number of Gaussians per refinement."""

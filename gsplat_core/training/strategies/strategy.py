@@ -16,18 +16,27 @@ holds one optimiser with one parameter group for each trainable tensor, under th
         for optimizer in optimizers.values():
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
+
+`StrategyKind` and its adapter run such a strategy on a scene that deforms, in offline reconstructions.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, MutableMapping
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from collections.abc import Callable, Mapping, MutableMapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
+import numpy as np
 import torch
+from torch import Tensor
 from torch.nn import Parameter, ParameterDict
 
 from gsplat_core.errors import InvalidInput
+from gsplat_core.scene.gaussians import Gaussians
+
+if TYPE_CHECKING:
+    from gsplat_core.training.observations import Observation
+    from gsplat_core.training.steps.step import TrainingStep
 
 Params = MutableMapping[str, Parameter] | ParameterDict
 """Tensors of the Gaussians by name; strategies replace entries."""
@@ -81,3 +90,100 @@ class Strategy:
 
 GEOMETRY = ("means", "scales", "quats", "opacities")
 """Names of the tensors that move and size a Gaussian."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """An offline training that is about to begin."""
+
+    step: TrainingStep
+    """Scene that the strategy changes, with its optimiser."""
+    observations: Sequence[Observation]
+    """Observations of both eyes to train on."""
+    steps: int
+    """Number of optimiser steps."""
+    most_gaussians: int
+    """Largest number of Gaussians."""
+    random: np.random.Generator
+    """Source of random numbers, shared with the order of the observations."""
+    seed: int
+    """Seed of a strategy's own generators."""
+
+
+class SceneStrategy(Protocol):
+    """Changes of the Gaussians of one offline training."""
+
+    def before_step(self, number: int, rate_scale: float) -> bool:
+        """Change the Gaussians before a step.
+
+        Args:
+            number: number of steps already taken, from 0.
+            rate_scale: factor of the learning rates of the last step.
+
+        Returns:
+            True if Gaussians were added or removed.
+        """
+
+
+@dataclass(frozen=True)
+class StrategyKind:
+    """Registry entry of a strategy."""
+
+    training: Callable[[Plan], SceneStrategy]
+    """Creates the strategy of an offline training."""
+    library: type[Strategy] | None = None
+    """Class for a user's own training loop, in gsplat's calling convention; None if there is none."""
+    losses: Mapping[str, float] = field(default_factory=dict)
+    """Losses in `LOSSES` that the strategy adds to those of the user, with their weights."""
+    screen_gradients: bool = False
+    """True if the strategy reads `TrainingStep.screen`. The step is then not captured as a CUDA graph."""
+
+
+def every_of(steps: int) -> int:
+    """Return the number of steps between two refinements: 100 as in gsplat for long trainings, at least 10."""
+    return min(100, max(10, steps // 40))
+
+
+NAMES = {"log_scales": "scales", "logit_opacities": "opacities"}
+"""gsplat's names of tensors that `Gaussians` names otherwise."""
+SOURCE = "source row"
+"""Name of the parameter from which the adapter reads where each row comes from."""
+
+
+def views_of(step: TrainingStep) -> dict[str, Parameter]:
+    """Return the scene's tensors by gsplat's names; changes in place reach the scene."""
+    tensors = step.gaussians.tensors()
+    return {NAMES.get(name, name): Parameter(tensor, requires_grad=False) for name, tensor in tensors.items()}
+
+
+@torch.no_grad()
+def change_rows(step: TrainingStep, state: dict[str, Any], change: Callable[[Params, Optimizers], None]) -> None:
+    """Change a scene's Gaussians by functions in gsplat's calling convention.
+
+    A further parameter of row numbers takes part in all row operations. It states the source of each row, from which the
+    deformation field's rows follow. Extra tensors and Adam's moments take part like any other.
+
+    Args:
+        step: scene and optimiser.
+        state: statistics of the strategy; their rows stay in the order of the scene's.
+        change: changes parameters, optimisers and `state` in place.
+    """
+    params: dict[str, Parameter] = {}
+    optimizers: dict[str, torch.optim.Optimizer] = {}
+    for name, tensor in step.gaussians.tensors().items():
+        alias = NAMES.get(name, name)
+        params[alias] = Parameter(tensor.clone())
+        optimizers[alias] = torch.optim.Adam([params[alias]])
+        optimizers[alias].state[params[alias]] = step.moments(name)
+    rows = torch.arange(step.gaussians.count, device=step.gaussians.device)
+    params[SOURCE] = Parameter(rows, requires_grad=False)
+    change(params, optimizers)
+    names = {name: NAMES.get(name, name) for name in step.gaussians.tensors()}
+    order = step.rearrange(
+        params[SOURCE].data,
+        Gaussians.from_tensors({name: params[alias].data for name, alias in names.items()}),
+        {name: optimizers[alias].state[params[alias]] for name, alias in names.items()},
+    )
+    for name, value in state.items():
+        if isinstance(value, Tensor) and name != "binoms":
+            state[name] = value[order]

@@ -18,7 +18,7 @@ from gsplat_core.scene.gaussians import SH_C0, Gaussians
 from gsplat_core.training.motion.image_motion import Seen
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.steps.step import TrainingStep
-from gsplat_core.training.strategies.scene import Plan, StrategyKind
+from gsplat_core.training.strategies.strategy import Plan, StrategyKind
 
 UNSEEN_PX = 0.5
 """Largest sum of blending weights over the pixels of any picture, in pixels, below which a Gaussian counts as

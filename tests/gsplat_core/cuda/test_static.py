@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from gsplat_core.contrib.dynamic import HexPlaneField
-from gsplat_core.training.static.trainer import StaticConfig, StaticTrainer
+from gsplat_core.training.static import StaticConfig, StaticTrainer
 from tests.gsplat_core.training.posed_pictures import posed_pictures
 
 

@@ -12,7 +12,7 @@ from gsplat_core.deformation import BasisField, BasisRates
 from gsplat_core.errors import InvalidInput
 from gsplat_core.io.bundle import load_bundle, save_bundle
 from gsplat_core.models.snapshots import SnapshotSlots
-from gsplat_core.scene.rows import RowMoves
+from gsplat_core.scene.gaussians import RowMoves
 
 RATES = BasisRates(position=0.02, centers=5e-3, widths=5e-3)
 SPACING_S = 0.2

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from gsplat_core.evaluation.depth import DepthShareSums, NormalSums, best_plane, flat_depths
-from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.projection import pixel_rays
+from gsplat_core.scene.cameras import Camera, pixel_rays
 
 CAMERA = Camera.from_focal(30.0, 48, 40)
 RAYS = pixel_rays(CAMERA)

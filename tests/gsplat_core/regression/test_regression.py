@@ -9,8 +9,15 @@ import torch
 
 from gsplat_core import InvalidInput, reference
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.regression import FitOptions, Splats, births_and_deaths, fit, loss_and_gradients, wasserstein_distance
-from gsplat_core.regression.birth_death import probabilities
+from gsplat_core.regression import (
+    FitOptions,
+    Splats,
+    births_and_deaths,
+    fit,
+    loss_and_gradients,
+    probabilities,
+    wasserstein_distance,
+)
 
 
 def bumps(seed, points=300, dims=2, channels=1, count=4):

@@ -12,8 +12,7 @@ import torch
 from gsplat_core import Camera, Gaussians, InvalidInput, reference, render, save_gaussians
 from gsplat_core.errors import BundleError, InvalidSetting
 from gsplat_core.io.model_sources import load_model
-from gsplat_core.scene.collection import GaussianCollection
-from gsplat_core.scene.harmonics import harmonic_bases, rotated_harmonics
+from gsplat_core.scene.collection import GaussianCollection, harmonic_bases, rotated_harmonics
 
 
 def gaussians(count=40, degree=3, seed=0, **extra):

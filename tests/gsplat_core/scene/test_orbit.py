@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from gsplat_core.errors import InvalidInput, InvalidSetting
-from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.orbit import Orbit
+from gsplat_core.scene.cameras import Camera, Orbit
 
 POSE = np.array([[0, -1, 0, 3.0], [1, 0, 0, -2], [0, 0, 1, 5], [0, 0, 0, 1]])
 START = Camera.from_focal(100.0, 64, 48, POSE)

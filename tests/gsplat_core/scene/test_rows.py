@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gsplat_core import Camera, InvalidInput, render
-from gsplat_core.scene.rows import GaussianRows, RowMoves
+from gsplat_core.scene.gaussians import GaussianRows, RowMoves
 
 CAMERA = Camera.from_focal(40.0, 32, 24)
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 import torch
 
-from gsplat_core.rendering.registry import new_renderer
+from gsplat_core.rendering.renderer import new_renderer
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.metrics import psnr_tissue_db

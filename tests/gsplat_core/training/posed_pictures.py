@@ -5,7 +5,7 @@ import numpy as np
 import torch
 
 from gsplat_core import Camera, Gaussians, render
-from gsplat_core.training.static.pictures import Points, TrainingPicture
+from gsplat_core.training.static import Points, TrainingPicture
 
 
 def posed_pictures(factor=1.0, shift=0.0, count=5):

@@ -12,7 +12,7 @@ from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.budget import Budget
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.growth.moving_view import NewTissue, entered, has_moved
+from gsplat_core.training.growth.covering import NewTissue, entered, has_moved
 from gsplat_core.training.growth.unseen import around_cells
 from gsplat_core.training.metrics import psnr_tissue_db
 from gsplat_core.training.observations import Observation

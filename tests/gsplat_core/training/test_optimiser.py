@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.scene.rows import RowMoves
+from gsplat_core.scene.gaussians import RowMoves
 from gsplat_core.training.steps.optimiser import FusedAdam
 
 RATES = {"means": 0.01, "sh": 0.002, "logit_opacities": 0.05}

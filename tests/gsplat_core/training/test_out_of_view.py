@@ -12,11 +12,10 @@ import torch
 from gsplat_core.rendering.remembered import share_of
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
-from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.scene.rows import RowMoves
+from gsplat_core.scene.gaussians import Gaussians, RowMoves
 from gsplat_core.training.budget import Budget
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.growth.moving_view import OutOfView
+from gsplat_core.training.growth.covering import OutOfView
 from gsplat_core.training.growth.unseen import Archive, LastSeen, pixels_of
 from gsplat_core.training.metrics import psnr_tissue_db
 from gsplat_core.training.observations import Observation

@@ -10,13 +10,12 @@ import torch
 
 from gsplat_core.choices import LOSSES, SENSORS
 from gsplat_core.errors import InvalidInput, InvalidSetting
-from gsplat_core.rendering.ranges import render_ranges
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.range_sensors import OctLine, RangeScan, StructuredLight, TimeOfFlight, simulate_scan
 from gsplat_core.training.losses.loss import LossContext
-from gsplat_core.training.losses.ranges import RangeLoss, range_loss
+from gsplat_core.training.losses.ranges import RangeLoss, range_loss, render_ranges
 from gsplat_core.training.observations import Observation
 
 SIZE = 24

@@ -18,7 +18,7 @@ from gsplat_core.training.steps.step import TrainingStep
 from gsplat_core.training.strategies.adc import CappedAdc
 from gsplat_core.training.strategies.mcmc import SceneMcmc
 from gsplat_core.training.strategies.operations import draw, remove, split
-from gsplat_core.training.strategies.scene import Plan, change_rows
+from gsplat_core.training.strategies.strategy import Plan, change_rows
 
 COUNT = 90
 

@@ -7,9 +7,7 @@ import pytest
 import torch
 
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.training.static.adam import CompiledAdam
-from gsplat_core.training.static.pictures import TrainingCoordinates
-from gsplat_core.training.static.trainer import StaticConfig, StaticTrainer
+from gsplat_core.training.static import CompiledAdam, StaticConfig, StaticTrainer, TrainingCoordinates
 from gsplat_core.training.strategies.adc import DefaultStrategy
 from gsplat_core.training.strategies.mcmc import MCMCStrategy
 from tests.gsplat_core.training.posed_pictures import posed_pictures

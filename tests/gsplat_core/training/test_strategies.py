@@ -11,7 +11,7 @@ import gsplat_core
 from gsplat_core import DefaultStrategy, MCMCStrategy, Strategy, rasterization
 from gsplat_core.errors import InvalidInput
 from gsplat_core.training.strategies import operations as ops
-from gsplat_core.training.strategies.relocation import MOST_COPIES, binomials, compute_relocation
+from gsplat_core.training.strategies.operations import MOST_COPIES, binomials, compute_relocation
 
 COUNT = 40
 

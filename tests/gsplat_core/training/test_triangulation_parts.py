@@ -10,10 +10,9 @@ import torch
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.training.growth import start_on_device
+from gsplat_core.training.growth import initialisation
 from gsplat_core.training.losses import triangulation
-from gsplat_core.training.losses.loss import LossContext
-from gsplat_core.training.losses.registry import loss_weights
+from gsplat_core.training.losses.loss import LossContext, loss_weights
 from gsplat_core.training.losses.triangulation import (
     Triangulated,
     TriangulationLoss,
@@ -167,7 +166,7 @@ def test_a_loss_without_a_weight_has_its_default_one_which_the_refusal_of_two_na
 def test_a_picture_is_blurred_over_three_standard_deviations(sigma_px):
     picture = torch.zeros(1, 31, 41)
     picture[0, 15, 20] = 1.0
-    found = start_on_device._blurred(picture, sigma_px)
+    found = initialisation._blurred(picture, sigma_px)
     assert float(found.sum()) == pytest.approx(1, abs=1e-5)
     reach = int(np.ceil(3 * sigma_px))
     lit = torch.nonzero(found[0])

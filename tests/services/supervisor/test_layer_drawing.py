@@ -10,7 +10,7 @@ import torch
 
 from gsplat_core.models.model import Model
 from gsplat_core.models.snapshots import SnapshotSlots
-from gsplat_core.scene.orbit import Orbit
+from gsplat_core.scene.cameras import Orbit
 from operators.layer_pictures import UNOBSERVED, UNOBSERVED_LINE, DepthColours
 from operators.messages import PictureState
 from operators.rasterize import displayed

@@ -1,17 +1,177 @@
-"""Fit of splats to values at points: metric-corrected descent with birth-death moves."""
+"""Regression of functions of 1 to 4 variables by Gaussian splats, with Wasserstein-Fisher-Rao descent.
+
+    from gsplat_core.regression import fit
+
+    fitted = fit(points, values, count=64)
+    fitted.splats(other_points)
+
+Metric-corrected descent with the Bures-Wasserstein metric moves the splats. Birth-death moves are the Fisher-Rao part of the
+gradient flow: the number of splats is constant, and each splat that dies makes place for a copy of another one. Probabilities
+follow from φ = ∂L/∂ln o, the change of the loss per relative change of a splat's opacity or mass (Rotskoff et al. 2019,
+"Neuron birth-death dynamics").
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from gsplat_core.argument_checks import require_float32
 from gsplat_core.errors import InvalidInput, InvalidSetting
-from gsplat_core.regression.birth_death import BirthDeath, births_and_deaths
-from gsplat_core.regression.splats import Gradients, Splats, loss_and_gradients
+from gsplat_core.ops.splat_regression import check_splats, splat_regression
+
+SMALLEST_MASS = 1e-4
+"""Lower bound of the mass that gradients are divided by, relative to the largest mass."""
+
+
+@dataclass(frozen=True, eq=False)
+class Splats:
+    """Function f(x) = Σ v g(x), where each g is a normal density of mean b and covariance A Aᵀ. Float32.
+
+    Raises:
+        InvalidInput: if shapes are inconsistent.
+    """
+
+    centres: Tensor
+    """Means b of the normal densities, [k, d] with d = 1 to 4."""
+    factors: Tensor
+    """Square roots A of the covariances A Aᵀ, [k, d, d]."""
+    values: Tensor
+    """Weights v, [k, m]: integral of each splat over space."""
+
+    def __post_init__(self) -> None:
+        check_splats(self.centres, self.centres, self.factors, self.values)
+
+    def __call__(self, points: Tensor) -> Tensor:
+        """Return f at points float32 [n, d] as [n, m]; differentiable in the splats."""
+        return splat_regression(points, self.centres, self.factors, self.values)
+
+    @property
+    def masses(self) -> Tensor:
+        """|v| of each splat, [k]."""
+        return self.values.norm(dim=1)
+
+
+class Gradients(NamedTuple):
+    """Gradients of a loss with the shapes of `Splats`."""
+
+    centres: Tensor
+    factors: Tensor
+    values: Tensor
+
+    def divided_by_mass(self, masses: Tensor) -> Gradients:
+        """Return the gradients in the Bures-Wasserstein metric: those of each splat divided by its mass, [k].
+
+        A splat then moves at a speed that does not depend on its mass.
+        """
+        each = masses.clamp(min=SMALLEST_MASS * float(masses.max()) + 1e-30 if len(masses) else 1.0)
+        return Gradients(*(g / each.view(-1, *[1] * (g.dim() - 1)) for g in self))
+
+
+def loss_and_gradients(
+    splats: Splats, points: Tensor, targets: Tensor, *, centre_decay: float = 0.0, factor_decay: float = 0.0
+) -> tuple[Tensor, Gradients]:
+    """Return (1/n) Σ|y - f(x)|² + λ_b Σ|b|² + λ_A Σ|A|² and its gradients in closed form, without autograd.
+
+    Args:
+        splats: the model.
+        points: float32 [n, d].
+        targets: y, float32 [n, m].
+        centre_decay: λ_b.
+        factor_decay: λ_A.
+    """
+    with torch.no_grad():
+        off = splats(points) - targets
+        loss = off.square().sum() / max(len(points), 1)
+        centres, factors, values = torch.ops.gsplat_core.splat_regression_backward(
+            points, splats.centres, splats.factors, splats.values, off * (2 / max(len(points), 1))
+        )
+        if centre_decay:
+            loss = loss + centre_decay * splats.centres.square().sum()
+            centres = centres + 2 * centre_decay * splats.centres
+        if factor_decay:
+            loss = loss + factor_decay * splats.factors.square().sum()
+            factors = factors + 2 * factor_decay * splats.factors
+        return loss, Gradients(centres, factors, values)
+
+
+def wasserstein_distance(first: Splats, second: Splats) -> Tensor:
+    """Return the 2-Wasserstein distance of each pair of normal distributions, [k].
+
+    W₂² = |b - b'|² + |A|² + |A'|² - 2|A'ᵀA|_* with the nuclear norm (Gelbrich 1990).
+    """
+    nuclear = torch.linalg.svdvals(second.factors.mT @ first.factors).sum(-1)
+    squared = (
+        (first.centres - second.centres).square().sum(-1)
+        + first.factors.square().sum((-2, -1))
+        + second.factors.square().sum((-2, -1))
+        - 2 * nuclear
+    )
+    return squared.clamp(min=0).sqrt()
+
+
+@dataclass(frozen=True)
+class BirthDeath:
+    """Indices of the splats that die, and of the parents whose copies replace them; int64 [D] each."""
+
+    dying: Tensor
+    parents: Tensor
+    """Parents in the order of `dying`. A parent of several copies occurs several times."""
+
+
+def probabilities(phi: Tensor, rate: float) -> tuple[Tensor, Tensor]:
+    """Return the probabilities of death and of duplication, [N] each.
+
+    They are 1 - exp(-τ(φ - φ̄)₊) and 1 - exp(-τ(φ̄ - φ)₊) with τ = `rate` / standard deviation of φ, so that the
+    probabilities do not depend on the unit of the loss.
+
+    Args:
+        phi: ∂L/∂ln o of each splat, [N]. Non-finite values count as the mean.
+        rate: rate of death or duplication of a splat whose φ is one standard deviation above or below the mean.
+    """
+    finite = phi.isfinite()
+    count = finite.sum().clamp(min=1)
+    off = torch.where(finite, phi, 0)
+    off = torch.where(finite, off - off.sum() / count, 0)
+    spread = (off.square().sum() / count).sqrt()
+    off = torch.where(spread > 0, off / spread, torch.zeros_like(off))
+    return -torch.expm1(-rate * off.clamp(min=0)), -torch.expm1(-rate * (-off).clamp(min=0))
+
+
+def births_and_deaths(phi: Tensor, rate: float, random: torch.Generator, *, single: bool = False) -> BirthDeath:
+    """Draw the splats that die, and a parent for each.
+
+    Synchronises with the device. The draws take place on the CPU, so the same φ gives the same moves on every device.
+
+    Args:
+        phi: ∂L/∂ln o of each splat, [N].
+        rate: see `probabilities`.
+        random: generator on the CPU.
+        single: draw each parent at most once. Splats without a parent then survive.
+    """
+    death, birth = probabilities(phi.detach().cpu().double(), rate)
+    marked = torch.nonzero(torch.rand(len(death), generator=random, dtype=death.dtype) < death)[:, 0]
+    possible = int(torch.count_nonzero(birth))
+    if possible == 0:
+        marked = marked[:0]
+    elif single:
+        marked = marked[torch.randperm(len(marked), generator=random)[:possible]].sort().values
+    if len(marked) == 0:
+        return BirthDeath(marked.to(phi.device), marked.to(phi.device))
+    # Inverse transform sampling, because torch.multinomial is limited to 2^24 splats.
+    if single:
+        keys = torch.rand(len(birth), generator=random, dtype=birth.dtype).log() / birth
+        parents = keys.argsort(descending=True, stable=True)[: len(marked)]
+    else:
+        total = birth.cumsum(0)
+        draws = torch.rand(len(marked), generator=random, dtype=birth.dtype) * total[-1]
+        parents = torch.searchsorted(total, draws, right=True).clamp(max=len(birth) - 1)
+    return BirthDeath(marked.to(phi.device), parents.to(phi.device))
+
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-8
 
