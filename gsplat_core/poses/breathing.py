@@ -50,7 +50,7 @@ otherwise twice their value would be selected.
 STEP_CYCLES = 0.25
 """Spacing of the tried breathing frequencies, in cycles over the recording; twice that for the heart."""
 SPREAD = 0.007
-"""Cauchy scale of ray errors (x / z)."""
+"""Scale of the robust loss of ray errors (x / z) in the search of frequencies."""
 ROUNDS = 3
 BREATHES, BEATS = 0.75, 0.94
 """Largest accepted ratio of the cost with all frequencies to that of the static model, and of the cost with a heart
@@ -194,9 +194,9 @@ POINTS, LEAST_SEEN = 400, 5
 FEWEST_POINTS = 60
 NEAREST, FARTHEST = 0.5, 2.0
 """Range of accepted initial depths relative to the median depth. Points outside it start at the median depth."""
-FINEST = 0.0017
-STAGES = ((0.014, 8), (0.007, 8), (0.0035, 8), *((FINEST, 8),) * 13)
-"""Optimisation stages: Cauchy scale of ray errors (x / z) and number of steps. The trajectory prior is re-estimated
+FINEST = 0.002
+STAGES = ((0.016, 8), (0.008, 8), (0.004, 8), *((FINEST, 8),) * 13)
+"""Optimisation stages: scale of the robust loss of ray errors (x / z) and number of steps. The trajectory prior is re-estimated
 before each stage.
 """
 FEW_POINTS, FEW_FRAMES, FEW_NODES = 200, 100, 16

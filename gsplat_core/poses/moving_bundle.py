@@ -2,8 +2,11 @@
 
 The position of a point is its rest position plus the sum over waves w(t) of w(t) times a vector. Waves are the cosines
 and sines of phases. Breathing pauses, has unequal halves and a changing rate, so the phase of each frame is estimated
-too (`Rhythm`). Cameras, phases, rest positions and vectors are estimated together by Levenberg-Marquardt with Cauchy
-weights, with rest positions eliminated (Schur complement). The unit of length is the tissue's median distance.
+too (`Rhythm`). Cameras, phases, rest positions and vectors are estimated together by Levenberg-Marquardt, with rest
+positions eliminated (Schur complement). The unit of length is the tissue's median distance.
+
+A tool moves tissue over a large part of the picture in the same direction. The loss of Geman and McClure limits the cost
+of such observations, so they have less influence on the cameras than with Cauchy's loss.
 
 The vectors vary smoothly over the surface and are given at nodes among its points (`SurfaceField`). Their prior is a
 Gaussian random field with a linear part, which includes rigid motion, and a local part with a correlation length
@@ -352,7 +355,7 @@ def adjust(
 
     Args:
         bundle: start values.
-        spread: Cauchy scale of ray errors; errors well above it have little influence.
+        spread: scale of the robust loss of ray errors (Geman and McClure); errors well above it have no influence.
         rounds: maximum number of Levenberg-Marquardt steps.
         prior: prior of the scope's trajectory, or None.
 
@@ -366,7 +369,8 @@ def adjust(
 
 def _cost(bundle: MovingBundle, spread: float, prior: TrajectoryPrior | None) -> float:
     residual, _, _ = _residuals(bundle)
-    seen = 0.5 * (spread / SIGMA) ** 2 * torch.log1p((residual / spread).square().sum(1)).sum()
+    squares = (residual / spread).square().sum(1)
+    seen = 0.5 * (spread / SIGMA) ** 2 * (squares / (1 + squares)).sum()
     depth = bundle.rest[:, 2]
     relief = 0.5 * ((depth - depth.median()) / RELIEF).square().sum()
     motion = 0.5 * torch.einsum("mjb,mn,njb->", bundle.amplitudes, bundle.field.stiffness, bundle.amplitudes)
@@ -410,7 +414,7 @@ def _step(bundle: MovingBundle, spread: float, damping: float, prior: Trajectory
     amplitudes in the order (axis, wave, node).
     """
     residual, local, rotation = _residuals(bundle)
-    weight = 1 / (SIGMA**2 * (1 + (residual / spread).square().sum(1)))
+    weight = 1 / (SIGMA * (1 + (residual / spread).square().sum(1))) ** 2
     by_local, by_rotation = ray_derivatives(local)
     by_place = by_local @ rotation
     by_frame = torch.cat([by_local, by_local @ by_rotation], 2)

@@ -30,15 +30,16 @@ def test_exact_sightings_are_explained_to_a_tenth_of_a_pixel():
 
 
 def test_without_waves_it_is_the_bundle_of_tissue_at_rest():
+    """Scales of the losses far above the errors, because the losses differ."""
     sightings, _ = seen_for(5.0, breathes=0.0, rate_hz=4.0)
     start = bundle_of(sightings, waves(sightings.times_s, ()))
     start = replace(
         start, poses=exp(1e-3 * torch.sin(torch.arange(6 * len(start.poses)).view(-1, 6).double())) @ start.poses
     )
-    found, _ = adjust(start, 0.004, 15)
-    still = Bundle(start.poses, start.rest, start.camera, start.point, start.rays, 1 / 0.004)
+    found, _ = adjust(start, 0.1, 15)
+    still = Bundle(start.poses, start.rest, start.camera, start.point, start.rays, 1 / 0.1)
     fixed = torch.arange(len(start.poses)) == 0
-    expected = errors_px(adjust_still(still, fixed=fixed, rounds=30)) * 0.004
+    expected = errors_px(adjust_still(still, fixed=fixed, rounds=30)) * 0.1
     assert float((found.off().norm(dim=1) - expected).abs().median()) < 2e-6
 
 
@@ -80,7 +81,7 @@ def test_more_waves_start_at_nothing_and_leave_the_others():
 
 
 def test_the_cost_is_the_negative_logarithm_of_the_likelihood_and_the_priors():
-    """Relief has a standard deviation of 0.3 of the median depth, motion that of its field, a ray 0.002 with Cauchy's scale."""
+    """Relief has a standard deviation of 0.3 of the median depth, motion that of its field, a ray 0.002 with the loss of Geman and McClure."""
     bundle, _ = breathing(5.0)
     generator = torch.Generator().manual_seed(0)
     swings = 0.01 * torch.randn(bundle.amplitudes.shape, generator=generator, dtype=torch.float64)
@@ -94,8 +95,9 @@ def test_the_cost_is_the_negative_logarithm_of_the_likelihood_and_the_priors():
     assert adjust(moving, 0.004, 0)[1] == pytest.approx(float(relief + motion), rel=1e-9)
     rays = moving.rays.clone()
     rays[7] += torch.tensor([0.003, -0.004], dtype=torch.float64)
-    off = 0.5 * (0.004 / 0.002) ** 2 * torch.log1p(torch.tensor((0.005 / 0.004) ** 2, dtype=torch.float64))
-    assert adjust(replace(moving, rays=rays), 0.004, 0)[1] == pytest.approx(float(relief + motion + off), rel=1e-9)
+    square = (0.005 / 0.004) ** 2
+    off = 0.5 * (0.004 / 0.002) ** 2 * square / (1 + square)
+    assert adjust(replace(moving, rays=rays), 0.004, 0)[1] == pytest.approx(float(relief + motion) + off, rel=1e-9)
 
 
 def warped(times_s: torch.Tensor, most: float = 0.4) -> Rhythm:
@@ -134,3 +136,13 @@ def test_the_cost_of_phases_is_that_of_a_random_walk():
     variance = (2 * torch.pi * 0.4 * 0.5) ** 2 * times_s.diff() / 6 / 0.4
     expected = 0.5 * ((change.diff() ** 2 / variance).sum() + (change**2).mean() + (change.mean() / 0.05) ** 2)
     assert steady.moved(change[:, None]).cost() == pytest.approx(float(expected), rel=1e-9)
+
+
+def test_tissue_that_a_tool_pulls_has_little_influence_on_the_cameras():
+    """A third of the points moves by seven times the scale in the same direction, in the middle third of the time."""
+    sightings, _ = seen_for(5.0, breathes=0.0, rate_hz=4.0, noise_px=0.0)
+    start = bundle_of(sightings, waves(sightings.times_s, ()))
+    middle = (start.camera // (len(start.poses) // 3 + 1) == 1) & (start.point % 3 == 0)
+    pulled = replace(start, rays=start.rays + 0.02 * middle[:, None])
+    found, _ = adjust(pulled, 0.004, 15)
+    assert float(found.off()[~middle].norm(dim=1).max()) < 0.0002
