@@ -135,7 +135,10 @@ class Pace:
     session: SessionReader | None = None
     """Recorded session whose training calls are replayed; None for a plain recording."""
     held_out: Callable[[Frame], bool] = lambda frame: False
-    """Returns True for frames that are displayed and scored but not trained on."""
+    """Returns True for frames that are displayed and scored but not trained on.
+
+    Ignored with a clock or a session.
+    """
     predict_every: int = 1
     """Predict one in this many frames before training on it; 0 for a finished model."""
     guard: BehindGuard = field(default_factory=BehindGuard)

@@ -207,7 +207,7 @@ class BumpTensors(ContinuedField):
 
     @property
     def columns(self) -> Columns:
-        """Layout of the columns in the tensors."""
+        """Position of each bump (column) in time and in the tensors."""
         return self._columns
 
     def frame_time(self, time_s: float) -> float:

@@ -44,7 +44,7 @@ EDGE_ERROR_PX = 1.5
 SMOOTHNESS, SMOOTH_GREY = 100.0, 5.0
 """Strength of the edge-aware filter, and the difference of grey values at which the strength falls to 1/e."""
 LEAST_VARIANCE_PX2 = 0.05
-"""Lower bound of a disparity's variance in the filter, in pixels²; limits the weight of the best values."""
+"""Summand of a disparity's variance in the filter, in pixels²; limits the weight of the best values."""
 LEAST_WEIGHT = 1e-4
 """Smallest filtered weight of known disparities for a smoothed disparity to count as known."""
 
@@ -292,8 +292,13 @@ def _basis(here: Points, width: int, height: int) -> NDArray[np.float64]:
 
 
 def _fitted_rows(here: Points, lower: Points, width: int, height: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Return the fitted row difference [3] and the inliers [N], by iteratively reweighted least
-    squares starting from the median.
+    """Fit a linear function of the position to the row differences `lower` [N] (right minus left, in pixels) of points.
+
+    `here` [N, 2] are the points' positions in the left picture. The method is iteratively reweighted least squares,
+    starting from the median difference without slopes.
+
+    Returns:
+        Coefficients [3] as in `PairLook.rows`, and the mask [N] of the inliers.
     """
     basis = _basis(here, width, height)
     rows = np.array([float(np.median(lower)), 0.0, 0.0])

@@ -40,7 +40,7 @@ CLIPPED = 252
 LEAST_LIT, LEAST_JUDGED = 0.05, 0.1
 """Smallest share of lit pixels in the picture, and of unclipped pixels among the lit ones, for a judgement."""
 NOISE = 6.0
-"""Offset added to each channel before ratios are computed."""
+"""Offset added to each channel (0 to 255) before ratios are computed; reduces the effect of noise in dark pixels."""
 LOGS = np.log(np.arange(256, dtype=np.float32) + np.float32(NOISE))
 RATIOS = np.array([[1, -1, 0], [1, 0, -1]], np.float32)
 """Matrix from log red, green and blue to the logs of red over green and red over blue."""

@@ -182,7 +182,7 @@ OPERATORS: Mapping[str, Operator] = {
         _enlarged,
         fixed={
             "coordinate_transformation_mode": "asymmetric",
-            "cubic_coeff_a": -0.75,  # of another mode, but exported
+            "cubic_coeff_a": -0.75,  # of the mode `cubic`; the exporter writes it for every mode
             "mode": "nearest",
             "nearest_mode": "floor",
         },

@@ -298,10 +298,10 @@ class FlowSums:
         self._started = _Started(frame.seq, frame.time_s, points, pixels, here, own, true, pose)
 
     def arrive(self, frame: Frame, own: Camera) -> None:
-        """Complete the comparison started by `begin` when the next frame arrives.
+        """Add the motion errors of the pixels that `begin` sampled, if `frame` is the one directly after theirs.
 
         Args:
-            frame: next frame; it need not have been sampled by `begin`.
+            frame: next frame that arrived; it need not have been sampled by `begin`.
             own: camera of the next frame in model space.
         """
         started, self._started = self._started, None

@@ -16,7 +16,8 @@ NEIGHBOURS = 8
 def nearest_others(points: Tensor, most: int = NEIGHBOURS) -> Tensor:
     """Return the indices of the nearest other points of `points` [N, 3], int64 [N, K], K at most `most`.
 
-    Synchronises with the device.     Ties are broken arbitrarily. A non-finite point has only itself as neighbour and is no neighbour of others.
+    Synchronises with the device. Ties are broken arbitrarily. A non-finite point has only itself as neighbour and is no
+    neighbour of others.
     """
     host = HostCopy(points.detach().float()).numpy()
     finite = np.flatnonzero(np.isfinite(host).all(axis=1))

@@ -47,7 +47,7 @@ MOST_MISSES = 15
 NODES = 16
 """Number of nodes of the smooth map along each side."""
 REACH = 0.12
-"""Standard deviation of the map's smoothing kernel, as a share of the longer side."""
+"""Standard deviation of the map's smoothing kernel, as a share of the picture's longer side."""
 HELD = 0.5
 """Weight of a residual of 0 in the mean of the residuals at a node; a match at the node has the weight 1."""
 FLOOR = 0.02

@@ -27,7 +27,7 @@ MOST_TRIANGLES = 5_000_000
 LEAST_EXTENT, MOST_EXTENT = 1e-6, 1e9
 """Accepted range of a mesh's bounding-box diagonal, in its unit."""
 EXACT_KD_TREE = 4
-"""Index type of FLANN's single k-d tree, whose search is exact. FLANN's other indices are approximate."""
+"""Number of FLANN's index type `KDTREE_SINGLE`, a single k-d tree with exact search."""
 
 
 class Closest(NamedTuple):

@@ -214,7 +214,10 @@ GOLDEN = 0.5 * (5**0.5 - 1)
 
 @dataclass(frozen=True)
 class Sightings:
-    """Point observations of all frames with a static reconstruction. The unit of length is about the points' distance."""
+    """Point observations of all frames with a static reconstruction.
+
+    The unit of length is about the distance of the points from the camera.
+    """
 
     frame: Tensor
     """Frame index of each observation, int64 [K], ascending."""

@@ -33,7 +33,7 @@ APART_S = 0.3
 LONGEST_APART_S = 1.0
 """Longest time between the frames of a pair in a stream. After a longer gap, the test starts anew."""
 RECENT_PAIRS, FEWEST_PAIRS = 5, 3
-"""Number of newest pairs of a stream, and the number from which there is a result."""
+"""Number of newest pairs of frames of a stream over which the median is taken, and the least number for a result."""
 LONGEST_PX = 320
 """Longer side of the compared pictures in pixels."""
 MOST_CORNERS, CORNERS_APART_PX, PATCH_PX, LEVELS = 300, 6, 21, 3

@@ -132,7 +132,7 @@ class MultiThreadScheduler:
         return LockedEdge(name, capacity, policy, self._lock)
 
     def wake(self) -> None:
-        """Make every operator check again. Thread-safe."""
+        """Wake all sleeping operators, which check again if they can run. Thread-safe."""
         with self._lock:
             for task in tuple(self._asleep):
                 self._rouse(task)

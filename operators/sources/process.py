@@ -477,8 +477,11 @@ class ProcessSource(LiveSource):
 
     @property
     def state(self) -> SourceState:
-        """Current state of the source: the one that the child process reported, or stalled if the process does not
-        respond.
+        """Current state of the source.
+
+        It is `LIVE` while frames wait for `read`, `ENDED` after the last one, and `RECONNECTING` from a call of `lost`
+        to the next frame. Otherwise it is `STALLED` if the child process does not respond, else the state that the
+        child reported, except `ENDED`.
         """
         state, reported, child = super().state, self._child_state, self._child
         if state is not SourceState.LIVE or self._ready:

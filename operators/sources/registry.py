@@ -40,7 +40,9 @@ SOURCES: Registry[SourceFactory] = Registry(
 _OF_PATHS = frozenset({"recording", "realtime", "folder", "v4l2", "pipe", "zmq+ipc"})
 """Schemes followed by a path, which may begin with a slash."""
 _BLOCKING = frozenset({*_URLS, "v4l2"})
-"""Schemes of sources that block in a library or driver and are therefore read in a separate process."""
+"""Schemes of sources that block in a library or driver. They are read in a separate process unless
+`SourceOptions.process` is False.
+"""
 
 _ON_DISK = frozenset({"recording", "realtime"})
 """Schemes of files. Unlike a camera, a missing file does not become available again."""
@@ -136,7 +138,7 @@ def check_address(address: str) -> None:
 
 
 def _reads_in_a_process(scheme: str, rest: str, options: SourceOptions) -> bool:
-    # A separate process has neither this process's standard input nor its registered sources.
+    # Read in this process: a separate one has neither its standard input nor its registered sources.
     if scheme not in _BUILT_IN or (scheme == "pipe" and rest.partition("?")[0] == "-"):
         return False
     return scheme in _BLOCKING if options.process is None else options.process

@@ -249,7 +249,7 @@ class TokenBuckets:
         enough = left >= tokens
         self._buckets[caller] = (left - tokens if enough else left, now_s)
         if len(self._buckets) > MOST_BUCKETS:
-            self._buckets.popitem(last=False)  # least recently used: its bucket is full again, or nearly
+            self._buckets.popitem(last=False)  # least recently used: this bucket has refilled, or nearly
         return 0.0 if enough else (tokens - left) / self._rate
 
 

@@ -171,7 +171,7 @@ class WatchedPublisher(PicturePublisher):
 
 
 def wait_for_readers(publishers: Iterable[WatchedPublisher], timeout_s: float) -> None:
-    """Wait until a reader connects to or leaves one of the publishers."""
+    """Wait up to `timeout_s` seconds until a reader connects to or leaves one of the publishers."""
     poller = zmq.Poller()
     for publisher in publishers:
         poller.register(publisher._socket, zmq.POLLIN)

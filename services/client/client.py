@@ -320,7 +320,10 @@ class Client(ReplayMethods, SnapshotMethods):
         )
 
     def activate(self, name: str, number: int, expected_current: int | None) -> VersionView:
-        """Activate a version in place of `expected_current` (None if no version is active)."""
+        """Activate a version in place of `expected_current` (None if no version is active).
+
+        The server refuses if another version is active.
+        """
         wanted = {"version": number, "expected_current": expected_current}
         return VersionView.model_validate(self._ask("POST", f"/v1/models/{name}/activate", json=wanted))
 

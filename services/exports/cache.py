@@ -96,7 +96,7 @@ class ExportPrograms:
             raise ExportFailed(f"the export ended with code {code}: {words[-1][:300]}; the server's log may say more")
 
     def end(self) -> None:
-        """Kill running export programs, and every program started later."""
+        """Kill running export programs. Programs that are started later are killed immediately after their start."""
         with self._lock:
             self._ended = True
             for process in self._running:

@@ -246,7 +246,7 @@ MOST_REASON = 1000
 
 @dataclass(frozen=True)
 class Heard:
-    """Jobs of an owner that changed in the database since its last renewal."""
+    """Running jobs that their owner must end, as found by `Claims.renew`."""
 
     lost: frozenset[str]
     """Jobs that this owner lost: taken over by another owner, or deleted."""

@@ -56,8 +56,10 @@ class VersionRecord:
     """Caller that caused the current state."""
     changed_at: datetime
     description: dict[str, Any] = field(default_factory=dict)
-    """Results of the check: gaussians, parameters, field, width_px, height_px, time_window_s,
-    model_sha256, render_ms. Empty before the check."""
+    """Results of the check: gaussians, parameters, field, renderer, width_px, height_px, time_window_s, model_sha256,
+    render_ms, covered (share of pixels with an opacity above 0.5). Empty before the check. Partial or empty after a
+    rejection.
+    """
 
 
 @dataclass(frozen=True)

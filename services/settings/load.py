@@ -39,7 +39,7 @@ class YamlFile:
 
     values: dict[str, Any]
     lines: dict[tuple[str, ...], int]
-    """Line number of each key, by its path of keys."""
+    """Line number of each key, by its path of keys. Keys inside lists are not included."""
     name: str
 
     @classmethod

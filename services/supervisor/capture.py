@@ -77,7 +77,11 @@ class CapturedSource(LiveSource):
 
     @property
     def state(self) -> SourceState:
-        """Current state of the source: the one that the capture process reported while no frame is pending."""
+        """Current state of the source, by the calls of `lost` and the time since the last frame, as in `LiveSource`.
+
+        If that state is `LIVE` and no frame waits for `read`, a state that the capture process reported since the last
+        frame replaces it.
+        """
         state, reported = super().state, self._reported
         if state is SourceState.LIVE and reported is not None and not self._ready:
             return reported[0]

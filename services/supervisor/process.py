@@ -118,7 +118,7 @@ class ProcessState:
     restarts: int
     figures: Mapping[str, Any]
     heard_s: float | None
-    """Seconds since the last heartbeat."""
+    """Seconds since the last heartbeat; None if the process does not run or has not sent one."""
     rate_hz: float | None = None
     """Captured frames or new pictures per second over the last `RATE_S`."""
     lost: bool = False

@@ -239,8 +239,9 @@ def label(image: NDArray[np.uint8], layer: Layer, state: PictureState, age_ns: i
 
 
 def _at(scene: LayerScene) -> tuple[Gaussians, torch.Tensor | None]:
-    """Return the Gaussians at the scene's time and, for each, the time in seconds since a frame showed it; None if
-    unknown.
+    """Return the Gaussians at the scene's time, and the times [N] in seconds since a frame showed each of them.
+
+    The times are None if the model does not have them.
     """
     model = scene.model
     unseen_s = model.unseen_s() if isinstance(model, Snapshot) else model.unseen_s

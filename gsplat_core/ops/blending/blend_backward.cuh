@@ -45,8 +45,8 @@ struct BackwardStage {
   alignas(16) uint32_t hits[kWarps][kBackwardBatch + kSlots];  // byte offsets of the splats that reach the warp's quadrant
 };
 
-// List the splats of the batch that reach this warp's pixels, back to front, and return their number. Eight more
-// entries are readable.
+// Write the byte offsets of the splats of the batch that reach this warp's pixels to `hits`, back to front, and return
+// their number. kSlots further entries refer to a splat that reaches no pixel.
 template <int D>
 __device__ inline int list_hits_backward(unsigned (&groups)[kBackwardBatch / 32], uint32_t* hits) {
   const int lane = threadIdx.x & 31;

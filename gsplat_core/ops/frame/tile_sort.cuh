@@ -83,7 +83,7 @@ __device__ inline void merge_down(uint64_t* keys, int count, int pairs, int dist
   }
 }
 
-// Sort `keys` in shared memory, which were written before the last barrier. Ends with a barrier.
+// Sort `keys` in shared memory, which were written before the last barrier. Ends with a barrier if it sorts anything.
 __device__ inline void sort_shared(uint64_t* keys, int count) {
   if (count < 2) return;
   const int pairs = 1 << (31 - __clz(count - 1));  // half of the next power of two

@@ -106,7 +106,8 @@ void draw_on_device(const Scene& scene, const Request& view, const Queue& queue,
 void resolve_on_device(const Scene& scene, const Request& view, const uint64_t* frame, float* sums, cudaStream_t stream);
 void poisson_on_device(const double* rates, int64_t rate_count, int64_t count, uint64_t seed, int64_t* out, cudaStream_t stream);
 
-// Number of splats whose fragments can be counted in the 42 bits that the queue has for them.
+// Return the capacity of the queue in splats, at least 1 and less than 2^21. It is limited by `bytes` of memory and by
+// the 42 bits that count the fragments of all splats in the queue.
 constexpr int64_t most_in_queue(int64_t bytes, int64_t subpixels) {
   const int64_t by_memory = bytes / int64_t(sizeof(Splat) + sizeof(uint64_t));
   const int64_t by_bits = (int64_t(1) << 42) / (2 * (subpixels > 64 ? subpixels : 64));

@@ -208,7 +208,7 @@ class Covering:
         self._under_way: list[Future[Gaussians | None]] = []
 
     def begin(self, camera: Camera | None, device: torch.device, rows: int) -> None:
-        """Prepare for a new scene, cancelling the creation of Gaussians for the previous one.
+        """Prepare for a new scene, and discard Gaussians that are being created for the previous one.
 
         Args:
             camera: camera for a captured coverage test on a GPU, or None for no such test.
@@ -219,7 +219,10 @@ class Covering:
         self._coverage = None if camera is None else CapturedCoverage(camera, device, rows)
 
     def forget(self) -> None:
-        """Cancel the creation of Gaussians for a scene that the stream has left."""
+        """Discard the Gaussians that the host thread is creating, because the stream has left their scene.
+
+        The thread itself is not interrupted.
+        """
         self._under_way.clear()
 
     def join(self, step: TrainingStep) -> None:

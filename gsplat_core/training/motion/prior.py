@@ -257,8 +257,10 @@ class FlowPrior:
         return HORIZON_S
 
     def observe(self, frame: Frame, time_s: float, camera: Camera, step: TrainingStep) -> None:
-        """Measure the optical flow to the next frame, update the damping, and move the scene by the flow if training
-        starts from it.
+        """Measure the optical flow from the previous frame to `frame` and update the damping.
+
+        If the settings say so, also correct the depth of the Gaussians by the flow (`depth_from_motion`), and start the
+        training at `time_s` from the scene moved by the flow (`start_from_motion`).
         """
         before, before_s = self._camera, self.newest_s
         self._camera, self.newest_s = camera, time_s
