@@ -30,7 +30,7 @@ from run_facts import run_facts
 from gsplat_core.depth.stereo import StereoDepth
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.geometry.measure import Length, Measurement
-from gsplat_core.geometry.surface import points_of, rays_of
+from gsplat_core.geometry.mesh import points_of, rays_of
 from gsplat_core.io.model_sources import load_model
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.models.model import Model

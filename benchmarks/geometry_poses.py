@@ -29,7 +29,7 @@ import torch
 from geometry_moving import add_breathing_options, asked_breathing, breathing_facts
 from run_facts import run_facts
 
-from gsplat_core.evaluation.trajectory import evaluate_trajectory
+from gsplat_core.evaluation.geometry import evaluate_trajectory
 from gsplat_core.experimental.breathing_depth import MovingTissue
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.io.recordings.synthetic.rendered import RenderSettings, render_recording

@@ -32,7 +32,7 @@ from gsplat_core.depth.multiview import ParallaxDepth
 from gsplat_core.depth.stereo import StereoDepth
 from gsplat_core.endoscope.field_of_view import FieldOfView
 from gsplat_core.evaluation.depth import MOST_DEPTH_PIXELS, flat_depths, pixels_to_compare
-from gsplat_core.evaluation.trajectory import evaluate_trajectory
+from gsplat_core.evaluation.geometry import evaluate_trajectory
 from gsplat_core.experimental.breathing_depth import MovingTissue
 from gsplat_core.experimental.light import LightDepth
 from gsplat_core.io.recordings import FileRecording, open_recording, synthesize

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core import Model, Reconstructor, ReconstructorConfig
-from gsplat_core.geometry.surface import normals_of
+from gsplat_core.geometry.mesh import normals_of
 from gsplat_core.io.recordings.synthetic.rendered import RenderedRecording, RenderSettings, render_recording
 from gsplat_core.scene.frames import Frame
 

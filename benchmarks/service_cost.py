@@ -27,7 +27,7 @@ from operators.sources.source import SourceDescription
 from services.bus.messages import CommandServer, Heartbeats
 from services.bus.pictures import PicturePublisher, picture_from, subscribe
 from services.bus.runtime import RuntimeFolder
-from services.display.hub import encoded
+from services.display import encoded
 from services.supervisor.capture import CapturedSource
 
 

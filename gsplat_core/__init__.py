@@ -14,8 +14,7 @@ if TYPE_CHECKING:
     from gsplat_core.deformation import DeformationField
     from gsplat_core.errors import CoreError, InvalidInput
     from gsplat_core.io.bundle import load_bundle, save_bundle
-    from gsplat_core.io.exports.export import save_gaussians
-    from gsplat_core.io.exports.splats import export_splats
+    from gsplat_core.io.exports.export import export_splats, save_gaussians
     from gsplat_core.io.ply import load_ply, save_ply
     from gsplat_core.io.png_compression import PngCompression
     from gsplat_core.io.recordings import open_recording
@@ -144,7 +143,7 @@ _HOME = {
     "UnscentedTransformParameters": "ops.unscented_projection",
     "accumulate": "ops.compositing",
     "accumulate_2dgs": "ops.surfel_blending",
-    "export_splats": "io.exports.splats",
+    "export_splats": "io.exports.export",
     "fully_fused_projection": "ops.projection.projection",
     "fully_fused_projection_2dgs": "ops.surfel_projection.surfel_projection",
     "fully_fused_projection_with_ut": "ops.unscented_projection",

@@ -3,14 +3,17 @@
 LAPACK, BLAS and torch's reductions split long sums among threads, so rounding depends on the thread count. The solution
 of a system with 200 unknowns, or the mean of 40,000 pixels, differs in its last bits between one and two threads.
 Geometry runs such operations within `one_thread` to be reproducible.
+
+Priority of background threads, which use CPU time that the graph leaves idle.
 """
 
 from __future__ import annotations
 
 import os
+import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 import torch
 
@@ -48,3 +51,14 @@ def one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+NICENESS = 10
+"""Nice value of a background thread."""
+
+
+def step_back() -> None:
+    """Lower the scheduling priority of the calling thread. No effect except on Linux."""
+    if sys.platform == "linux":  # on other systems the nice value applies to the whole process
+        with suppress(OSError):  # if not permitted, keep the normal priority
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)

@@ -23,9 +23,8 @@ from gsplat_core.endoscope.highlights import HighlightFinder
 from gsplat_core.endoscope.interlacing import Deinterlacer, without_combs
 from gsplat_core.endoscope.mask_and_depth import DepthCheck, MaskCheck
 from gsplat_core.endoscope.ordinary import LOOK_EVERY_S, OrdinaryPictures, Turns
-from gsplat_core.endoscope.sequence import SequenceCheck
+from gsplat_core.endoscope.sequence import OUT_OF_ORDER, SequenceCheck, StreamClock
 from gsplat_core.endoscope.sharpness import SharpnessGate
-from gsplat_core.endoscope.stream_clock import OUT_OF_ORDER, StreamClock
 from gsplat_core.endoscope.strip import StripDetector
 from gsplat_core.scene.frames import CUT_IN_DOUBT, Frame, FrameStatus
 from operators.graph import Operator, OperatorSpec

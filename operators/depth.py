@@ -19,12 +19,11 @@ from gsplat_core.depth.registry import DepthFinder, check_depth, evidence, keeps
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_origin import BELIEVED
 from gsplat_core.scene.frames import Frame
-from gsplat_core.threads import usable_cores, use_one_thread
+from gsplat_core.threads import step_back, usable_cores, use_one_thread
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.placement import LateDepth
 from operators.graph import Operator, OperatorSpec
 from operators.outcome import OutcomeBuilder
-from operators.side_thread import step_back
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.training.metrics import SETTLING_S
-from operators.falling_behind import BehindGuard
-from operators.frame_clock import FrameClock
+from operators.frame_clock import BehindGuard, FrameClock
 from operators.graph import ConditionType, MessageOrTimeoutCondition, Operator, OperatorSpec
 from operators.graph.tracking import DurationSummary, Histogram
 from operators.messages import PictureState, RenderedFrame, ShownPicture

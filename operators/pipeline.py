@@ -40,8 +40,7 @@ from operators.choices import SINKS, Policy
 from operators.compare_shown import CompareShownOp
 from operators.depth import DepthOp
 from operators.display import DisplayOp
-from operators.falling_behind import BehindGuard
-from operators.frame_clock import FrameClock
+from operators.frame_clock import BehindGuard, FrameClock
 from operators.frame_log import FRAMES_FILE, FrameLog
 from operators.graph import Application, GreedyScheduler, MultiThreadScheduler, Operator
 from operators.ingest import SourceOp

@@ -1,11 +1,22 @@
-"""Detection and marking of remembered tissue: rendered, but not visible in the current frame."""
+"""Detection and marking of remembered tissue: rendered, but not visible in the current frame.
+
+Remembered tissue was seen earlier and is not visible to the camera now.
+"""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
+from gsplat_core.argument_checks import require_shape
+from gsplat_core.rendering.rasterization import render
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.gaussians import SH_C0, Gaussians
 from operators.messages import RenderedFrame
 
 COVERED = 0.1
@@ -114,3 +125,21 @@ def marked(rendered: RenderedFrame) -> NDArray[np.uint8]:
     picture = rendered.image.copy()
     tissue.mark(picture, layer, (rendered.content or rendered.frame).mask)
     return picture
+
+
+def share_of(gaussians: Gaussians, chosen: Tensor, camera: Camera) -> Tensor:
+    """Return each pixel's share of chosen Gaussians in the blended weight.
+
+    Args:
+        gaussians: all Gaussians.
+        chosen: bool [N].
+        camera: camera of the picture.
+
+    Returns:
+        [H, W] in 0..1; 0 where nothing is rendered.
+    """
+    require_shape("chosen", chosen, (gaussians.count,), "[N]")
+    colours = (chosen.to(gaussians.dtype) - 0.5) / SH_C0
+    with torch.no_grad():
+        seen = render(replace(gaussians, sh=colours[:, None, None].expand(-1, 1, 3).contiguous()), camera, depth=False)
+    return torch.where(seen.alpha > 0, seen.image[..., 0] / seen.alpha.clamp(min=1e-6), 0).clamp(0, 1)

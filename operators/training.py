@@ -29,8 +29,7 @@ from gsplat_core.training.budget import Budget
 from gsplat_core.training.placement import MOST_LATE, LateDepth
 from gsplat_core.training.reconstructor import Reconstructor
 from operators.depth import BackgroundDepth, TakenDepth
-from operators.falling_behind import BehindGuard
-from operators.frame_clock import FrameClock
+from operators.frame_clock import BehindGuard, FrameClock
 from operators.graph.tracking import Histogram
 from operators.messages import Reconstruction
 from operators.outcome import OutcomeBuilder

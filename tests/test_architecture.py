@@ -81,7 +81,7 @@ def test_the_reference_is_imported_by_tests_only(package):
     [
         "import gsplat_core.reference",
         "from gsplat_core import reference",
-        "from gsplat_core.reference.frame import x",
+        "from gsplat_core.reference.rendering import x",
         "def f():\n    from gsplat_core.reference import deformation",
     ],
 )
@@ -181,7 +181,7 @@ WITHOUT_TORCH = [
     "services.supervisor.process",
     "services.supervisor.worker",
     "services.supervisor.stream",
-    "services.display.hub",
+    "services.display",
     "services.registry.models",
     "services.recordings.store",
     "services.jobs.pool",

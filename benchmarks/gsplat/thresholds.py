@@ -29,7 +29,7 @@ from own_tests import synthetic_scene
 from torch import Tensor
 
 import gsplat_core
-from gsplat_core.reference import compositing, surfel_blending
+from gsplat_core.reference import compositing, surfels
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "methods"))
 
@@ -92,8 +92,8 @@ TESTS = {
     ),
     "test_rasterize_to_pixels_2dgs": Test(
         gsplat_core.rasterize_to_pixels_2dgs,
-        surfel_blending.rasterize_to_pixels_2dgs,
-        surfel_blending,
+        surfels.rasterize_to_pixels_2dgs,
+        surfels,
         1e-3,
         1e-3,
         1e-3,
@@ -180,10 +180,10 @@ def main() -> None:
     size = chosen.width, chosen.height
     figures: dict[str, Any] = {}
     for name, test in TESTS.items():
-        surfels = test.module is surfel_blending
+        of_surfels = test.module is surfels
         scenes = (
             surfel_scene(chosen.points // 20, 2 * size[0], 2 * size[1], seed, chosen.device)
-            if surfels
+            if of_surfels
             else scene(chosen.points, *size, seed, chosen.device)
             for seed in chosen.seeds
         )

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gsplat_core.argument_checks import require_trailing
 from gsplat_core.errors import InvalidInput
-from gsplat_core.io.exports.splats import export_splats
+from gsplat_core.io.exports.export import export_splats
 from gsplat_core.scene.gaussians import SH_C0
 from gsplat_core.training.strategies.operations import draw
 

@@ -56,7 +56,7 @@ MODULES: Mapping[str, Mapping[str, str]] = {
         "__version__": "gsplat_core.as_gsplat.names:VERSION",
         "accumulate": "gsplat_core.ops.compositing",
         "accumulate_2dgs": "gsplat_core.ops.surfel_blending",
-        "export_splats": "gsplat_core.io.exports.splats",
+        "export_splats": "gsplat_core.io.exports.export",
     },
     "gsplat._helper": {"load_test_data": "gsplat_core.as_gsplat.test_scene"},
     "gsplat.compression": {"PngCompression": "gsplat_core.io.png_compression"},
@@ -111,7 +111,7 @@ MODULES: Mapping[str, Mapping[str, str]] = {
         "all_to_all_tensor_list": _DISTRIBUTED,
         "cli": _DISTRIBUTED,
     },
-    "gsplat.exporter": {"export_splats": "gsplat_core.io.exports.splats"},
+    "gsplat.exporter": {"export_splats": "gsplat_core.io.exports.export"},
     "gsplat.init_utils": {"knn_scale_init": _SURGICAL, "multi_frame_depth_unprojection": _SURGICAL},
     "gsplat.losses": {
         "binocular_disparity_l1": _SURGICAL,

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.geometry.neighbours import nearest_others
+from gsplat_core.geometry.registration import nearest_others
 from gsplat_core.ops.ssim import fused_ssim
 
 LEAST_VARIANCE = 1e-12

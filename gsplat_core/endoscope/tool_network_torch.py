@@ -20,9 +20,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from gsplat_core.endoscope.onnx import read_model
+from gsplat_core.endoscope.onnx import read_model, values
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.io.protobuf import values
 from gsplat_core.rendering.frame_renderer import CapturedSequence, GraphMemory
 
 PRIORITY = -1

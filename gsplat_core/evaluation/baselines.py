@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.evaluation.scores import Entry, Record, finite, why_left_out
-from gsplat_core.io.recordings.split import is_heldout
+from gsplat_core.io.recordings.recording import is_heldout
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.metrics import ImageLike, ScoredMean, psnr_tissue_db, psnrs_db, unit_image
 

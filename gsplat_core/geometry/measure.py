@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.geometry.surface import in_world, rays_of
+from gsplat_core.geometry.mesh import in_world, rays_of
 from gsplat_core.models.model import Model
 from gsplat_core.rendering.surface import COVERED, Surface
 from gsplat_core.scene.cameras import Camera

@@ -1,4 +1,7 @@
-"""Coloured triangle meshes of a model's surface at one time, made from a depth map and cut at occlusion edges."""
+"""Coloured triangle meshes of a model's surface at one time, made from a depth map and cut at occlusion edges.
+
+The surface of a depth map has points, normals and occlusion edges.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +11,114 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsplat_core.errors import ExportError
-from gsplat_core.geometry.surface import in_world, joined, points_of
+from gsplat_core.errors import ExportError, InvalidInput
 from gsplat_core.models.model import Model
 from gsplat_core.rendering.surface import COVERED
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.transfers import HostCopy
+
+Array = NDArray[np.floating]
+
+TORN_DEGREES = 80.0
+"""Tilt against the line of sight in degrees above which a depth step between neighbouring pixels
+counts as an occlusion edge.
+"""
+MOST_ANGLE_RAD = 1.5
+"""Largest angle of a fisheye ray to the axis in radians; at 90 degrees a ray has no point at z = 1."""
+
+
+def rays_of(camera: Camera, pixels: Array) -> tuple[Array, Array]:
+    """Return the rays of pixel coordinates [..., 2].
+
+    Returns:
+        Points at z = 0 and steps to z = 1, both [..., 3] in camera coordinates.
+    """
+    plane = (np.asarray(pixels, np.float64) - camera.K[:2, 2]) / np.diag(camera.K)[:2]
+    zero, one = np.zeros_like(plane[..., :1]), np.ones_like(plane[..., :1])
+    if camera.model == "ortho":
+        return np.concatenate([plane, zero], -1), np.concatenate([zero, zero, one], -1)
+    if camera.model == "fisheye":
+        angle = np.linalg.norm(plane, axis=-1, keepdims=True)
+        plane = plane * np.tan(np.minimum(angle, MOST_ANGLE_RAD)) / np.maximum(angle, 1e-9)
+    return np.zeros((*plane.shape[:-1], 3)), np.concatenate([plane, one], -1)
+
+
+def points_of(depth: Array, camera: Camera) -> NDArray[np.float64]:
+    """Return points [H, W, 3] in camera coordinates at the pixel centres of a depth map z [H, W];
+    meaningless where the depth is unknown (0).
+    """
+    if depth.shape != (camera.height_px, camera.width_px):
+        raise InvalidInput(
+            f"the depth is {list(depth.shape)}; the camera's picture is [{camera.height_px}, {camera.width_px}]"
+        )
+    column, row = np.meshgrid(np.arange(camera.width_px) + 0.5, np.arange(camera.height_px) + 0.5)
+    start, step = rays_of(camera, np.stack([column, row], -1))
+    return np.asarray(start + step * np.nan_to_num(depth, posinf=0, neginf=0)[..., None], np.float64)
+
+
+def in_world(points: Array, camera: Camera) -> NDArray[np.float64]:
+    """Transform points [..., 3] from camera to world coordinates."""
+    rotation, translation = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
+    return np.asarray((points - translation) @ rotation, np.float64)
+
+
+def known(depth: Array) -> NDArray[np.bool_]:
+    """Return where a depth map is known, bool [H, W]."""
+    return np.asarray(np.isfinite(depth) & (depth > 0))
+
+
+def joined(depth: Array, camera: Camera, axis: int) -> NDArray[np.bool_]:
+    """Return which neighbouring pixels are connected by the surface.
+
+    Two pixels are connected if both depths are known and the surface between them is tilted by less
+    than `TORN_DEGREES` against the line of sight.
+
+    Args:
+        depth: [H, W], z in camera coordinates, 0 = unknown.
+        camera: camera of the depth map.
+        axis: 0 for vertical, 1 for horizontal neighbours.
+
+    Returns:
+        bool, one element shorter than [H, W] along `axis`.
+    """
+    points = points_of(depth, camera)
+    there = known(depth)
+    before, after = _pair(points, axis)
+    both = np.logical_and(*_pair(there, axis))
+    z = 0.5 * (before[..., 2] + after[..., 2])
+    pixel = 1 / camera.K[1 - axis, 1 - axis] * (1 if camera.model == "ortho" else z)
+    return np.asarray(both & (np.abs(after[..., 2] - before[..., 2]) < np.tan(np.radians(TORN_DEGREES)) * pixel))
+
+
+def normals_of(depth: Array, camera: Camera) -> NDArray[np.float32]:
+    """Return unit normals [H, W, 3] in camera coordinates, facing the camera, from differences of
+    connected neighbours. Pixels without a connected neighbour in both directions get 0.
+    """
+    points = points_of(depth, camera)
+    (across, has_across), (down, has_down) = (_tangent(points, joined(depth, camera, axis), axis) for axis in (1, 0))
+    normals = np.cross(down, across)  # with x right and y down, this points towards the camera
+    length = np.linalg.norm(normals, axis=-1)
+    good = has_across & has_down & (length > 0)
+    normals = np.where(good[..., None], normals / np.where(length > 0, length, 1)[..., None], 0)
+    towards = normals[..., 2] if camera.model == "ortho" else np.einsum("...i,...i->...", normals, points)
+    return np.where((towards > 0)[..., None], -normals, normals).astype(np.float32)
+
+
+def _pair(values: NDArray, axis: int) -> tuple[NDArray, NDArray]:
+    return (values[:-1], values[1:]) if axis == 0 else (values[:, :-1], values[:, 1:])
+
+
+def _tangent(points: Array, joins: NDArray[np.bool_], axis: int) -> tuple[Array, NDArray[np.bool_]]:
+    """Return the tangent along `axis` [H, W, 3], from both connected neighbours or one, and where it exists [H, W]."""
+    before, after = _pair(points, axis)
+    step = np.where(joins[..., None], after - before, 0)
+    padding = [(0, 0), (0, 0), (0, 0)]
+    padding[axis] = (1, 0)
+    backward, has_backward = np.pad(step, padding), np.pad(joins, padding[:2])
+    padding[axis] = (0, 1)
+    forward, has_forward = np.pad(step, padding), np.pad(joins, padding[:2])
+    return backward + forward, has_backward | has_forward
+
 
 LEAST_OPACITY = 0.5
 """Least opacity of a pixel that becomes part of the mesh, stricter than `COVERED`."""

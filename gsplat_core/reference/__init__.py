@@ -20,24 +20,16 @@ from gsplat_core.reference.deformation import (
     hexplane_space,
 )
 from gsplat_core.reference.densification import accumulate_gradient_norms_, diffuse_positions_
-from gsplat_core.reference.disparity_fit import fit_disparities
-from gsplat_core.reference.edge_aware_filter import smooth_within_edges
 from gsplat_core.reference.flow_blending import blend_flow
-from gsplat_core.reference.frame import render_frame
-from gsplat_core.reference.image_loss import frame_loss, image_loss
-from gsplat_core.reference.points import point_moments
+from gsplat_core.reference.image_loss import frame_loss, image_loss, ssim_map
 from gsplat_core.reference.projection import fully_fused_projection
-from gsplat_core.reference.range_histogram import range_histogram
-from gsplat_core.reference.ray_blending import blend_rays, splat_rays
-from gsplat_core.reference.ray_losses import ray_depth_loss, ray_normal_loss
-from gsplat_core.reference.rendering import rasterization
+from gsplat_core.reference.ray_blending import blend_rays, range_histogram, ray_depth_loss, ray_normal_loss, splat_rays
+from gsplat_core.reference.rendering import rasterization, render_frame
 from gsplat_core.reference.spherical_harmonics import spherical_harmonics
 from gsplat_core.reference.splat_regression import splat_regression, splat_regression_gradients
-from gsplat_core.reference.ssim import ssim_map
-from gsplat_core.reference.stereo_matching import match_disparities
-from gsplat_core.reference.stochastic import sample_moments
-from gsplat_core.reference.surfel_blending import rasterize_to_pixels_2dgs
-from gsplat_core.reference.surfel_projection import fully_fused_projection_2dgs
+from gsplat_core.reference.stereo import fit_disparities, match_disparities, smooth_within_edges
+from gsplat_core.reference.stochastic import point_moments, sample_moments
+from gsplat_core.reference.surfels import fully_fused_projection_2dgs, rasterize_to_pixels_2dgs
 from gsplat_core.reference.tiles import isect_offset_encode, isect_tiles
 from gsplat_core.reference.weighted_sum import weighted_sums
 

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.errors import InvalidInput, InvalidSetting
-from gsplat_core.geometry.neighbours import nearest_others
+from gsplat_core.geometry.registration import nearest_others
 from gsplat_core.ops.flow_blending import blend_flow
 from gsplat_core.ops.neighbour_motion import neighbour_motion
 from gsplat_core.ops.projection.arguments import DenseProjection

@@ -21,7 +21,7 @@ from gsplat_core.choices import STRATEGIES
 from gsplat_core.depth.maps import OfRecording
 from gsplat_core.depth.registry import new_estimator, with_surface
 from gsplat_core.errors import InvalidInput
-from gsplat_core.geometry.neighbours import nearest_others
+from gsplat_core.geometry.registration import nearest_others
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.motion.surface_tracks import SurfaceTracks
 from gsplat_core.training.observations import Observation

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsplat_core.errors import InvalidSetting, RecordingInvalid
-from gsplat_core.geometry.neighbours import nearest_others
+from gsplat_core.geometry.registration import nearest_others
 from gsplat_core.io.recordings.colmap import ColmapScene, PosedImage
 from gsplat_core.ops.adam import adam_step_queued
 from gsplat_core.ops.image_loss.image_loss import image_loss

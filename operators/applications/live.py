@@ -1,19 +1,28 @@
 """Live reconstruction and display of an endless stream.
 
 Before the first frame, models and operators are warmed up and the interpreter is set for low latency. `operators.pipeline` has the graph.
+
+Creation of the recorder of a live run, which keeps frames, pictures and the calls of training.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import gc
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 import cv2
+from pydantic import TypeAdapter
 
+from gsplat_core.io.frame_codec import camera_record
+from gsplat_core.io.sessions import SessionInfo
+from gsplat_core.io.sessions.records import ReconstructorMade
 from gsplat_core.models.model import Model
 from gsplat_core.models.snapshots import Snapshot
 from gsplat_core.rendering.renderer import check_renderer
@@ -22,7 +31,6 @@ from gsplat_core.training.reconstructor import Reconstructor
 from operators.applications.device import check_device, seeded
 from operators.applications.limits import check_picture
 from operators.applications.live_settings import LIVE_PREDICT_EVERY, LiveSettings
-from operators.applications.recording import new_recorder, reconstructor_line
 from operators.applications.session import Report, RunOutcome, Session, delivered, saves_model
 from operators.applications.warm_reconstructor import warm_reconstructor
 from operators.applications.working_size import (
@@ -36,14 +44,76 @@ from operators.applications.working_size import (
 from operators.frame_clock import FrameClock
 from operators.messages import DeformedScene, ShownPicture
 from operators.metrics import ScoredFrame
+from operators.output_folder import RECORDINGS
 from operators.pipeline import REPORT_RESERVE_BYTES, Outputs, Pace, Pipeline
 from operators.pose import check_poses
 from operators.rasterize import Rasterizer
+from operators.sinks.session_recorder import SessionRecorder
 from operators.sources.address import SourceOptions
 from operators.sources.derived import ScaledSource, scaled_description
 from operators.sources.registry import open_source
 from operators.sources.source import FrameSource, SourceDescription
 from operators.storage import StorageReserve
+
+RECORDING_RESERVE_BYTES = 64 * 2**20
+"""Disk space that a recording leaves free in addition to the space for finishing the run, in bytes."""
+
+
+def new_recording_folder(out: Path) -> Path:
+    """Return a new folder name for the recording of a run with the output folder `out`. Creates nothing."""
+    base = out / RECORDINGS / datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
+    folder, more = base, 1
+    while folder.exists():
+        folder, more = base.with_name(f"{base.name}-{more}"), more + 1
+    return folder
+
+
+def new_recorder(
+    folder: Path, source: SourceDescription, settings: LiveSettings, room_to_finish: Callable[[], int]
+) -> SessionRecorder:
+    """Create the recorder of a run. The graph opens it at its start.
+
+    Args:
+        folder: folder for this recording alone.
+        source: description of the stream.
+        settings: settings of the run.
+        room_to_finish: returns the disk space that finishing the run needs, in bytes.
+    """
+    info = SessionInfo(
+        source=source.name[:1000],
+        utc=datetime.now(UTC).isoformat(),
+        fps=source.fps,
+        camera=camera_record(source.camera),
+        fields=tuple(sorted(source.fields & {"mask", "depth", "right_image", "pose"})),  # type: ignore[arg-type]
+        settings={"device": settings.device, "scale": settings.given_scale, "seed": settings.seed},
+        keeps_bytes=settings.recording.keep_bytes,
+        keeps_s=settings.recording.keep_s,
+    )
+    reserve = StorageReserve(folder, lambda: RECORDING_RESERVE_BYTES + room_to_finish())
+    return SessionRecorder(folder, info, settings.recording, reserve=reserve)
+
+
+def reconstructor_line(
+    reconstructor: Reconstructor, settings: LiveSettings, source: SourceDescription
+) -> ReconstructorMade:
+    """Return the line that records the settings of a new reconstructor."""
+    return ReconstructorMade(
+        device=settings.device,
+        seed=settings.seed,
+        renderer=settings.renderer,
+        config=_json(reconstructor.config),
+        training=_json(settings.chosen_training),
+        camera=camera_record(reconstructor.camera),
+        stereo=source.is_stereo,
+    )
+
+
+def _json(settings: Any) -> dict[str, Any]:
+    """Return the fields of a dataclass as JSON values."""
+    assert dataclasses.is_dataclass(settings)
+    values: dict[str, Any] = TypeAdapter(type(settings)).dump_python(settings, mode="json")
+    return values
+
 
 GARBAGE_THRESHOLDS = (20_000, 20, 1000)
 """Thresholds of the garbage collector. Collections are rare and mostly of young objects: processing

@@ -5,18 +5,20 @@ imported only by `run(app, engine="holoscan")`.
 """
 
 from operators.graph.application import Application, Engine, Fragment, run
-from operators.graph.clock import Clock, ManualClock, RealtimeClock
 from operators.graph.conditions import (
     AsynchronousCondition,
     AsynchronousEventState,
     BooleanCondition,
+    Clock,
     Condition,
     CountCondition,
     DownstreamMessageAffordableCondition,
+    ManualClock,
     MessageAvailableCondition,
     MessageOrTimeoutCondition,
     PeriodicCondition,
     PeriodicConditionPolicy,
+    RealtimeClock,
     SchedulingStatus,
 )
 from operators.graph.graph import RunResult, StopReason

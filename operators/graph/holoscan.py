@@ -27,8 +27,7 @@ import threading
 from typing import Any, cast
 
 from operators.errors import EngineError, EngineUnsupported
-from operators.graph.clock import ManualClock
-from operators.graph.conditions import SchedulingStatus
+from operators.graph.conditions import ManualClock, SchedulingStatus
 from operators.graph.graph import Graph, OperatorTask, Scheduler
 from operators.graph.queues import CarriedEdge
 from operators.graph.schedulers import GreedyScheduler, MultiThreadScheduler, interruptible_wait

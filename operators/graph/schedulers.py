@@ -8,8 +8,7 @@ from functools import partial
 from typing import Any
 
 from operators.errors import GraphInvalid, OperatorStuck
-from operators.graph.clock import Clock, ManualClock, RealtimeClock
-from operators.graph.conditions import SchedulingStatus
+from operators.graph.conditions import Clock, ManualClock, RealtimeClock, SchedulingStatus
 from operators.graph.graph import Graph, OperatorTask
 from operators.graph.queues import Edge, LockedEdge
 from operators.graph.spec import QueuePolicy

@@ -30,11 +30,11 @@ from gsplat_core.io.sessions import SessionInfo, SessionWriter, WriterOptions
 from gsplat_core.io.sessions.records import SESSION_FILE, LostLine, ScheduleLine
 from gsplat_core.io.sessions.writer import Shown
 from gsplat_core.scene.frames import Frame
+from gsplat_core.threads import step_back
 from operators.errors import OutputError
 from operators.graph import Operator, OperatorSpec
 from operators.messages import ShownPicture
 from operators.outcome import OutcomeBuilder
-from operators.side_thread import step_back
 from operators.storage import StorageReserve, mebibytes, storage_errors
 
 

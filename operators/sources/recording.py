@@ -11,7 +11,7 @@ from functools import cached_property
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings import Recording, open_recording
-from gsplat_core.io.recordings.ahead import read_ahead
+from gsplat_core.io.recordings.contents import read_ahead
 from gsplat_core.io.sessions import SessionReader
 from gsplat_core.scene.frames import Frame
 from operators.errors import SourceLost

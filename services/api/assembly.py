@@ -41,8 +41,8 @@ from services.jobs.results import Results
 from services.jobs.store import JobStore, uses_recording
 from services.missing_files import StoredFiles, StoredFilesWatch
 from services.recordings.store import RecordingStore, State
-from services.registry.limits import NICENESS
 from services.registry.models import DATABASE_FILE, ModelRegistry
+from services.registry.records import NICENESS
 from services.schemas.service import CheckResult
 from services.settings import ServiceSettings
 from services.supervisor.metrics import StreamMeasures

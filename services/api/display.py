@@ -22,7 +22,7 @@ from services.api.guard import CallerOf, new_router, requires, still_valid
 from services.api.problems import Unavailable, problem_answer
 from services.api.state import ControlState, control_of, part
 from services.auth.roles import Caller
-from services.display.hub import BOUNDARY, EncodedPicture, PictureKind
+from services.display import BOUNDARY, EncodedPicture, PictureKind
 from services.settings import ResourceName
 
 log = logging.getLogger(__name__)

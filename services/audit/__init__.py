@@ -6,8 +6,7 @@ AuditError
 """
 
 from services.audit.files import Entry, Keeping
-from services.audit.log import AuditLog
-from services.audit.pages import ExportFormat, Wanted
+from services.audit.log import AuditLog, ExportFormat, Wanted
 from services.audit.verify import Finding, Verdict, verify
 from services.errors import AuditError, AuditInUse, AuditUnwritable
 

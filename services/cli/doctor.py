@@ -85,7 +85,7 @@ def _processor() -> list[Check]:
     import torch
 
     from gsplat_core.threads import usable_cores
-    from services.reports.machine import processor_name
+    from services.reports.schema import processor_name
 
     threads, cores = torch.get_num_threads(), usable_cores()
     advice = "" if threads <= cores else f"set OMP_NUM_THREADS={cores}: more threads than cores slow each other down"

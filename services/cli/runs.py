@@ -17,11 +17,10 @@ import typer
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.sessions import WriterOptions
-from operators.applications.live import live
+from operators.applications.live import live, new_recording_folder
 from operators.applications.live_settings import LiveSettings
 from operators.applications.progress import ProgressCallback
 from operators.applications.reconstruct import ReconstructSettings, reconstruct
-from operators.applications.recording import new_recording_folder
 from operators.applications.replay import ReplaySettings, replay
 from operators.applications.session import Report, RunOutcome
 from operators.metrics import ScoredFrame

@@ -107,7 +107,7 @@ def igtl(
     ] = False,
 ) -> int:
     """Send a stream's pictures and the pose of its camera over OpenIGTLink, for example to 3D Slicer."""
-    from services.cli.igtl import igtl_command
+    from services.cli.view import igtl_command
 
     return igtl_command(
         stream, config, runtime, kind=kind, host=host, port=port, name=name, spacing_mm=spacing_mm, plaintext=plaintext

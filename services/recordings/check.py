@@ -21,7 +21,7 @@ from typing import Any
 from gsplat_core.io.recordings import validate_recording
 from services.private_files import keep_files_private
 from services.recordings.archives import ARCHIVE, MOST_UNPACKED_BYTES, ArchiveInvalid, unpack
-from services.registry.limits import NICENESS, lower_limit, taken_bytes
+from services.registry.records import NICENESS, lower_limit, taken_bytes
 
 UPLOAD = "upload"
 _REPORTED_FACTS = (

@@ -28,7 +28,7 @@ from gsplat_core.io.model_files import open_model_file
 from gsplat_core.models.model import Model
 from gsplat_core.rendering.renderer import new_renderer
 from services.private_files import keep_files_private
-from services.registry.limits import (
+from services.registry.records import (
     CHECK_MEMORY_BYTES,
     MOST_GAUSSIANS,
     MOST_PIXELS,

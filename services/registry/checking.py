@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from services.errors import CheckFailed
-from services.registry.limits import CHECK_PASSED_S
+from services.registry.records import CHECK_PASSED_S
 
 PROGRAM = (sys.executable, "-P", "-m", "services.registry.check")
 CONVERTER = (sys.executable, "-P", "-m", "services.registry.convert")

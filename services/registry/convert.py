@@ -22,7 +22,7 @@ from gsplat_core.io.bundle import save_bundle
 from gsplat_core.io.model_sources import load_model
 from services.private_files import keep_files_private
 from services.registry.bundle_file import pack
-from services.registry.limits import CHECK_MEMORY_BYTES, MOST_GAUSSIANS, limit_resources, says_out_of_memory
+from services.registry.records import CHECK_MEMORY_BYTES, MOST_GAUSSIANS, limit_resources, says_out_of_memory
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -13,14 +13,22 @@ import sqlalchemy as sa
 
 from services.errors import Conflict, NotFound, Rejected, StoreUnavailable
 from services.registry import versions
-from services.registry.blobs import StagedUpload, open_blobs, stage
 from services.registry.bundle_file import SUFFIX
 from services.registry.checking import CONVERTER, PROGRAM, RunningChecks, Verdict, run_check, run_conversion
 from services.registry.database import Database
-from services.registry.folder import FolderLock, UnpackedModels, findings, folder_name, remove_leftovers
-from services.registry.limits import MOST_UPLOAD_BYTES
+from services.registry.folder import (
+    FolderLock,
+    StagedUpload,
+    UnpackedModels,
+    findings,
+    folder_name,
+    open_blobs,
+    remove_leftovers,
+    stage,
+)
 from services.registry.records import (
     MODELS,
+    MOST_UPLOAD_BYTES,
     UNCHECKED,
     Change,
     ModelRecord,

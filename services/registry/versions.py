@@ -9,7 +9,7 @@ from typing import Any
 import sqlalchemy as sa
 
 from services.errors import Conflict, NotFound, Rejected, StillActive
-from services.registry.blobs import StagedUpload
+from services.registry.folder import StagedUpload
 from services.registry.records import (
     ACTIVATABLE,
     ACTIVATIONS,

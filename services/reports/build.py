@@ -30,7 +30,6 @@ from operators.sources.source import SourceDescription
 from operators.training import TrainingCounts
 from operators.truth import TruthResult
 from services.reports.html import write_html
-from services.reports.machine import machine_facts
 from services.reports.pictures import hidden_pictures, keyframe_pictures
 from services.reports.schema import (
     BaselineQuality,
@@ -51,6 +50,7 @@ from services.reports.schema import (
     TrainingSteps,
     TrialFacts,
     TruthFacts,
+    machine_facts,
 )
 from services.version import product_version
 

@@ -37,8 +37,7 @@ from services.reports.evaluation_schema import (
     ScoreFacts,
     SecondEyeFacts,
 )
-from services.reports.machine import machine_facts
-from services.reports.schema import ModelFacts, RecordingFacts
+from services.reports.schema import ModelFacts, RecordingFacts, machine_facts
 from services.version import product_version
 
 LABELS = {

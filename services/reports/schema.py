@@ -1,18 +1,24 @@
 """Schema of `report.json`: one model for writing, reading and the JSON schema.
 
 While `format_version` is unchanged, fields are only added. A missing measurement is null, never NaN.
+
+Facts about the machine of the measurement.
 """
 
 from __future__ import annotations
 
 import json
+import platform
 from pathlib import Path
 from typing import Annotated, Literal
 
+import torch
 from pydantic import BaseModel, ConfigDict, Field
 
 from gsplat_core.choices import Eyes
 from gsplat_core.io.files import read_regular
+from gsplat_core.ops.native import instruction_set
+from gsplat_core.threads import usable_cores
 from operators.storage import write_whole
 
 MOST_REPORT_BYTES = 256 << 20
@@ -310,3 +316,26 @@ class RunReport(Part):
             OSError: if the path is no regular file of at most MOST_REPORT_BYTES.
         """
         return cls.model_validate_json(read_regular(path, MOST_REPORT_BYTES))
+
+
+def machine_facts() -> dict[str, str]:
+    """Return names and values of the facts, formatted for people."""
+    return {
+        "Processor": f"{processor_name()}, {usable_cores()} cores",
+        "Instruction set": instruction_set(),
+        "System": f"{platform.system()} {platform.release()}",
+        "Python": platform.python_version(),
+        "torch": torch.__version__,
+    }
+
+
+def processor_name() -> str:
+    """Return the processor's marketing name if the system reports it."""
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8") as lines:
+            for line in lines:
+                if line.startswith("model name"):
+                    return line.split(":", 1)[1].strip()
+    except FileNotFoundError:
+        pass
+    return platform.processor() or platform.machine()

@@ -11,7 +11,7 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Histo
 from prometheus_client.registry import Collector
 
 from services.bus.messages import cumulative
-from services.display.hub import KINDS
+from services.display import KINDS
 from services.supervisor.process import StreamEvent
 
 if TYPE_CHECKING:

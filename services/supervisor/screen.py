@@ -22,18 +22,17 @@ from numpy.typing import NDArray
 from gsplat_core.models.model import Model
 from gsplat_core.models.snapshots import Snapshot
 from gsplat_core.rendering.rasterization import RenderOutput, render
-from gsplat_core.rendering.remembered import share_of
 from gsplat_core.rendering.surface import certainty
 from gsplat_core.scene.cameras import Camera, Orbit
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
+from gsplat_core.threads import step_back
 from gsplat_core.transfers import HostCopy
 from operators.display import draw_label, picture_state
 from operators.layer_pictures import DepthColours, confidence_picture, mark_unobserved, mark_virtual
 from operators.messages import PictureState, ShownPicture
 from operators.metrics import ScoredFrame
 from operators.rasterize import displayed
-from operators.remembered import RememberedTissue
-from operators.side_thread import step_back
+from operators.remembered import RememberedTissue, share_of
 from operators.sources.source import SourceState
 from services.bus.messages import Durations
 from services.bus.pictures import PicturePublisher, WatchedPublisher, wait_for_readers

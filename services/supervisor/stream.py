@@ -16,7 +16,7 @@ from typing import Any
 from gsplat_core.errors import InvalidSetting
 from services.audit.system_events import SystemEvents
 from services.bus.runtime import Role, RuntimeFolder, StreamFolder
-from services.display.hub import KINDS, DisplayHub, EncodedPicture, PictureKind
+from services.display import KINDS, DisplayHub, EncodedPicture, PictureKind
 from services.errors import BusError, Conflict, NotFound, RegistryError, Rejected
 from services.registry.models import ModelRegistry
 from services.schemas.streams import StreamView

@@ -18,8 +18,7 @@ from operators.display import (
     draw_label,
     picture_state,
 )
-from operators.falling_behind import BehindGuard
-from operators.frame_clock import ClockSettings, FrameClock
+from operators.frame_clock import BehindGuard, ClockSettings, FrameClock
 from operators.messages import PictureState
 from operators.outcome import OutcomeBuilder
 from operators.sources.source import SourceState

@@ -13,7 +13,7 @@ from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.metrics import psnr_tissue_db
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.schedule import LiveTraining
-from operators.falling_behind import RENEW_AFTER, BehindGuard
+from operators.frame_clock import RENEW_AFTER, BehindGuard
 
 WIDTH, HEIGHT = 64, 48
 LARGE = cv2.resize(

@@ -10,8 +10,7 @@ import torch
 from gsplat_core.io.sessions.records import SceneBegun
 from gsplat_core.scene.frames import FrameStatus
 from operators.depth import TakenDepth
-from operators.falling_behind import BehindGuard
-from operators.frame_clock import ClockSettings, FrameClock
+from operators.frame_clock import BehindGuard, ClockSettings, FrameClock
 from operators.outcome import OutcomeBuilder
 from operators.reconstruct import ModelResult, ReconstructOp
 from operators.training import GROWN_AT_LATEST, UntilDisplay

@@ -8,8 +8,7 @@ import threading
 
 import pytest
 
-from gsplat_core.threads import usable_cores
-from operators.side_thread import NICENESS, step_back
+from gsplat_core.threads import NICENESS, step_back, usable_cores
 
 
 def in_a_thread(work):

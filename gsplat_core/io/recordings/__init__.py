@@ -1,8 +1,7 @@
 """Recordings of endoscopic video: open, validate, synthesize."""
 
 from gsplat_core.io.recordings.findings import Finding, ValidationReport
-from gsplat_core.io.recordings.recording import FileRecording, Recording, open_recording, validate_recording
-from gsplat_core.io.recordings.split import is_heldout
+from gsplat_core.io.recordings.recording import FileRecording, Recording, is_heldout, open_recording, validate_recording
 from gsplat_core.io.recordings.synthetic.synthesize import synthesize
 
 __all__ = [

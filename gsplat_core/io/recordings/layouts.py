@@ -54,7 +54,7 @@ from gsplat_core.io.recordings.sidecars import DESCRIPTION_FILE, Beside
 from gsplat_core.io.recordings.video import VIDEO_SUFFIXES, open_video
 
 if TYPE_CHECKING:
-    from gsplat_core.io.sessions.contents import SessionContents
+    from gsplat_core.io.sessions.reader import SessionContents
 
 
 _LEFT = re.compile(r"(?<![a-z])(left|l)(?![a-z])", re.IGNORECASE)
@@ -249,7 +249,7 @@ def _inspect_folder(path: Path, findings: Findings) -> Contents | SessionContent
     names = sorted(entry.name for entry in path.iterdir())
     if "session.json" in names:
         # Imported lazily: most recordings are not sessions, and the session reader loads slowly.
-        from gsplat_core.io.sessions.contents import session_contents
+        from gsplat_core.io.sessions.reader import session_contents
 
         return session_contents(path, findings)
     videos = [path / name for name in names if Path(name).suffix.lower() in VIDEO_SUFFIXES and name[0] != "."]

@@ -1,4 +1,9 @@
-"""Opening and validating recordings."""
+"""Opening and validating recordings.
+
+The held-out split is the one customary for endoscopic reconstruction: frames with (i - 1) % 8 == 0 (1, 9, 17, …) are test frames.
+
+EndoGaussian, Deform3DGS and SurgicalGaussian use it on EndoNeRF's clips, which have no official split.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +26,7 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame, FrameStatus
 
 if TYPE_CHECKING:
-    from gsplat_core.io.sessions.contents import SessionContents
+    from gsplat_core.io.sessions.reader import SessionContents
 
 MAX_REPORTED_PROBLEMS = 100
 _DAMAGE_ADVICE = "Damaged frames are shown, but neither trained on nor scored; copy the file again from its source"
@@ -197,3 +202,11 @@ def validate_recording(path: str | os.PathLike[str]) -> ValidationReport:
         "stereo_baseline_mm": contents.stereo_baseline_mm,
     }
     return ValidationReport(facts, findings.problems, findings.warnings)
+
+
+HELDOUT_STRIDE = 8
+
+
+def is_heldout(index: int) -> bool:
+    """Return True if the frame with this 0-based index is held out from training."""
+    return (index - 1) % HELDOUT_STRIDE == 0

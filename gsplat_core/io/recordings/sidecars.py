@@ -27,7 +27,18 @@ from gsplat_core.io.recordings.calibration import (
 )
 from gsplat_core.io.recordings.contents import FrameImages
 from gsplat_core.io.recordings.findings import Findings
-from gsplat_core.io.recordings.frame_files import DepthFiles, ImageFiles, MaskFiles, check_pairing, check_sizes
+from gsplat_core.io.recordings.frame_files import (
+    SENSOR_FILE,
+    DepthFiles,
+    ImageFiles,
+    LabelFiles,
+    MaskFiles,
+    ScanFiles,
+    by_frame,
+    check_pairing,
+    check_sizes,
+    read_sensor,
+)
 from gsplat_core.io.recordings.plain_files import (
     IMAGE_SUFFIXES,
     UnreadableFile,
@@ -36,7 +47,6 @@ from gsplat_core.io.recordings.plain_files import (
     list_images,
     stays_inside,
 )
-from gsplat_core.io.recordings.sparse_files import SENSOR_FILE, LabelFiles, ScanFiles, by_frame, read_sensor
 
 RECORDING_FORMAT = "intrasplat-recording"
 RECORDING_VERSION = 1

@@ -18,7 +18,7 @@ from gsplat_core.ops.frame.frame import (
     FrameMode,
     render_frame,
 )
-from gsplat_core.reference.frame import render_frame as reference_frame
+from gsplat_core.reference.rendering import render_frame as reference_frame
 from gsplat_core.rendering.settings import EPS2D
 from gsplat_core.scene.gaussians import COLOUR
 from tests.gsplat_core.cuda.frame_scenes import FrameScene, frame_scene

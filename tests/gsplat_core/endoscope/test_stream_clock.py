@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gsplat_core.endoscope.stream_clock import StreamClock
+from gsplat_core.endoscope.sequence import StreamClock
 
 STEP = 40_000_000
 S = 1_000_000_000

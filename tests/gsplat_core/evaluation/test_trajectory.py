@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.evaluation.trajectory import evaluate_trajectory
+from gsplat_core.evaluation.geometry import evaluate_trajectory
 from gsplat_core.io.recordings.synthetic.scene import SyntheticScene
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_core.evaluation.trajectory import evaluate_trajectory
+from gsplat_core.evaluation.geometry import evaluate_trajectory
 from gsplat_core.poses.breathing import LONGEST_S, BreathingTrajectory, breathing_trajectory, frequencies_of, waves
 from tests.gsplat_core.geometry.breathing_points import BREATHING_HZ, HEART_HZ
 from tests.gsplat_core.geometry.breathing_sightings import bundle_of, seen_for

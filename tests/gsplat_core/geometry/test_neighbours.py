@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gsplat_core.geometry.neighbours import NEIGHBOURS, nearest_others
+from gsplat_core.geometry.registration import NEIGHBOURS, nearest_others
 
 
 def test_they_are_those_of_all_distances():

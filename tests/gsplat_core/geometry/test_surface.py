@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gsplat_core import Camera, InvalidInput
-from gsplat_core.geometry.surface import in_world, joined, known, normals_of, points_of, rays_of
+from gsplat_core.geometry.mesh import in_world, joined, known, normals_of, points_of, rays_of
 from gsplat_core.io.recordings.synthetic.renderer import cast_tissue, pixel_rays
 from gsplat_core.io.recordings.synthetic.synthesize import SyntheticScene
 

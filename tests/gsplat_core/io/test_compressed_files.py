@@ -11,12 +11,11 @@ import pytest
 import torch
 
 from gsplat_core.errors import BundleCorrupt, BundleError, ExportError
-from gsplat_core.io import spz, zstd
+from gsplat_core.io import spz
 from gsplat_core.io.compressed_ply import BOUNDS, compressed_ply_pieces, morton_order
 from gsplat_core.io.exports.export import with_unit_rotations
 from gsplat_core.io.ply import load_ply
-from gsplat_core.io.spz import load_spz, spz_pieces
-from gsplat_core.io.zstd import library
+from gsplat_core.io.spz import library, load_spz, spz_pieces
 from gsplat_core.reference.spherical_harmonics import spherical_harmonics_bases
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
 
@@ -168,11 +167,11 @@ def test_a_malformed_version_4_is_refused_with_its_reason(tmp_path, make, reason
 
 def test_version_4_without_the_library_names_its_package(tmp_path, monkeypatch):
     (tmp_path / "a.spz").write_bytes(four())
-    monkeypatch.setattr(zstd, "NAMES", ("libnothing.so.1",))
-    zstd.library.cache_clear()
+    monkeypatch.setattr(spz, "NAMES", ("libnothing.so.1",))
+    spz.library.cache_clear()
     with pytest.raises(BundleError, match="install the package libzstd1"):
         load_spz(tmp_path / "a.spz")
-    zstd.library.cache_clear()
+    spz.library.cache_clear()
 
 
 def test_an_spz_laid_out_by_hand_is_read(tmp_path):

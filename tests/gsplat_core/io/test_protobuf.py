@@ -6,7 +6,7 @@ import struct
 
 import pytest
 
-from gsplat_core.io.protobuf import fields, values, varint
+from gsplat_core.endoscope.onnx import fields, values, varint
 
 NESTED = b"\x0a\x02hi" + b"\x12\x04" + b"\x08\x07\x08\x08" + b"\x12\x02" + b"\x08\x09"
 """Text in field 1, and two messages in field 2 with the numbers 7, 8 and 9 in their field 1."""

@@ -13,7 +13,7 @@ from gsplat_core.ops.surfel_blending import rasterize_to_pixels_2dgs
 from gsplat_core.ops.surfel_projection.surfel_projection import fully_fused_projection_2dgs
 from gsplat_core.ops.tiles.grid import TileGrid
 from gsplat_core.ops.tiles.tiles import bin_splats
-from gsplat_core.reference import surfel_blending, surfel_projection
+from gsplat_core.reference import surfels as oracle
 
 PROJECTED = ("means2d", "depths", "ray_transforms", "normals")
 BLENDED = ("image", "alphas", "normals", "distortions", "medians")
@@ -43,7 +43,7 @@ class SurfelScene:
         viewmats = self.viewmats.to(device, dtype).clone().requires_grad_()
         function: Callable[..., Any] = fully_fused_projection_2dgs
         if dtype == torch.float64:
-            function = surfel_projection.fully_fused_projection_2dgs
+            function = oracle.fully_fused_projection_2dgs
         out = function(*inputs.values(), viewmats, self.Ks.to(device, dtype), self.width, self.height, **options)
         generator = torch.Generator().manual_seed(7)
         loss = sum(
@@ -118,7 +118,7 @@ class BlendScene:
         masks = None if self.masks is None else self.masks.to(device)
         function: Callable[..., Any] = rasterize_to_pixels_2dgs
         if dtype == torch.float64:
-            function = surfel_blending.rasterize_to_pixels_2dgs
+            function = oracle.rasterize_to_pixels_2dgs
         offsets, ids = lists or self.lists()
         out = function(
             *inputs.values(), self.width, self.height, self.tile_size, offsets.to(device), ids.to(device),
@@ -141,7 +141,7 @@ class BlendScene:
 
 def blend_scene(surfels: SurfelScene, **options: Any) -> BlendScene:
     """Return the inputs of blending of projected surfels, with depth as the last channel."""
-    dense = surfel_projection.fully_fused_projection_2dgs(
+    dense = oracle.fully_fused_projection_2dgs(
         surfels.means, surfels.quats, surfels.scales, surfels.viewmats, surfels.Ks, surfels.width, surfels.height
     )
     colors = surfels.colors.clone()

@@ -10,7 +10,7 @@ import torch
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.surfel_blending import rasterize_to_pixels_2dgs
-from gsplat_core.reference import surfel_blending as reference
+from gsplat_core.reference import surfels as reference
 from tests.gsplat_core.ops.surfel_scenes import BLENDED, INPUTS, BlendScene, blend_scene, close, surfel_scene
 
 

@@ -9,7 +9,7 @@ import torch
 
 from gsplat_core import Camera, Gaussians, InvalidInput, reference
 from gsplat_core.models.model import Model
-from gsplat_core.rendering.remembered import share_of
+from operators.remembered import share_of
 
 CAMERA = Camera.from_focal(40.0, 37, 29)
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from gsplat_core.deformation import BasisField
-from gsplat_core.geometry.neighbours import nearest_others
+from gsplat_core.geometry.registration import nearest_others
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.gaussians import POSITION
 from gsplat_core.training import offline

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_core.rendering.remembered import share_of
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians, RowMoves
@@ -21,6 +20,7 @@ from gsplat_core.training.metrics import psnr_tissue_db
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.schedule import LiveTraining
+from operators.remembered import share_of
 
 WIDTH, HEIGHT = 48, 40
 FOCAL = 50.0

@@ -12,7 +12,7 @@ from typing import Any
 
 from services.api.problems import Conflicting, Missing, Unprocessable
 from services.api.state import Parts
-from services.display.hub import EncodedPicture
+from services.display import EncodedPicture
 from services.schemas.streams import StreamView
 from services.settings import StreamSettings
 

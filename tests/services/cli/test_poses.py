@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from gsplat_core.evaluation.trajectory import evaluate_trajectory
+from gsplat_core.evaluation.geometry import evaluate_trajectory
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.poses import focal_length
 from gsplat_core.poses.focal_length import FocalLength

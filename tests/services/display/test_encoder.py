@@ -5,7 +5,7 @@ import pytest
 import simplejpeg
 
 from gsplat_core.errors import InvalidSetting
-from services.display.hub import check_quality, dimmed, encoded
+from services.display import check_quality, dimmed, encoded
 
 
 def test_colours_and_sides_are_kept():

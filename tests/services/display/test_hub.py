@@ -9,9 +9,9 @@ import pytest
 import simplejpeg
 
 from gsplat_core.errors import InvalidSetting
+from services import display as hubs
 from services.bus.pictures import PicturePublisher
-from services.display import hub as hubs
-from services.display.hub import SLOW, DisplayHub
+from services.display import SLOW, DisplayHub
 
 IMAGE = np.full((16, 24, 3), (200, 100, 50), np.uint8)
 HEADER = {"state": "live", "new": True, "model_version": 3, "run": 1}
@@ -107,7 +107,7 @@ def test_a_viewer_who_takes_nothing_misses_pictures_and_nobody_else_does(runtime
 
 
 def test_a_dead_viewer_is_dropped(runtime, monkeypatch):
-    monkeypatch.setattr("services.display.hub.DEAD_S", 0.1)
+    monkeypatch.setattr("services.display.DEAD_S", 0.1)
 
     async def scenario() -> None:
         async with published(runtime) as (hub, _):

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from services.errors import StoreUnavailable
-from services.registry import blobs
-from services.registry.blobs import FolderBlobs, RemoteBlobs, open_blobs
+from services.registry import folder
+from services.registry.folder import FolderBlobs, RemoteBlobs, open_blobs
 
 
 @pytest.fixture
@@ -59,7 +59,7 @@ def test_a_file_of_another_machine_is_abandoned_after_an_hour(monkeypatch: pytes
         )
     ]
     monkeypatch.setattr(store._files, "ls", lambda path, detail: described)
-    monkeypatch.setattr(blobs.time, "time", moment.timestamp)
+    monkeypatch.setattr(folder.time, "time", moment.timestamp)
     assert {each.key: each.abandoned for each in store.stored()} == {
         "new": False, "border": False, "old": True, "seconds": True, "unknown": False,
     }  # fmt: skip
@@ -93,12 +93,12 @@ class _Botocore(Exception):
     ],
 )
 def test_errors_of_a_store_are_said(error: Exception, why: str) -> None:
-    with pytest.raises(StoreUnavailable, match=why), blobs._store_errors("s3://x"):
+    with pytest.raises(StoreUnavailable, match=why), folder._store_errors("s3://x"):
         raise error
 
 
 def test_a_bug_stays_one() -> None:
-    with pytest.raises(KeyError), blobs._store_errors("s3://x"):
+    with pytest.raises(KeyError), folder._store_errors("s3://x"):
         raise KeyError("bug")
     with pytest.raises(StoreUnavailable, match="give s3://BUCKET/PREFIX"):
         open_blobs("nonsense://x", Path("unused"))

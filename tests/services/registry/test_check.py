@@ -20,7 +20,7 @@ from gsplat_core.models.model import TrainedBy
 from gsplat_core.rendering.alpha import AlphaRenderer
 from gsplat_core.rendering.weighted_sum import WeightedSumRenderer
 from services.errors import CheckFailed
-from services.registry import check, checking, limits
+from services.registry import check, checking, records
 from services.registry.checking import run_check
 from services.registry.models import ModelRegistry
 from tests.services.registry.made import packed_model, save_model
@@ -30,11 +30,11 @@ from tests.services.registry.stub_check import ALWAYS_READY, says
 def test_the_limits_of_a_model_are_those_of_the_guide():
     guide = (Path(__file__).parents[3] / "docs" / "service.md").read_text(encoding="utf-8").replace("\n", " ")
     stated = (
-        f"Limits are {limits.MOST_GAUSSIANS:,} Gaussians, {limits.MOST_PIXELS:,} pixels, {limits.CHECK_S:g} s and"
-        f" {limits.CHECK_MEMORY_BYTES >> 30} GiB"
+        f"Limits are {records.MOST_GAUSSIANS:,} Gaussians, {records.MOST_PIXELS:,} pixels, {records.CHECK_S:g} s and"
+        f" {records.CHECK_MEMORY_BYTES >> 30} GiB"
     )
     assert stated in guide
-    assert limits.MOST_UPLOAD_BYTES == limits.MOST_TENSOR_BYTES == 4_294_967_296
+    assert records.MOST_UPLOAD_BYTES == records.MOST_TENSOR_BYTES == 4_294_967_296
 
 
 @pytest.fixture

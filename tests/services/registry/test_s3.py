@@ -6,7 +6,7 @@ import pytest
 
 from gsplat_core.io.bundle import load_bundle
 from services.errors import BlobDamaged, StoreUnavailable
-from services.registry.blobs import RemoteBlobs
+from services.registry.folder import RemoteBlobs
 from services.registry.models import ModelRegistry
 from tests.services.registry.made import add_ready, assert_whole, packed_model, sha256
 from tests.services.registry.stub_check import ALWAYS_READY

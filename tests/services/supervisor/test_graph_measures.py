@@ -9,7 +9,7 @@ from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.registry import Collector
 
 from services.bus.messages import BOUNDS_S, Durations
-from services.display.hub import KINDS
+from services.display import KINDS
 from services.supervisor.launcher import cause_of
 from services.supervisor.metrics import GraphFamilies, StreamMeasures
 from services.supervisor.process import StreamEvent

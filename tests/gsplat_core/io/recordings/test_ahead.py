@@ -10,7 +10,7 @@ import pytest
 
 from gsplat_core.errors import RecordingInvalid
 from gsplat_core.io.recordings import open_recording
-from gsplat_core.io.recordings.ahead import read_ahead
+from gsplat_core.io.recordings.contents import read_ahead
 from gsplat_core.io.recordings.plain_files import quiet_decoder
 
 NAME = "read ahead in a test"

@@ -16,7 +16,7 @@ from gsplat_core.io.recordings.synthetic.extras import Extras
 from gsplat_core.io.recordings.synthetic.random_scene import draw_scene
 from gsplat_core.io.recordings.synthetic.scene import SyntheticScene
 from gsplat_core.io.recordings.synthetic.sensor import Field, RadialLens
-from gsplat_core.io.recordings.synthetic.truth import projected
+from gsplat_core.io.recordings.synthetic.synthesize import projected
 
 SMALL = {"frames": 2, "width_px": 48, "height_px": 40, "fps": 2}
 

@@ -17,8 +17,8 @@ from gsplat_core.io.recordings.synthetic.extras import Extras
 from gsplat_core.io.recordings.synthetic.lamp import Lamp
 from gsplat_core.io.recordings.synthetic.renderer import cast_tissue, pixel_rays
 from gsplat_core.io.recordings.synthetic.scene import SyntheticScene, View
+from gsplat_core.io.recordings.synthetic.synthesize import motion_to, projected, seen_points
 from gsplat_core.io.recordings.synthetic.tissue import NO_TUG
-from gsplat_core.io.recordings.synthetic.truth import motion_to, projected, seen_points
 from gsplat_core.io.recordings.truth import open_truth
 from gsplat_core.scene.cameras import Camera
 
