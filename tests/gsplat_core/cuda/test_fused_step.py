@@ -10,6 +10,7 @@ import torch
 from gsplat_core import Camera, Gaussians, render
 from gsplat_core.deformation.field import displaced
 from gsplat_core.training.losses.loss import WeightedLosses
+from gsplat_core.training.losses.rendered_rays import EVERY
 from gsplat_core.training.observations import Observation, RightEye
 from gsplat_core.training.steps.fused_step import FusedStep
 from gsplat_core.training.steps.optimiser import FusedAdam
@@ -311,7 +312,7 @@ def test_losses_of_rays_are_captured_and_learn_as_on_the_cpu(wall_seen, relaxati
         values.append(float(compared.loss))
         adam.step(expected.tensors(), compared.gradients, RATES)
     assert losses == pytest.approx(values, rel=5e-3)
-    assert values[4] > 1.5 * values[3], "one of four steps compares rays"
+    assert values[EVERY] > 1.5 * values[EVERY - 1], "one of EVERY steps compares rays"
     for name, tensor in expected.tensors().items():
         change = (tensor - start.tensors()[name]).norm()
         assert (gaussians.tensors()[name].cpu() - tensor).norm() <= 0.1 * change + 1e-6, name
@@ -327,11 +328,11 @@ def test_a_captured_comparison_of_rays_reads_camera_and_depth_of_its_observation
         gaussians = slanted_wall(0.2, 10.5).to("cuda")
         losses = WeightedLosses({"ray_depth": 2.0, "normal_consistency": 1.0})
         step = FusedStep(gaussians, NoField(), FusedAdam(gaussians.tensors()), LossWeights(), wall_seen.camera, losses)
-        return [float(step(gaussians, one, 0.0, still, [])) for one in observations][::4]
+        return [float(step(gaussians, one, 0.0, still, [])) for one in observations][::EVERY]
 
-    alone = ray_losses([wall_seen] * 9), ray_losses([other] * 9)
+    alone = ray_losses([wall_seen] * (EVERY + 1)), ray_losses([other] * (EVERY + 1))
     assert abs(alone[1][0] - alone[0][0]) > 0.1 * alone[0][0]
-    by_turns = ray_losses([wall_seen] * 5 + [other] * 4 + [wall_seen])
+    by_turns = ray_losses([wall_seen] * (EVERY + 1) + [other] * EVERY + [wall_seen])
     assert by_turns == pytest.approx([alone[0][0], alone[0][0], alone[1][0]], rel=1e-5)
 
 
