@@ -260,12 +260,20 @@ def trainings(logs: Logs) -> str:
             "fused_ssim" not in run["replaced"] for run in log["runs"] if run["variant"].startswith("gsplat")
         )
         runs = {run["seed"] for run in log["runs"]}
+        names = {name for variants in log["summary"].values() for name in variants}
+        absent = [
+            f"`{strategy}` with {TRAINER_VARIANTS[name]}"
+            for strategy, variants in log["summary"].items()
+            for name in sorted(names - set(variants))
+            if name != "ours-selective"
+        ]
         texts.append(
             f"{device}: {scene['views']} views of {scene['width_px']}x{scene['height_px']} px, {scene['points']:,} points,"
             f" {log['steps']:,} steps with all intervals scaled by {log['steps'] / 30_000:g}, cap of `mcmc` {log['cap']:,},"
             f" seeds {', '.join(str(seed) for seed in sorted(runs))}. SSIM of the loss with gsplat:"
             f" {'the package fused-ssim' if installed else 'ours, because fused-ssim was not installed'}."
             f" Replaced packages: {', '.join(sorted({each for run in log['runs'] for each in run['replaced']}))}."
+            + (f" Not run for want of time: {', '.join(absent)}." if absent else "")
         )
     head = ("strategy", "package", "device", "PSNR", "SSIM", "splats", "peak memory", "training time", "waiting", "ratio", "ratio without waiting")  # fmt: skip
     return "\n\n".join([*texts, table(head, rows)])

@@ -122,7 +122,7 @@ METHODS = (
         (
             figure("step without the losses", "step: losses none, ms", "", unit="ms"),
             figure("step with both losses", "step: losses both, ms", "", unit="ms"),
-            figure("extra time", "step: extra cost of both %", "at most 25", 0, unit="%"),
+            figure("extra time", "step: extra cost of both %", "at most 25", 1, unit="%"),
         ),
     ),
     Method(
