@@ -1,10 +1,8 @@
-"""Display deadlines of live frames and the training budget that they leave.
+"""Time of live frames: display deadlines, the training budget that they leave, and a check that the model keeps up.
 
-Live check whether displayed pictures are better than trivial ones; a model that falls behind is started anew.
-
-A model that cannot follow a fast scope shows its tissue at the wrong place. Training then repairs it more slowly than the
-pictures move on. A new scene, created from the newest frame, shows that frame at once. All comparisons are relative to the
-stream: the previous frame shown again, and the first picture of the present scene.
+A model that cannot follow a fast scope shows its tissue at the wrong place, and training repairs it more slowly than the
+pictures move on. The check compares displayed pictures with the previous frame shown again and with the first picture of
+the present scene. A model that falls behind both is replaced by a new scene, which shows the newest frame at once.
 """
 
 from __future__ import annotations

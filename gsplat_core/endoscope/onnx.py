@@ -4,7 +4,7 @@ Files are read without the onnx package and bounded in size. A model can store w
 Loading them would let a foreign model read any file of the machine. Such models are rejected, and the runtime gets
 bytes instead of a path. Input and output conventions come from the model's metadata or from a JSON file next to it.
 
-Reading of protobuf messages without their schema.
+Protobuf messages are read without their schema.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Coloured triangle meshes of a model's surface at one time, made from a depth map and cut at occlusion edges.
-
-The surface of a depth map has points, normals and occlusion edges.
-"""
+"""Coloured triangle meshes of a model's surface at one time, made from a depth map and cut at occlusion edges."""
 
 from __future__ import annotations
 

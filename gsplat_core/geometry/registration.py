@@ -2,9 +2,7 @@
 
 Point-to-plane ICP (Chen and Medioni 1991) with trimming (Chetverikov et al. 2002) uses only the closest pairs, because
 a reconstruction covers part of the reference and contains structures that the reference lacks. The start is an initial
-guess or three or more corresponding point pairs.
-
-Nearest neighbours within a set of points.
+guess or three or more corresponding point pairs. Nearest neighbours come from k-d trees.
 """
 
 from __future__ import annotations

@@ -1,10 +1,8 @@
-"""Image loss and its terms in plain torch: any floating dtype, differentiable by autograd.
+"""Losses of pictures in plain torch: any floating dtype, differentiable by autograd.
 
-A term without any pixel (no tissue, no valid depth) is 0 with zero gradient, never NaN.
-
-Structural similarity (Wang et al. 2004) in plain torch: any floating dtype, differentiable.
-
-Usual parameters: 11x11 Gaussian window of sigma 1.5, zero padding, C1 = 0.01^2, C2 = 0.03^2, values in 0..1.
+The image loss and its terms: a term without any pixel (no tissue, no valid depth) is 0 with zero gradient, never NaN.
+Structural similarity (Wang et al. 2004): 11x11 Gaussian window of sigma 1.5, zero padding, C1 = 0.01^2, C2 = 0.03^2,
+values in 0..1.
 """
 
 from __future__ import annotations

@@ -1,8 +1,6 @@
-"""Ray depth of Gaussians and its blending in plain torch, for any floating dtype; test reference of the compiled op.
+"""Values along rays in plain torch, for any floating dtype; test reference of the compiled ops.
 
-Losses of rendered rays in plain torch.
-
-Depth histograms of a range sensor in plain torch, for any floating dtype; test reference of the compiled op.
+Ray depth of Gaussians and its blending, losses of rendered rays, and depth histograms of a range sensor.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""`rasterization` built from the reference operations: any floating-point dtype and device, slow.
+"""Whole renderers built from the reference operations: any floating-point dtype and device, slow.
 
-One frame from raw Gaussians and deltas in plain torch: test reference of the CUDA op `render_frame`.
+`rasterization`, and one frame from raw Gaussians and deltas, the test reference of the CUDA op `render_frame`.
 """
 
 from __future__ import annotations

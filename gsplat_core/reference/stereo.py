@@ -1,12 +1,7 @@
-"""Integer semi-global matching in plain torch (Hirschmüller 2008).
+"""Stereo matching in plain torch, test reference of three compiled ops.
 
-Test reference of `gsplat_core.ops.stereo_matching`.
-
-Disparity refinement in plain torch: test reference of `gsplat_core.ops.disparity_fit`.
-
-Fast global smoother (Min et al. 2014) in plain torch.
-
-Test reference of `gsplat_core.ops.edge_aware_filter`.
+`gsplat_core.ops.stereo_matching`: integer semi-global matching (Hirschmüller 2008). `gsplat_core.ops.disparity_fit`:
+refinement of disparities. `gsplat_core.ops.edge_aware_filter`: fast global smoother (Min et al. 2014).
 """
 
 from __future__ import annotations

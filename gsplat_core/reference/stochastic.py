@@ -1,10 +1,8 @@
-"""Expectation and variance of stochastic transparency in plain torch: alpha blending without early stop.
+"""Expectation and variance of the sort-free renderers in plain torch.
 
-Any floating dtype; every splat is evaluated at every pixel, so it is for small scenes.
-
-Expectation and variance of Gaussian point splatting in plain torch (Rijsdijk et al., TOG 2026).
-
-The number of points of a splat in a pixel is Poisson distributed with the integral of -ln(1 - o G) over the pixel.
+Stochastic transparency: alpha blending without early stop. Gaussian point splatting (Rijsdijk et al., TOG 2026): the number
+of points of a splat in a pixel is Poisson distributed with the integral of -ln(1 - o G) over the pixel. Any floating dtype;
+every splat is evaluated at every pixel, so it is for small scenes.
 """
 
 from __future__ import annotations

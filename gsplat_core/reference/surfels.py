@@ -1,7 +1,4 @@
-"""Projection of surfels (flat Gaussians) in plain torch (Huang et al. 2024, 2D Gaussian Splatting).
-
-Alpha compositing of surfels at their ray intersections in plain torch (Huang et al. 2024, 2D Gaussian Splatting).
-"""
+"""Surfels (flat Gaussians) in plain torch: projection, and blending at ray intersections (Huang et al. 2024, 2D Gaussian Splatting)."""
 
 from __future__ import annotations
 

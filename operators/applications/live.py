@@ -1,8 +1,6 @@
-"""Live reconstruction and display of an endless stream.
+"""Live reconstruction and display of an endless stream, and its recorder, which keeps frames, pictures and calls of training.
 
 Before the first frame, models and operators are warmed up and the interpreter is set for low latency. `operators.pipeline` has the graph.
-
-Creation of the recorder of a live run, which keeps frames, pictures and the calls of training.
 """
 
 from __future__ import annotations
