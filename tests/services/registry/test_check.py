@@ -114,7 +114,7 @@ def test_a_model_without_gaussians_is_rejected(tmp_path, checked):
 @pytest.mark.slow
 def test_a_check_without_enough_memory_is_a_verdict(tmp_path):
     folder = save_model(tmp_path / "model", count=40_000)
-    code = "import sys\nfrom services.registry import check, limits\nlimits.CHECK_MEMORY_BYTES = 50 << 20\nsys.exit(check.main())"
+    code = "import sys\nfrom services.registry import check, records\nrecords.CHECK_MEMORY_BYTES = 50 << 20\nsys.exit(check.main())"
     verdict = run_check(folder, program=(sys.executable, "-c", code))
     assert verdict.reason is not None and "memory" in verdict.reason
 
@@ -139,7 +139,7 @@ def test_the_reason_names_no_folder_of_the_machine(tmp_path, checked):
 @pytest.mark.slow
 def test_a_check_that_computes_too_long_is_ended(tmp_path):
     endless = (
-        "from services.registry import limits\nlimits.CHECK_S = 0.1\nlimits.limit_resources('cpu')\nwhile True: pass\n"
+        "from services.registry import records\nrecords.CHECK_S = 0.1\nrecords.limit_resources('cpu')\nwhile True: pass\n"
     )
     done = subprocess.run([sys.executable, "-c", endless], capture_output=True)
     assert -done.returncode == signal.SIGXCPU
