@@ -138,9 +138,7 @@ def test_the_reason_names_no_folder_of_the_machine(tmp_path, checked):
 
 @pytest.mark.slow
 def test_a_check_that_computes_too_long_is_ended(tmp_path):
-    endless = (
-        "from services.registry import records\nrecords.CHECK_S = 0.1\nrecords.limit_resources('cpu')\nwhile True: pass\n"
-    )
+    endless = "from services.registry import records\nrecords.CHECK_S = 0.1\nrecords.limit_resources('cpu')\nwhile True: pass\n"
     done = subprocess.run([sys.executable, "-c", endless], capture_output=True)
     assert -done.returncode == signal.SIGXCPU
 
