@@ -72,7 +72,7 @@ class Appearance:
     picture.
     """
     columns: float
-    """The same for columns."""
+    """`rows` for neighbouring columns in place of rows."""
     contrast: float
     """Standard deviation of log brightness."""
     saturation: float
