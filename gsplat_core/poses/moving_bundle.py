@@ -355,7 +355,7 @@ def adjust(
 
     Args:
         bundle: start values.
-        spread: scale of the robust loss of ray errors (Geman and McClure); errors well above it have no influence.
+        spread: scale of the robust loss of ray errors (Geman and McClure); errors well above it have almost no influence.
         rounds: maximum number of Levenberg-Marquardt steps.
         prior: prior of the scope's trajectory, or None.
 
