@@ -175,7 +175,8 @@ class FrameClock:
         )
 
     def may_rehearse(self, made: int, ahead_ns: float) -> bool:
-        """Return True if another rehearsal step ends before the next frame is expected.
+        """Return True if another rehearsal step ends before the next frame is expected, and fewer than
+        `rehearse_at_most` were made.
 
         Args:
             made: rehearsal steps since the last frame.
@@ -294,7 +295,8 @@ class BehindGuard:
             image: picture uint8 RGB [H, W, 3].
 
         Returns:
-            True if the picture is behind, or if the last compared one was.
+            True if the picture is behind; for a picture that is not compared, True if the last compared one was behind.
+            False for the first picture of a scene.
         """
         if frame.unusable is not None:
             return self._run > 0

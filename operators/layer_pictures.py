@@ -54,7 +54,8 @@ class DepthColours:
         """
 
     def look_at(self, depth: NDArray[np.float32], alpha: NDArray[np.float32]) -> None:
-        """Adapt the range of displayed depths to a rendered picture.
+        """Adapt the range of displayed depths to a rendered picture: gradually, or at once if the median has changed by
+        a factor of 2 or more.
 
         Args:
             depth: float32 [H, W], in the scene's unit.

@@ -35,8 +35,8 @@ class ScoredFrame:
     error.
     """
     previous_frame_db: float
-    """Tissue PSNR in dB of the previous raw frame as a prediction (trivial baseline). NaN for the
-    first frame.
+    """Tissue PSNR in dB of the previous raw frame as a prediction (trivial baseline). NaN for the first frame and after
+    a change of size.
     """
     next_frame_db: float = math.nan
     """Tissue PSNR in dB of the prediction made before training on this frame; NaN without a
@@ -173,7 +173,7 @@ class PictureDigest:
         self._newest: Future[None] | None = None
 
     def add(self, rendered: RenderedFrame) -> None:
-        """Hash the picture of a frame. Waits for the previous one."""
+        """Start hashing the picture of a frame. Waits until the previous one is hashed."""
         if self._thread is None:
             self._thread = ThreadPoolExecutor(1, thread_name_prefix="hash frames")
         self._wait()
@@ -203,7 +203,7 @@ class OnScreen:
     """
 
     def __init__(self, show: Callable[[ShownPicture], None]) -> None:
-        """show: called with each picture in the order of display."""
+        """Start without frames and pictures. show: called with each picture in the order of display."""
         self._show = show
         self._frames: deque[Frame | None] = deque()
         self._shown: deque[ShownPicture] = deque()
@@ -228,7 +228,8 @@ class OnScreen:
 
     def pairs(self, waiting: int) -> Iterator[tuple[Frame, ShownPicture | None, float]]:
         """Yield the oldest frames until `waiting` frames remain, each with its assigned picture and the arrival time of
-        the following frame in nanoseconds. The picture is None if none of the frame's size was on display.
+        the following frame in nanoseconds, infinite for the last frame. The picture is None if none of the frame's size
+        was on display.
         """
         while len(self._frames) > max(1, waiting):
             frame, following = self._frames.popleft(), self._frames[0]

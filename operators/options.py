@@ -346,8 +346,8 @@ Kind = TypeVar("Kind", bound=type[Section])
 def for_callers(kind: Kind) -> Kind:
     """Restrict the inherited options of a class to the limits of REST API callers. Apply it below `@dataclass`.
 
-    `Option.callers_le` replaces the upper limit of a number. An option that takes a file, such as `depth`, accepts only
-    the absolute path of an existing ONNX file on the server.
+    `Option.callers_le` replaces the upper limit of a number. Where an option such as `depth` takes a file, only the
+    absolute path of an existing ONNX file on the server is accepted.
     """
     (base,) = kind.__bases__
     for name, each in options_of(base).items():

@@ -51,7 +51,7 @@ class OutOfBodyFrames:
 class OutOfBodyGateOp(Operator):
     """Replaces pictures that were not clearly taken inside of the body. Connect it directly to the source.
 
-    A withheld frame is black, has no right picture, depth or pose, counts as tissue everywhere, and is excluded from
+    A withheld frame is black in both eyes, has no depth or pose, counts as tissue everywhere, and is excluded from
     every loss. Black is used rather than pixelation, because a moving scene can be recovered from blocks that change
     with every frame. A picture that cannot be examined is withheld.
 

@@ -308,7 +308,7 @@ def _check_no_recording(folder: Path, option: str) -> None:
 
 
 def _part_of(inputs: Sequence[Path], out: Path) -> Path | None:
-    """Return the input file of which `out` is a hard link; None if there is none."""
+    """Return the file inside an input folder of which `out` is a hard link; None if there is none."""
     status = out.stat()
     if status.st_nlink < 2:
         return None
@@ -484,7 +484,8 @@ def check_output_folder(folder: Path) -> bool:
     """Return True if `folder` contains an earlier run, whose results a new run replaces. Read-only.
 
     Raises:
-        OutputFolderInUse: the folder is neither new, nor empty, nor an earlier run's.
+        OutputFolderInUse: the folder is neither new, nor empty, nor an earlier run's, or it contains modified or
+            foreign results.
     """
     if not os.path.lexists(folder):
         return False

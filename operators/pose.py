@@ -177,7 +177,8 @@ def check_poses(choice: str, camera: Camera) -> None:
 
 
 def pose_operators(fragment: Any, choice: Poses, camera: Camera, depth: str) -> Sequence[Operator]:
-    """Return the operators to insert before depth estimation; none for recorded poses.
+    """Return the operators to insert before depth estimation; none for recorded poses, and for `auto` with a camera
+    that is not a pinhole.
 
     Args:
         fragment: the graph.

@@ -17,8 +17,8 @@ from gsplat_core.transfers import HostCopy
 Array = NDArray[np.floating]
 
 TORN_DEGREES = 80.0
-"""Tilt against the line of sight in degrees above which a depth step between neighbouring pixels
-counts as an occlusion edge.
+"""Tilt against the image plane in degrees from which a depth step between neighbouring pixels counts as an occlusion
+edge.
 """
 MOST_ANGLE_RAD = 1.5
 """Largest angle of a fisheye ray to the axis in radians; at 90 degrees a ray has no point at z = 1."""
@@ -67,8 +67,8 @@ def known(depth: Array) -> NDArray[np.bool_]:
 def joined(depth: Array, camera: Camera, axis: int) -> NDArray[np.bool_]:
     """Return which neighbouring pixels are connected by the surface.
 
-    Two pixels are connected if both depths are known and the surface between them is tilted by less
-    than `TORN_DEGREES` against the line of sight.
+    Two pixels are connected if both depths are known and the surface between them is tilted by less than `TORN_DEGREES`
+    against the image plane.
 
     Args:
         depth: [H, W], z in camera coordinates, 0 = unknown.

@@ -1,6 +1,7 @@
 """Tracking of points without drift, by alignment with reference pictures.
 
-`ReferenceTracks` detects corners in a reference picture every `EVERY` pictures and finds them in the following pictures.
+`ReferenceTracks` detects corners in a new reference picture every `EVERY` pictures, or earlier if it finds few of the
+last ones, and finds them in the following pictures.
 Optical flow predicts a smooth map from the reference to the new picture. The new picture is warped by this map, and each
 corner's patch is aligned with the patch of the reference (Lucas and Kanade 1981) with a forward-backward test. Errors
 therefore do not accumulate from picture to picture, and a corner is found again after it was hidden.

@@ -100,7 +100,8 @@ class FeatureTracks:
         self._seen: list[tuple[NDArray[np.int64], NDArray[np.float64]]] = []
 
     def follow(self, image: NDArray[np.uint8], mask: NDArray[np.uint8] | None) -> None:
-        """Track all points to the next picture and detect new corners.
+        """Track all points to the next picture and detect new corners. A picture in which too few points can be tracked
+        is left out, at most `MOST_LEFT_OUT` in succession.
 
         Args:
             image: RGB uint8 [H, W, 3].

@@ -228,7 +228,7 @@ def _model(path: Path, payload: bytes, manifest: Manifest) -> Model:
 
 
 def _check_size(path: Path, expected: dict[str, Tensor], start: bytes, size: int) -> None:
-    """Check the file size against the manifest and the header length, before reading anything.
+    """Check the file size against the manifest and the header length, before the header and the tensors are read.
 
     A safetensors file consists of eight bytes with the header's length, the JSON header, and the tensors without gaps.
     """

@@ -151,8 +151,8 @@ class LiveOdometry:
         self._key_numbers: Numbers = np.zeros(0, np.int64)
         self._waiting = self._since_key = 0
         self.frames = self.not_placed = self.begun = 0
-        """Numbers of frames processed, of frames that kept the previous pose because they could not
-        be placed, and of maps started.
+        """Numbers of frames processed, of frames that kept the previous pose because they were withheld, damaged or
+        could not be placed, and of maps started.
         """
         self.returned = 0
         """Number of times an earlier key frame was recognised."""
@@ -272,8 +272,8 @@ class LiveOdometry:
         return None
 
     def _relocalise(self, picture: SmallPicture) -> bool:
-        """Find the pose of a picture that tracking could not place, by matching key frames of all kept maps. Returns
-        True on success.
+        """Find the pose of a picture that tracking could not place, by matching some key frames of the kept maps;
+        others are tried at the next call. Returns True on success.
         """
         maps = [self.map, *self._left]
         found = self._recognition.find(

@@ -188,7 +188,7 @@ class LocalMap:
         return local.median()
 
     def _rescale(self, about: KeyFrame, factor: float) -> None:
-        """Scale all lengths about the position of a key frame."""
+        """Scale all lengths about the position of a key frame. No effect for a factor outside 0.1 to 10."""
         if not 0.1 < factor < 10:
             return
         centre = torch.from_numpy(about.position)

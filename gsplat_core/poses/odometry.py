@@ -2,7 +2,8 @@
 
 Tissue corners are tracked (`reference_tracks`), excluding tools. The scene starts as a plane in front of a static camera. Each
 frame's camera starts at the previous pose and is optimised until the points fit. Bundle adjustment over all key
-frames so far runs at the third key frame and whenever their number has grown by a third. Small motions in front of a
+frames so far runs at the third key frame, whenever their number has grown by 30 %, and at the last frame. Small motions
+in front of a
 near-planar scene need no other initialisation (Yu and Gallup, "3D Reconstruction from Accidental Motion", 2014), and
 an essential matrix is ill-conditioned there.
 
@@ -255,7 +256,8 @@ class _Odometry:
         self._known[point[new]] = True
 
     def _adjust(self, last: int, flat_px: float) -> None:
-        """Run bundle adjustment over the key frames up to `last` and restore the unit of length."""
+        """Run bundle adjustment over the key frames up to `last` and restore the unit of length. At the last frame, a
+        second run removes the flatness prior."""
         keys = torch.nonzero(self._is_key[: last + 1])[:, 0]
         chosen = self._is_key[self._frame] & (self._frame <= last)
         # A point constrains poses only if at least two cameras observe it.

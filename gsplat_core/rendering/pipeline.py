@@ -499,7 +499,8 @@ class Operations(StepOperations):
                 have any number of channels.
 
         On CUDA, one native call per pass renders pictures with tiles of 16 px, the constants of 1.6, and spherical harmonics
-        or at most 3 plain colour channels. Other arguments use the chain of operations. In both cases the host waits once, for
+        or at most 3 plain colour channels. Other arguments, such as `extra_signals` and `sparse_grad`, use the chain of
+        operations. In both cases the host waits once, for
         the length of the tile lists.
 
         Returns:

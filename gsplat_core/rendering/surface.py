@@ -47,7 +47,7 @@ class Surface(NamedTuple):
     median_depth: Tensor
     """z [H, W] of the splat at which transmittance falls to 1/2; 0 if it never does."""
     spread: Tensor
-    """Standard deviation of z along the ray [H, W]. Does not include a systematic error."""
+    """Standard deviation of z along the ray [H, W], 0 where unobserved. Does not include a systematic error."""
     confidence: Tensor
     """Confidence [H, W], 0 to 1: opacity, reduced where tissue has not been seen (`certainty`)."""
     depth_normals: Tensor

@@ -35,9 +35,10 @@ MOST_FRAMES = 32
 
 
 def steadiness(observations: Sequence[Observation]) -> float:
-    """Return the ratio of noise to the deviation of frames from the interpolation of their neighbours, 0 to 1.
+    """Return the ratio of the noise variance to the mean squared deviation of frames from the interpolation of their
+    neighbours, 0 to 1.
 
-    The value is 1 if the deviation is at most noise, and decreases with its square. Temporal smoothing removes this
+    The value is 1 if the deviation is at most noise. Temporal smoothing removes this
     deviation, so the ratio is the admissible amount of smoothing. Only tissue counts; without three frames with tissue
     it is 1. Integer sums make the result independent of the order. Synchronises once.
     """

@@ -117,7 +117,7 @@ class Places:
         return len(self._left)
 
     def leave(self, gaussians: Gaussians, camera: Camera, time_s: float, seen: Structure | None = None) -> None:
-        """Keep a copy of a scene on its device until the next call of `to_host`, `take` or this method.
+        """Keep a copy of a scene. It stays on its device until the next call of `to_host` or this method.
 
         Args:
             gaussians: last state of the scene.

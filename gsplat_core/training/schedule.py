@@ -60,7 +60,8 @@ class LiveTraining:
     rate_steps: int = 30
     """Number of steps from the first to the last factor in equal ratios; further steps use the last factor."""
     recent_share: float = 0.6
-    """Share of the rehearsal steps on the newest frame. The other rehearsal steps are spread evenly over the window."""
+    """Share of the rehearsal steps on the newest frame. The other rehearsal steps are on frames drawn at random from
+    the window."""
     colour_relaxation: float = 0.0
     """Above 0, colours are corrected by this multiple of the mean residual (`colour_correction`) instead of trained
     with a learning rate, if the field has temporal colours. On a GPU this requires spherical harmonics of degree 0, and

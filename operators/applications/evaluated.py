@@ -125,7 +125,7 @@ def fitting_source(
 
     Raises:
         InvalidSetting: the model cannot come from such a recording, because camera, aspect ratio or
-            time range differ. Also as `open_source`.
+            time range differ, or the source can be read only once. Also as `open_source`.
     """
     notes: list[str] = []
     source = open_source(address, SourceOptions(scale or 1.0, max_frames))
@@ -160,7 +160,8 @@ def fitting_source(
 
 
 def poses_of_run(source: FrameSource, run: EvaluatedRun | None) -> Path | None:
-    """Return the file with the poses that `reconstruct` estimated for its model; None if it estimated none."""
+    """Return the file with the poses that `reconstruct` estimated for its model; None if it estimated none, or if the
+    source has poses."""
     path = None if run is None else run.folder / POSES_FILE
     return path if path is not None and path.is_file() and "pose" not in source.description.fields else None
 

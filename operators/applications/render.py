@@ -139,7 +139,8 @@ def on_orbit(camera: Camera, distance: float, turns: float) -> Camera:
 def typical_depth(model: Model, camera: Camera) -> float:
     """Return the median depth at the model's start. Raises InvalidSetting if `camera` sees no part of the scene.
 
-    For a very large static scene it is the median over the Gaussians in front of the camera, without a picture.
+    For a very large static scene it is the median over a sample of the Gaussians in front of the camera, without a
+    picture.
     """
     if model.field is None and model.gaussians.count > MOST_PICTURED:
         every = slice(None, None, -(-model.gaussians.count // MOST_PICTURED))
@@ -367,7 +368,8 @@ def _images(
 
 
 def write_video(images: Iterator[NDArray], out: Path, size_px: tuple[int, int], fps: float, overwrite: bool) -> int:
-    """Write the video atomically. After an error the partial video is kept only if no earlier video exists at `out`."""
+    """Write the video atomically. After a UserError, such as a full disk, the frames so far are kept only if no earlier
+    video exists at `out`; after any other exception they are removed."""
     replaces = os.path.lexists(out)
     reserve = StorageReserve(out.parent, lambda: RESERVE_BYTES)
     with storage_errors(out.parent), PartialFile(out, overwrite=overwrite) as partial:
@@ -386,8 +388,8 @@ def write_video(images: Iterator[NDArray], out: Path, size_px: tuple[int, int], 
 
 
 def _write_images(images: Iterator[NDArray], inputs: Sequence[Path], out: Path) -> int:
-    """Write numbered PNG files. After an error the images written so far are kept only if the folder was empty
-    before."""
+    """Write numbered PNG files. After a UserError, such as a full disk, the images written so far are kept only if the
+    folder was empty before."""
     written = 0
     with OutputFolder(out, "render", inputs) as output:
         reserve = StorageReserve(output.path, lambda: RESERVE_BYTES)

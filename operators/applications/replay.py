@@ -87,7 +87,8 @@ class ReplaySettings(ReplayOptions):
         if offline:
             config = replace(config, depth_of_recording=of_recording(self.depth))
         if pixels is not None:
-            # One Gaussian per `PIXELS_PER_GAUSSIAN` pixels is the useful maximum.
+            # At the start, one Gaussian per `PIXELS_PER_GAUSSIAN` pixels is the useful maximum; growth may double the
+            # number.
             most = max(64, pixels // PIXELS_PER_GAUSSIAN)
             config = replace(
                 config, gaussians=min(config.gaussians, most), max_gaussians=min(config.max_gaussians, 2 * most)
@@ -298,7 +299,8 @@ class FollowedSession:
 
 
 def followed_session(settings: ReplaySettings, notes: list[str]) -> FollowedSession | None:
-    """Return the recorded session if its schedule can be replayed; None for a plain recording.
+    """Return the recorded session if its schedule is replayed; None for a plain recording, or if the schedule is
+    missing, ignored or contradicts the settings.
 
     Args:
         settings: settings of the replay.

@@ -53,7 +53,7 @@ class TrainSettings:
     save_every: int = 5000
     """Interval in steps at which the model is saved."""
     strategy: str = "adc"
-    """How the number of Gaussians changes: a key of `STARTS`."""
+    """Rule that adds and removes Gaussians: a key of `STARTS`."""
     max_gaussians: int = 1_000_000
     absgrad: bool = False
     sh_degree: int = 3
@@ -96,7 +96,7 @@ class SceneTraining:
     """Peak memory of tensors on the GPU; None on the CPU."""
     interrupted: bool
     heldout: SceneScore | None
-    """Scores of the held-out images; None if there are none."""
+    """Scores of the held-out images; None if there are none or the training was interrupted."""
 
 
 def train_scene(
@@ -113,7 +113,8 @@ def train_scene(
     Args:
         settings: scene and options.
         folder: where to write.
-        progress: called after pictures read, and every `REPORT_EVERY` steps.
+        progress: called after each picture that is read, every `REPORT_EVERY` steps, before each save, after the last
+            step, and after each evaluated image.
         stop_requested: polled after each step; True ends the training with the steps done so far.
 
     Raises:

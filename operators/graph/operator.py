@@ -26,8 +26,8 @@ class FaultAction(Enum):
 
 @dataclass(frozen=True)
 class FaultPolicy:
-    """Reaction of the graph to an operator's exceptions. Messages that the operator was processing are lost and
-    counted as a fault."""
+    """Reaction of the graph to an operator's exceptions. Messages that the operator was processing are lost. Each
+    exception is recorded as a `Fault`."""
 
     action: FaultAction = FaultAction.STOP_GRAPH
     restarts: int = 0

@@ -232,7 +232,8 @@ class SessionRecorder:
     def close(self, why: str = "the session ended") -> None:
         """Write the queue and finish the files. No effect if the recorder is not open.
 
-        Waits at most `MOST_CLOSE_S` seconds. Raises the exception of the thread unless the disk caused it.
+        Waits while the queue shrinks, at most about `MOST_CLOSE_S` seconds. Raises the exception of the thread unless
+        the disk caused it.
 
         Args:
             why: reason for the end, stored in the recording.

@@ -178,7 +178,8 @@ class SplitSource(DerivedSource):
 class JoinedSource(LiveSource):
     """Pairs each frame of the left source with the frame of the right source closest in arrival time.
 
-    A left frame waits for its right one for at most half a frame interval. Without one it is emitted alone and counted
+    A left frame waits for its right one for at most `apart_s`, by default half a frame interval. Without one it is
+    emitted alone and counted
     as `without_right`, so that a lost eye never interrupts the stream.
     """
 

@@ -101,7 +101,7 @@ class FolderSource(StreamSource):
     """Reads PNG and JPEG images in the order of their names, each once it is complete.
 
     A writer should rename finished files, or use a format with an end marker, to avoid delay. Of
-    the images present at the start, only the newest is read.
+    the images present at the start, only the newest is read, unless `every` is set.
     """
 
     def __init__(

@@ -81,7 +81,7 @@ class FrameOrder:
         return self._counts
 
     def begin(self) -> None:
-        """Forget the previous stream; the next frame gets number 0 and time 0."""
+        """Forget the previous stream. The next frame gets number 0 and time 0; a trusted sender's keeps its own."""
         self._counts.clear()
         self._out: Frame | None = None  # last frame, as passed on
         self._in: Frame | None = None  # last frame, as received

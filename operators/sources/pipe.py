@@ -160,7 +160,7 @@ class PipeSource(StreamSource):
             options: source options.
 
         Raises:
-            SourceUnavailable: the pipe does not exist, or no header arrived in time.
+            SourceUnavailable: the pipe cannot be opened, or no header arrived in time.
             InvalidSetting: the header is invalid.
         """
         super().__init__(options)

@@ -99,7 +99,7 @@ class FrameReader:
             sizes: sizes of the pieces in bytes.
 
         Raises:
-            InvalidMessage: the position is invalid.
+            InvalidMessage: the position or a size is invalid.
         """
         whole = isinstance(sizes, list) and all(type(size) is int and size > 0 for size in sizes)
         if not whole or not 1 <= len(sizes) <= MAX_PIECES or sum(sizes) > MAX_FRAME_BYTES:
@@ -450,7 +450,7 @@ class ProcessSource(LiveSource):
             options: source options.
             opener: `module:function` called in the process with address and options.
             hung_after_s: time without a message after which the process is replaced, in seconds.
-            stuck_after_s: time without a frame of a stalled source after which the process is replaced.
+            stuck_after_s: time without a frame of a stalled source after which the process is replaced, in seconds.
             open_timeout_s: timeout for opening the source, in seconds.
             may_return: a source that is unavailable may return, such as a camera. Otherwise, as for a missing file, the
                 failure counts towards `MOST_FAILURES`.

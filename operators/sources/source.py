@@ -55,7 +55,7 @@ class SourceDescription:
     camera: Camera
     """Camera of the first frame, at the frames' size."""
     fields: frozenset[str] = frozenset()
-    """Optional fields that the frames have: `mask`, `depth`, `right_image`, `pose`."""
+    """Optional fields that the frames have: `mask`, `depth`, `right_image`, `pose`, `labels`, `ranges`."""
     frame_count: int | None = None
     """Number of frames; None for an endless stream."""
     digest: str | None = None

@@ -95,8 +95,7 @@ class Ending:
 async def until_ended(
     connection: HTTPConnection, left: Coroutine[Any, Any, None], caller: Caller
 ) -> AsyncIterator[Ending]:
-    """Run a block that sends pictures, and cancel it when the viewer leaves, its key becomes invalid, or the server
-    drains.
+    """Run a block that sends pictures until its viewer gets no more.
 
     The block is cancelled when the server drains, `left` returns, the connection breaks, or the caller's key becomes
     invalid.
@@ -223,7 +222,7 @@ async def mjpeg(
 
 
 class MjpegResponse(Response):
-    """MJPEG response that ends when the viewer leaves or stalls, or the server drains. The
+    """MJPEG response that ends when the viewer leaves or stalls, its key becomes invalid, or the server drains. The
     subscription is then closed."""
 
     media_type = f"multipart/x-mixed-replace; boundary={BOUNDARY}"

@@ -300,7 +300,7 @@ QUIET = {"/livez", "/readyz", "/metrics"}
 
 class Observed:
     """Middleware that numbers, logs and measures each request, and answers 500 after a bug. Outermost except for the
-    security headers.
+    security headers and, with trusted proxies, the proxy headers.
     """
 
     def __init__(self, app: ASGIApp, measures: Measures) -> None:

@@ -64,7 +64,7 @@ class BadRequest(Problem):
 
 
 class Unauthenticated(Problem):
-    """The request has no key, or an unknown one."""
+    """The request has no valid key, token or ticket, or several."""
 
     status, title = 401, "Not authenticated"
 
@@ -73,7 +73,7 @@ class Unauthenticated(Problem):
 
 
 class Forbidden(Problem):
-    """The role of the key does not permit the operation."""
+    """The role of the caller, or its limit to some streams, does not permit the operation."""
 
     status, title = 403, "Forbidden"
 

@@ -419,7 +419,7 @@ def bind(settings: ServiceSettings) -> socket.socket:
     """Bind the listening socket at the configured address.
 
     Raises:
-        CannotServe: if the port is in use, or the address is reachable from the network without TLS.
+        CannotServe: if the socket cannot be bound, or the address is reachable from the network without TLS.
     """
     server = settings.server
     _refuse_plaintext(settings)

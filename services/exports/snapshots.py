@@ -79,7 +79,7 @@ class SnapshotStore:
 
     @contextmanager
     def new(self) -> Iterator[Path]:
-        """Provide a temporary folder, deleted at the end of the block unless it was stored."""
+        """Provide a temporary folder, deleted at the end of the block. `keep` moves a bundle out of it."""
         path = self._folder / f".new-{secrets.token_hex(8)}"
         try:
             path.mkdir(mode=0o700)

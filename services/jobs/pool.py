@@ -214,7 +214,7 @@ def new_runner(ray: str | None) -> Runner:
 
 
 def main() -> int:
-    """Run the pool until standard input closes.
+    """Run the pool until standard input closes, a signal arrives, or no job has run for `idle_s`.
 
     Returns:
         The exit code.

@@ -14,8 +14,8 @@ from services.registry.database import Schema
 
 
 class JobState(StrEnum):
-    """State of a job: `queued` → `running` → `done`, `failed` or `cancelled`. Back to `queued` if
-    the pool died."""
+    """State of a job: `queued` → `running` → `done`, `failed` or `cancelled`. Back to `queued` if the pool or the
+    process of the attempt died."""
 
     QUEUED = "queued"
     RUNNING = "running"

@@ -72,7 +72,7 @@ class Replays:
         return gone
 
     def files(self, job: JobRecord) -> list[str]:
-        """Return the names of the result files."""
+        """Return the names of the result files; none unless the replay is done."""
         return self._results.files(job.folder) if job.state == JobState.DONE else []
 
     def file(self, job_id: str, name: str) -> Path:

@@ -73,7 +73,8 @@ class JobStore:
         Raises:
             NotFound: if a recording does not exist.
             Conflict: if a recording is not ready.
-            Rejected: if the key was used for a different request.
+            Rejected: if the key was used for a different request, or the number of recordings is not 1 to
+                `MOST_AT_ONCE`.
         """
         if not 1 <= len(jobs) <= MOST_AT_ONCE:
             raise Rejected(f"{len(jobs)} recordings were named; name 1 to {MOST_AT_ONCE} at once")
@@ -103,7 +104,8 @@ class JobStore:
     def newest(
         self, count: int = 100, *, before: int | None = None, batch: str | None = None, state: str | None = None
     ) -> list[JobRecord]:
-        """Return up to `count` jobs, newest first, numbered below `before`."""
+        """Return up to `count` jobs, newest first, numbered below `before`; if given, of one batch and in one state
+        only."""
         query = sa.select(JOBS).order_by(JOBS.c.number.desc()).limit(count)
         for column, value in ((JOBS.c.batch, batch), (JOBS.c.state, state)):
             if value is not None:
@@ -305,7 +307,7 @@ class Claims:
                 return Claimed(row["id"], row["recording"], row["source"], row["folder"], dict(row["options"]), attempt)
 
     def renew(self, progress: Mapping[str, JobProgress]) -> Heard:
-        """Extend the leases of running jobs and store their progress."""
+        """Extend the leases of running jobs and store their progress. Return the jobs that must end."""
         until_ms = _now_ms() + self._lease_ms
         lost, cancelled = set(), {}
         with self._database.writing() as connection:

@@ -98,8 +98,8 @@ def run_check(
     program: tuple[str, ...] = PROGRAM,
     running: RunningChecks | None = None,
 ) -> Verdict:
-    """Check the model in `folder`; blocks until there is a verdict. A check that exceeds its limits
-    or crashes because of the model is a verdict too.
+    """Check the model in `folder`; blocks until there is a verdict. A check that exceeds its limits of memory or CPU
+    time, or crashes because of the model, is a verdict too.
 
     Args:
         folder: unpacked model.
@@ -109,7 +109,8 @@ def run_check(
         running: registry in which the process is listed.
 
     Raises:
-        CheckFailed: if the check could not run or was killed by `RunningChecks.end`.
+        CheckFailed: if the check could not run, lasted longer than `CHECK_PASSED_S`, or was killed by
+            `RunningChecks.end`.
     """
     command = [*program, str(folder), "--json", "--device", device]
     verdict, description = None, dict[str, Any]()
@@ -173,7 +174,8 @@ def run_program(
 
     Raises:
         BroughtDown: if the checked content terminated the program.
-        CheckFailed: if the program could not run or was killed by `RunningChecks.end`.
+        CheckFailed: if the program could not run, lasted longer than `passed_s` seconds, or was killed by
+            `RunningChecks.end`.
     """
     running = running or RunningChecks()
     with tempfile.TemporaryFile() as said, _started(command, said, device) as process, running.counted(process):

@@ -106,7 +106,7 @@ class Screen:
             image: RGB uint8 [H, W, 3].
 
         Returns:
-            False, without publishing, if the other kind was requested and is already on screen.
+            False, without publishing, if the other kind was requested and this kind is not on screen.
         """
         with self._lock:
             if shows != self._wanted and self._shown != shows:
@@ -368,8 +368,8 @@ class Layers:
                 publisher.close()
 
     def _next(self) -> tuple[Layer, Scene] | None:
-        """Return the newest scene and the watched layer whose last drawing is oldest. None if every watched layer
-        has drawn this scene."""
+        """Return the watched layer whose last drawing is oldest, and the newest scene. If every watched layer has drawn
+        this scene, wait up to `LOOK_S` for a new one and return None."""
         with self._changed:
             waiting = [each for each in LAYERS if each in self._watched and self._drawn_of[each][0] < self._number]
             if not waiting or self._scene is None:

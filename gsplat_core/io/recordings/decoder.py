@@ -157,7 +157,7 @@ class PictureDecoder:
             self._probe = OverrunProbe(_context(known, _DECODERS.get(name, name)), length_bytes(name, known.extradata))
 
     def decode(self, packet: av.Packet | None, number: int, shown: bool) -> list[tuple[int, av.VideoFrame]]:
-        """Decode a packet and yield the finished frames, each with the number of its own packet.
+        """Decode a packet and return the finished frames, each with the number of its own packet.
 
         Args:
             packet: next packet; None at the end flushes the decoder.

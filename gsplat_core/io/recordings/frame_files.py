@@ -220,13 +220,13 @@ class ImageFiles:
 
 
 class MaskFiles:
-    """Reader of tool masks. Files mark tools with 255 or 1; returned masks mark tissue with 1."""
+    """Reader of tool masks. Files mark tools with 1, 255 or 65535; returned masks mark tissue with 1."""
 
     def __init__(self, files: Sequence[Path]) -> None:
         self.files = tuple(files)
 
     def read(self, index: int, findings: Findings) -> NDArray[np.uint8] | None:
-        """Read a mask [H, W]; 1 = tissue, 0 = tool."""
+        """Read a mask uint8 [H, W], 1 = tissue, 0 = tool; None after a problem."""
         path = self.files[index]
         try:
             mask = decode_plane(path)
@@ -278,7 +278,7 @@ class DepthFiles:
         self._shape = (height_px, width_px)
 
     def read(self, index: int, findings: Findings) -> NDArray[np.float32] | None:
-        """Read depth z in mm, float32 [H, W]."""
+        """Read depth z in mm, float32 [H, W]; None after a problem."""
         path = self.files[index]
         depth = self._array(path, findings) if path.suffix.lower() == ".npy" else self._image(path, findings)
         if depth is None:

@@ -102,7 +102,7 @@ def frame_times(files: Sequence[Path], findings: Findings) -> tuple[float, ...] 
     frame is evenly spaced. Gaps are kept and noted. A repeated or decreasing number is a problem.
 
     Returns:
-        Times [N], or None for evenly spaced images.
+        Times [N], or None for evenly spaced images, for names without different numbers, and after a problem.
     """
     numbers = [number for path in files if (number := frame_number(path)) is not None]
     if len(numbers) < len(files) or len(set(numbers)) < 2:

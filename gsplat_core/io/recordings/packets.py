@@ -322,7 +322,8 @@ def _h265_kind(unit: bytes) -> int | None:
 
 
 def _check_units(data: bytes, width: int, pictures: frozenset[int], kind: Callable[[bytes], int | None]) -> str | None:
-    """Check that well-formed NAL units fill the packet exactly and include a part of a picture."""
+    """Return the reason if well-formed NAL units, among them a part of a picture, do not fill the packet exactly; None
+    if they do."""
     found = False
     for unit in _units(data, width):
         if not unit:

@@ -48,7 +48,7 @@ class Recording(Protocol):
     notes: tuple[str, ...]
     """Sentences about fallbacks that were applied."""
     fields: frozenset[str]
-    """Optional frame fields that are present: any of mask, depth, right_image and pose."""
+    """Optional frame fields that are present: any of mask, depth, right_image, pose, labels and ranges."""
     stereo_baseline_mm: float | None
     """Distance of the right eye along the camera's x axis in mm, if known."""
 
@@ -155,7 +155,8 @@ def _check_scaled_size(width_px: int, height_px: int, scale: float) -> None:
 
 
 def validate_recording(path: str | os.PathLike[str]) -> ValidationReport:
-    """Read an entire recording and list its problems; never raises for a bad recording."""
+    """Read an entire recording, or up to `MAX_REPORTED_PROBLEMS`, and list its problems. A bad recording raises no
+    exception."""
     findings = Findings()
     contents = inspect(Path(path), findings)
     if contents is None:

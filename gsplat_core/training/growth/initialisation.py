@@ -1,7 +1,8 @@
 """Creation of Gaussians from one frame: a jittered pixel grid at the tissue's depth, coloured by the picture.
 
-`start_on_device` creates a scene's first Gaussians on the device. The result is the same and takes a few milliseconds on a
-GPU. It avoids cuBLAS and cuDNN: each takes tens of milliseconds for its first use in a thread, which would delay a stream's
+`StartOnDevice` creates a scene's first Gaussians on the device like `gaussians_from_frame`, except that it fills tools
+from a pyramid of means. This takes a few milliseconds on a GPU. It avoids cuBLAS and cuDNN: each takes tens of
+milliseconds for its first use in a thread, which would delay a stream's
 first picture.
 """
 
@@ -92,7 +93,7 @@ def gaussians_at_pixels(
 
     Args:
         pixels: positions [M, 2] as x, y; pixel centres at +0.5.
-        spacing_px: width of the Gaussians in pixels.
+        spacing_px: distance of neighbouring Gaussians in pixels, to which their width is proportional.
         image: RGB uint8 [H, W, 3], source of colours.
         depth_mm: float32 [H, W].
         camera: camera of the picture, with its pose.

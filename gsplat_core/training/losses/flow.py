@@ -45,7 +45,8 @@ class FlowLoss:
         self._calls = 0
 
     def __call__(self, scene: Gaussians, observation: Observation, context: LossContext) -> Tensor | None:
-        """Return the mean flow error between the observation and the frame before or after it; None without a pair.
+        """Return the mean flow error between the observation and the frame before or after it; None without a pair, and
+        for a right eye.
         Raises InvalidSetting for a camera other than a pinhole.
         """
         if observation.camera.model != "pinhole":

@@ -63,7 +63,7 @@ def compared_rays(
 ) -> tuple[RenderedRays, Tensor | None]:
     """Render the rays of a view. Pictures of more than `SMALL_PIXELS` pixels are rendered at half size.
 
-    The centre of every compared pixel is that of the observation's pixel with even row and column.
+    The centre of a compared pixel is then that of the observation's pixel with even row and column.
 
     Args:
         scene: Gaussians at the observation's time.

@@ -337,7 +337,8 @@ def no_prior(config: ReconstructorConfig) -> None:
 
 
 def new_motion_prior(config: ReconstructorConfig, field: DeformationField) -> MotionPrior | None:
-    """Create the configured prior, or None for a field without continuation or editable motion.
+    """Create the configured prior; None if the configuration selects none, or for a field without continuation or
+    editable motion.
 
     Raises:
         InvalidSetting: for an unknown name.

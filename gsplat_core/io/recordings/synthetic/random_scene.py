@@ -239,7 +239,7 @@ SHAFTS: tuple[tuple[Colour, bool], ...] = (
 
 
 def _tools(rng: Random, distance_mm: float) -> tuple[ToolPlan, ...]:
-    """Draw up to three tools; only the first one pulls the tissue."""
+    """Draw up to three tools; only the first one may pull the tissue."""
     count = int(rng.choice([0, 1, 2, 3], p=[0.15, 0.45, 0.3, 0.1]))
     size = distance_mm / TISSUE_DISTANCE_MM
     first = rng.uniform(0, 2 * np.pi)
