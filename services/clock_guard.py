@@ -79,7 +79,8 @@ class ClockGuard:
         self._since_s = self._monotonic()
 
     def _read(self) -> float | None:
-        """Return the stored time; None if the file does not exist."""
+        """Return the stored time in seconds; None if the file does not exist. A damaged file gives a time that lets the
+        clock count as jumped."""
         try:
             return float(json.loads(self._path.read_bytes())["seen_s"])
         except FileNotFoundError:

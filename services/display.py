@@ -258,7 +258,7 @@ class _Channel:
             socket.close()
 
     async def _newest(self, socket: Any, timeout_s: float) -> Picture | None:
-        """Return the newest pending picture, or None after the timeout."""
+        """Return the newest pending picture; None after the timeout or a malformed message."""
         if not await socket.poll(round(timeout_s * 1000)):
             return None
         parts = await socket.recv_multipart(copy=False)

@@ -69,7 +69,7 @@ class BlobDamaged(StoreUnavailable):
 
 
 class CheckFailed(StoreUnavailable):
-    """The check of a version could not run. The version itself may be valid."""
+    """The check of a version or a recording could not run. What was to be checked may be valid."""
 
 
 class ExportsError(UserError):

@@ -97,8 +97,8 @@ class FrameDeltas(Protocol):
             dtype: torch.float16 permits half precision where it is faster; the result is float32.
 
         Returns:
-            Function from a normalised time [1] on the field's device to deltas [N, 16] in the
-                columns of `gsplat_core.ops.frame`.
+            Function from a normalised time [1] on the field's device to deltas [N, 16] in the columns of
+                `gsplat_core.scene.gaussians`.
         """
 
 
@@ -346,7 +346,8 @@ class WholeFieldSlot:
         self.parameter_count = sum(tensor.numel() for tensor in self.field.state_dict().values())
 
     def overwrite(self, source: DeformationField) -> bool:
-        """Copy every parameter and buffer, and the time window."""
+        """Copy every parameter and buffer, and the time window. Returns False, with nothing copied, if the shapes
+        differ."""
         mine, theirs = self.field.state_dict(keep_vars=True), source.state_dict(keep_vars=True)
         if {name: t.shape for name, t in mine.items()} != {name: t.shape for name, t in theirs.items()}:
             return False

@@ -35,7 +35,7 @@ class FieldRates:
     Other rates are in the units of their parameters.
 
     Raises:
-        InvalidSetting: if a rate is not in 0..10.
+        InvalidSetting: if a rate is below 0, or 10 or more.
     """
 
     def __post_init__(self) -> None:
@@ -61,7 +61,7 @@ class OneRate(FieldRates):
 
 
 def check_rates(rates: dict[str, float]) -> None:
-    """Raise InvalidSetting unless every rate is in 0..10."""
+    """Raise InvalidSetting unless every rate is at least 0 and below 10."""
     for name, rate in rates.items():
         if not 0 <= rate < 10:
             raise InvalidSetting(f"learning rate {name} is {rate}; it must be between 0 and 10")

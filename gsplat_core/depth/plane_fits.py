@@ -235,7 +235,7 @@ def with_matched_surface(frame: Frame, camera: Camera) -> Frame:
         camera: left camera.
 
     Returns:
-        The frame, unchanged without depth or confidence.
+        The frame with the depth of the surface; unchanged without depth, confidence or a pixel to fit.
     """
     if frame.depth is None or frame.depth_confidence is None:
         return frame

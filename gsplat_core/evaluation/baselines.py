@@ -2,8 +2,8 @@
 
 A copy of the previous frame is a strong baseline in slow endoscopy. A reconstruction that scores
 lower adds nothing to a frozen video. The recording is read twice, with at most ten frames and one
-sum in memory. Frames are held out by `Frame.seq`. Damaged and withheld frames are neither scored
-nor part of a mean. Where numbers are missing, the previous frame is the last one that arrived.
+sum in memory. Frames are held out by `Frame.seq`. Damaged and withheld frames are neither scored nor part of the mean
+of the training frames. Where numbers are missing, the previous frame is the last one that arrived.
 """
 
 from __future__ import annotations
@@ -188,8 +188,8 @@ def measure_baselines(
 
 @dataclass(frozen=True)
 class _Values:
-    """PSNR of the baselines on one frame, by baseline name: over tissue, over the whole frame, and over pixels that are
-    tissue in both pictures.
+    """PSNR of the baselines on one frame, by baseline name: over tissue, over the whole frame, and for copies over
+    pixels that are tissue in both pictures.
     """
 
     frame: Frame

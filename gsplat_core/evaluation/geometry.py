@@ -192,7 +192,7 @@ class PartSums:
 
     @property
     def shares(self) -> PartShares | None:
-        """Shares of all compared frames; None if the images do not change over time."""
+        """Shares over all compared frames; None without frames, or if the frozen model has no error."""
         whole = self._errors[frozenset()]
         if not self._frames or whole <= 0:
             return None
@@ -263,7 +263,7 @@ def evaluate_geometry(
 ) -> Geometry:
     """Measure the geometry of a model.
 
-    Reads the frames once, and again for the scaled views of a model without known scale.
+    Reads the frames once, and again for the scaled views of a model whose scale differs from the true depth.
 
     Args:
         frames: frames of the recording, in order on each iteration; `Frame.seq` counts from 0 as in `truth`.

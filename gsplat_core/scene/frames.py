@@ -45,7 +45,7 @@ class Frame:
     right_camera: Camera | None = None
     """Camera of `right_image`; its pose maps left-camera coordinates to its own. None if unknown."""
     depth: NDArray[np.float32] | None = None
-    """Depth z in millimetres [H, W]; 0 = unknown."""
+    """Depth z [H, W], 0 = unknown; in millimetres if `depth_is_metric`, otherwise in an unknown unit."""
     depth_confidence: NDArray[np.float32] | None = None
     """Confidence of each pixel's depth [H, W], 0 to 1; None for full confidence."""
     depth_origin: DepthOrigin | None = None

@@ -30,7 +30,7 @@ Detail = dict[str, str | int | float | bool | None]
 
 @dataclass(frozen=True)
 class Entry:
-    """Audit entry. It names keys and objects of the service, never persons, file names or patients."""
+    """Audit entry. It names callers and objects of the service, never file names or patients."""
 
     seq: int
     at: str

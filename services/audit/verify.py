@@ -28,7 +28,8 @@ class Finding:
     """Inconsistency of the log, with the line at which it was detected."""
 
     line: int
-    """Line number in its file, from 1; one past the last line for entries missing at the end."""
+    """Line number in its file, from 1; one past the last line for entries missing at the end; 0 if the head or anchor
+    file cannot be read."""
     what: str
     file: str = ""
     """Name of the closed segment; empty for the current file."""
@@ -97,7 +98,7 @@ def verify(path: Path, expected_head: str | None = None) -> Verdict:
         expected_head: digest of an entry, noted outside of the log, which must still exist; None for no such check.
 
     Returns:
-        The findings.
+        Number of entries, newest entry, and the findings.
 
     Raises:
         OSError: if a file cannot be read.

@@ -40,7 +40,7 @@ class Caller:
     streams: frozenset[str] | None = None
     """Streams that the key is limited to; None for all."""
     expires_at: float | None = None
-    """Unix time in seconds at which the user's token expires."""
+    """Unix time in seconds at which the user's token expires; None for an API key."""
 
     def may_use(self, stream: str) -> bool:
         """Return True if the key's limits include the stream, regardless of whether it exists."""

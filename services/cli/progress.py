@@ -61,7 +61,8 @@ class ProgressPrinter:
             self._bar.stop()
 
     def __call__(self, progress: Progress) -> None:
-        """Update the bar on a terminal. Otherwise print a line, at most one per `PLAIN_PERIOD_S` and stage."""
+        """Update the bar on a terminal. Otherwise print a line at the start, after the first frame and at the end of a
+        stage, and every `PLAIN_PERIOD_S` in between."""
         if self._quiet:
             return
         now_s = time.monotonic()

@@ -147,7 +147,7 @@ class SnapshotMethods(Requests):
         """Export a version of a model to a file. `wish`: `time_s`, or `times` of a sequence.
 
         Returns:
-            Size of the file.
+            Size of the file in bytes.
         """
         return self._download(f"/v1/models/{name}/versions/{number}/exports/{format_name}", file, wish, overwrite)
 
@@ -176,7 +176,7 @@ class SnapshotMethods(Requests):
             options: options of `intrasplat render`, such as `outputs`, by name.
 
         Returns:
-            Size of the file.
+            Size of the file in bytes.
         """
         wanted = {"format": format_name, "view": view, "time_s": time_s, "options": dict(options or {})}
         path = f"/v1/models/{name}/versions/{number}/render"
@@ -188,7 +188,7 @@ class SnapshotMethods(Requests):
         """Export a snapshot to a file.
 
         Returns:
-            Size of the file.
+            Size of the file in bytes.
         """
         return self._download(f"/v1/streams/{stream}/snapshots/{number}/exports/{format_name}", file, wish, overwrite)
 
@@ -223,7 +223,7 @@ class Client(ReplayMethods, SnapshotMethods):
         super().__init__(url, key, timeout_s, verify)
 
     def streams(self) -> list[StreamView]:
-        """Return every stream."""
+        """Return the streams that the key may access."""
         return TypeAdapter(list[StreamView]).validate_python(self._ask("GET", "/v1/streams"))
 
     def stream(self, name: str) -> StreamView:

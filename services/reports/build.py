@@ -153,7 +153,7 @@ def build_report(outcome: RunOutcome) -> RunReport:
 
 
 def displayed(outcome: RunOutcome) -> int:
-    """Return the number of frames that a run displayed."""
+    """Return the number of frames that a run displayed; of a live run, the number of new pictures."""
     video, screen, quality = (outcome.find(kind) for kind in (DisplayResult, LiveDisplayResult, QualityResult))
     if isinstance(screen, LiveDisplayResult):
         return screen.pictures

@@ -321,7 +321,7 @@ def load_evaluated(path: Path) -> tuple[Model, EvaluatedRun | None]:
         The model, and the run or None.
 
     Raises:
-        InvalidSetting: if a run has no model or an unreadable report.
+        InvalidSetting: if a run has no model, an unreadable report, or the report of another model.
         BundleError: if the model cannot be loaded.
     """
     if os.path.lexists(path / REPORT):

@@ -35,7 +35,7 @@ def against(psnr_db: float | None, baseline_db: float | None) -> str:
 
 
 def _quality_tiles(report: RunReport) -> list[str]:
-    """Return the tiles of the run's main quality scores. A training error is never the only score."""
+    """Return the tiles of the run's main quality scores, each next to that of the previous frame."""
     quality, baselines = report.quality, report.quality.baselines
     tiles = []
     if (next_frame := quality.next_frame) is not None:

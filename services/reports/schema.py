@@ -87,7 +87,8 @@ class RunFacts(Part):
     started_at: str
     """Start time, UTC, ISO 8601."""
     stop_reason: str
-    """Reason for the end: `end of recording`, `interrupted`, or the failure."""
+    """Reason for the end: `end of recording`, `end of stream`, `end of the time asked for`, `interrupted`, or the
+    failure."""
     interrupted: bool = False
     peak_memory_bytes: Count | None = None
     machine: dict[str, str] = {}

@@ -38,7 +38,7 @@ def basis_field(
         padded: append zero columns up to `RAW_COLUMNS`.
 
     Returns:
-        Deltas [N, C].
+        Deltas [N, C], or [N, 16] if padded.
     """
     u = (tau - centers) * torch.exp(-log_widths)
     inactive = u.abs() > BUMP_REACH

@@ -66,7 +66,7 @@ def hexplane_decode(
         [N, outputs].
 
     Raises:
-        RuntimeError: if the layers do not fit together.
+        InvalidInput: if a tensor is not float32. RuntimeError: if the layers do not fit together.
     """
     for tensor in (coordinates, *spaces, *lines, *weights, *biases):
         if tensor.dtype != torch.float32:

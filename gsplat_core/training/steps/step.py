@@ -142,7 +142,9 @@ def mm_per_px(gaussians: Gaussians, camera: Camera) -> float:
 class TrainingStep:
     """Scene in training: its Gaussians, deformation field and optimiser.
 
-    On a GPU the step is captured as a CUDA graph (`FusedStep`) if the field and all further losses support it. Otherwise the gradient is computed at the deformed Gaussians, and the field's training propagates it to the
+    On a GPU the step is captured as a CUDA graph (`FusedStep`) if alpha blending trains the scene, the strategy reads
+    no gradients in the picture, and the field and all further losses support it. Otherwise the gradient is computed at
+    the deformed Gaussians, and the field's training propagates it to the
     field and the canonical Gaussians.
     """
 

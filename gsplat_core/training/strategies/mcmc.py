@@ -43,7 +43,7 @@ class MCMCStrategy(Strategy):
     refine_start_iter: int = 500
     """Step after which Gaussians move and grow in number."""
     refine_stop_iter: int = 25_000
-    """Step after which Gaussians no longer move and grow in number."""
+    """Step at which Gaussians stop to move and grow in number."""
     refine_every: int = 100
     """Steps between two refinements."""
     min_opacity: float = 0.005
