@@ -315,7 +315,11 @@ class BreathingDepth(Estimator):
         return doubted(frame.image.shape[:2], PARALLAX, NEEDS_ALL_FRAMES)
 
     def of_recording(self, frames: Sequence[Frame], cameras: Sequence[Camera]) -> RecordingDepth:
-        """Estimate the depth of all frames of a recording together."""
+        """Estimate the depth of a recording's frames together.
+
+        If all frames have more than `MOST_PIXELS` pixels, evenly spaced ones get depth. The frames are unchanged if the
+        camera is no pinhole, or if a frame has depth.
+        """
         if cameras[0].model != "pinhole" or any(frame.depth is not None for frame in frames):
             return RecordingDepth(list(frames), {})
         tissue = MovingTissue(frames, cameras)

@@ -118,8 +118,9 @@ class LightDepth(Estimator):
         self._recent: deque[Look] = deque(maxlen=MOST_LOOKS // 2)
 
     def estimate(self, frame: Frame, camera: Camera) -> DepthMap | None:
-        """Return the depth of a frame from shading, at most every `EVERY_S` seconds. A rejected map states why the
-        relief cannot be distinguished from a plane.
+        """Return the depth of a frame from shading; the last result if it is younger than `EVERY_S` seconds and the
+        camera has not moved. A rejected map states why the relief cannot be distinguished from a plane. None without a
+        pinhole camera.
         """
         if camera.model != "pinhole":
             return None

@@ -368,7 +368,10 @@ class Frequencies:
 
 
 def found_in(tracks: GridTracks) -> Frequencies:
-    """Find the frequencies that best explain the tracks; none if static tissue explains them nearly as well."""
+    """Find the frequencies that best explain the tracks.
+
+    None are found if static tissue explains the tracks nearly as well, or the tracks are too short.
+    """
     few = _few(tracks)
     still = fitted(few, (), rounds=2 * ROUNDS, nodes=COARSE)
     rest = still.terms[:, :, 0]

@@ -360,7 +360,7 @@ class _Streams:
         """Raise an error if the streams contain more data than was read.
 
         Raises:
-            BundleCorrupt: otherwise, or if the last one is damaged.
+            BundleCorrupt: in this case, or if a stream is damaged.
         """
         while self._streams:
             if self._next(1):

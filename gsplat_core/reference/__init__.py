@@ -1,4 +1,4 @@
-"""Plain-torch implementations of all operations, for any floating dtype and device.
+"""Plain-torch implementations of the compiled operations, for any floating dtype and device.
 
 They are the reference for tests of the compiled ops.
 """

@@ -1,7 +1,7 @@
 """Limits on pictures, rendered frames and memory, to refuse a run that cannot fit before it starts.
 
 `operators.settings` declares the ranges of options. The constants of the memory estimates are fitted to the peak
-resident size of replays on a CPU: `sinus` (540x540) and `cutting` (640x512) at scales 0.5, 1 and 2, with 2 to 156
+resident size of replays on a CPU: two recordings (540x540 and 640x512 pixels) at scales 0.5, 1 and 2, with 2 to 156
 frames. Including the 0.5 GiB that the process uses before its first frame, the estimates are within 10 % of each
 measurement.
 """

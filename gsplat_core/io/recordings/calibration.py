@@ -413,7 +413,8 @@ def _matlab(paths: Sequence[Path], findings: Findings) -> StereoCalibration:
 
     left, right = eye("Left"), eye("Right")
     # All matrices are OpenCV's. The MATLAB function transposes the intrinsics but not the rotation. The pictures agree
-    # with the rotation as stored: rows of `scared_raw` are off by 0.40 px with it, and by 0.69 px with its transpose.
+    # with the rotation as stored: rows of a SCARED recording are off by 0.40 px with it, and by 0.69 px with its
+    # transpose.
     rotation = _shaped(value("rotationOfCameraMatrix"), (3, 3), "rotationOfCameraMatrix")
     translation = _shaped(value("translationOfCameraMatrix"), (3,), "translationOfCameraMatrix")
     return StereoCalibration(*left, *right, rotation, translation, paths[0].name)

@@ -93,7 +93,7 @@ def open_views(folder: Path, frame_count: int, scale: float = 1.0) -> tuple[Reco
         scale: factor on the picture size.
 
     Raises:
-        RecordingInvalid: if a file cannot be read, or a view has too few pictures.
+        RecordingInvalid: if `views.json` is invalid, a file cannot be read, or a view has too few pictures.
     """
     path = folder / VIEWS_FILE
     if not folder.is_dir() or not path.exists():

@@ -56,7 +56,7 @@ class SessionReader:
     Opening reads all logs and indexes the tracks without decoding.
 
     Raises:
-        RecordingInvalid: if `session.json` is missing or invalid.
+        RecordingInvalid: if `session.json` is missing or invalid, or the folder of segments cannot be read.
     """
 
     def __init__(self, folder: Path) -> None:

@@ -155,7 +155,7 @@ class WriterOptions:
 
     segment_bytes: int = 256 * 2**20
     segment_s: float = 60.0
-    """Size and age limits of a segment."""
+    """Limits of a segment's size in bytes and of its duration in seconds."""
     keep_bytes: int | None = None
     """Size limit in bytes beyond which the oldest segments are deleted; None for no limit."""
     keep_s: float | None = None

@@ -2,9 +2,9 @@
 // the kernels of both devices.
 //
 // A tile is composited in windows of 16x16 pixels. On the CPU a window consists of blocks of one vector of pixels each,
-// 4 wide: 4x4 with AVX-512, 4x2 with AVX2. A first pass finds the blocks that each splat's ellipse touches; the second
-// pass blends only those. On CUDA a thread block of four warps processes a window; each warp has a quadrant of 8x8
-// pixels, two per thread (../blending).
+// 4 wide: 4x4 with AVX-512, 4x2 with AVX2, else 4x1. A first pass finds the blocks that each splat's ellipse touches;
+// the second pass blends only those. On CUDA a thread block of four warps processes a window; each warp has a quadrant
+// of 8x8 pixels, two per thread (../blending).
 #pragma once
 
 #include <cstdint>

@@ -32,7 +32,7 @@ __device__ inline ProjectionInput seen_by(const Scene& scene, int64_t batch, int
 }
 
 // Compute the camera centre: the translation of the inverse view matrix, by Cramer's rule. `camera_centers` in
-// view_colors.py uses the same formula.
+// rendering/pipeline.py uses the same formula.
 __device__ inline void center_of(const float* m, float* center) {
   float crosses[3][3];
   for (int row = 0; row < 3; ++row) {

@@ -94,8 +94,8 @@ struct Kernels {
   void (*poisson)(const double* rates, int64_t rate_count, int64_t count, uint64_t seed, int64_t* out);
 };
 
-// Memory for splats with many fragments on CUDA. `queue` has room for `queue_splats` large splats, and `starts` for as
-// many numbers. `rounds` is zeroed and has ceil(count / queue_splats) values.
+// Memory for splats with many fragments on CUDA. `splats` has room for `capacity` large splats, and `starts` for as
+// many numbers. `rounds` is zeroed and has ceil(count / capacity) values.
 struct Queue {
   Splat* splats;
   uint64_t* starts;

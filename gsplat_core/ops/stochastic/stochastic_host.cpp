@@ -10,9 +10,9 @@ namespace {
 
 using OptionalTensors = std::vector<OptionalTensor>;
 
-// Indices of the scene's tensors; `SplatScene` in stochastic.py has the same order.
+// Indices of the scene's tensors; `SplatScene` in __init__.py has the same order.
 enum SceneTensor { kMeans, kCovars, kOpacities, kQuats, kLogScales, kLogits, kSh, kIndex, kPacked, kChunks, kPackedSh, kTensors };
-// Indices of the options; `SampleOptions` in stochastic.py has the same order.
+// Indices of the options; `SampleOptions` in __init__.py has the same order.
 enum Option {
   kWidth,
   kHeight,

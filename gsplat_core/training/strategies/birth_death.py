@@ -31,8 +31,8 @@ MOST_DEATHS = 0.05
 def birth_death(step: TrainingStep, shares: Shares, count: int) -> None:
     """Remove invisible Gaussians and draw deaths, then split drawn parents until there are `count`.
 
-    Nothing changes if more than `count` would remain. At most every remaining Gaussian is split, once. The same scene
-    at the same step gives the same moves.
+    Each is split once at most. Nothing changes if `count` or more would remain. The same scene at the same step gives
+    the same moves.
     """
     gaussians = step.gaussians
     phi = (step.mean_gradients("logit_opacities") / (1 - gaussians.opacities).clamp(min=1e-3)).cpu().double()

@@ -134,7 +134,10 @@ class Rounds:
 
 @torch.no_grad()
 def densify(step: TrainingStep, shares: Shares, count: int) -> None:
-    """Remove invisible Gaussians, and split those with the largest error until there are `count`."""
+    """Remove invisible Gaussians, and split those with the largest error, each once at most, until there are `count`.
+
+    Nothing changes if `count` or more would remain.
+    """
     unseen = shares.seen_px < UNSEEN_PX
     left = step.gaussians.count - int(torch.count_nonzero(unseen))
     wanted = min(count - left, left)
