@@ -229,7 +229,8 @@ def check_folder_path(out: Path, inputs: Sequence[Path] = ()) -> None:
         inputs: files and folders that the run reads.
 
     Raises:
-        OutputError: `out` is a protected folder, or contains or is part of an input or recording.
+        OutputError: `out` is too long, a protected folder or a result of a batch, or contains or is part of an input or
+            recording.
     """
     if len(os.fsencode(out)) >= MAX_PATH_BYTES:
         raise OutputError(f"--out has {len(os.fsencode(out))} bytes; a path has at most {MAX_PATH_BYTES - 1}")

@@ -213,7 +213,9 @@ class _Handler(BaseHTTPRequestHandler):
             self._answer(HTTPStatus.NOT_FOUND, "text/plain", b"there is nothing here")
 
     def _is_addressed(self) -> bool:
-        """Refuse names of other sites that resolve to this machine, by which their pages could read the pictures."""
+        """Return False for a request to another name than this machine's, if only this machine is served. Pages of
+        other sites could read the pictures by a name that resolves to this machine.
+        """
         name = urlsplit(f"//{self.headers.get('Host', '')}").hostname
         return self.only_host is not None or name in ("127.0.0.1", "::1", "localhost")
 

@@ -136,7 +136,7 @@ class DeformNetwork(torch.nn.Module):
             num_layers: number of layers before the heads.
 
         Raises:
-            ValueError: if a number is below 1.
+            ValueError: if `feature_dim` or `num_layers` is below 1.
         """
         super().__init__()
         for name, value in (("feature_dim", feature_dim), ("num_layers", num_layers)):

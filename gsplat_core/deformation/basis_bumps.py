@@ -274,7 +274,9 @@ class BumpTensors(ContinuedField):
         self._time_window_s = (start, end)
 
     def cover(self, time_s: float, newest_s: float) -> None:
-        """Keep `COLUMNS_AHEAD` columns plus one ahead of `time_s`; new ones continue from `newest_s`."""
+        """Extend the window by columns that continue from `newest_s` if it ends less than `COLUMNS_AHEAD` columns after
+        `time_s`.
+        """
         start, end = self._time_window_s
         ahead_s = COLUMNS_AHEAD * self.spacing_s
         if time_s + ahead_s > end:

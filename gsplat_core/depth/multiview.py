@@ -488,11 +488,11 @@ STREAM_PX = 160
 MOST_KEY_FRAMES = 8
 """Largest number of key frames. When it is exceeded, one of the two closest key frames is removed."""
 MOST_OFFLINE = 32
-"""Number of frames of a complete recording that get depth, spread evenly."""
+"""Largest number of frames of a complete recording that get depth, spread evenly."""
 LONGEST_S = 3.0
 """Largest time difference in seconds of compared frames, limited because tissue deforms."""
 EVERY_S = 0.2
-"""Time between two depth estimates in seconds; until the first one every frame is tried."""
+"""Time in seconds from a depth map to the next attempt. From then on every frame is tried until one gets depth."""
 
 
 class ParallaxDepth(Estimator):
@@ -513,7 +513,9 @@ class ParallaxDepth(Estimator):
         """Depth map estimated at time `_found_s`."""
 
     def estimate(self, frame: Frame, camera: Camera) -> DepthMap | None:
-        """Estimate the depth of a frame by parallax against the key frames, at most every `EVERY_S` seconds."""
+        """Estimate the depth of a frame by parallax against the key frames; None within `EVERY_S` seconds of the last
+        map.
+        """
         if frame.new_scene is not None:
             self._kept, self._found_s, self._look = [], None, None
         if frame.pose is None or camera.model != "pinhole":
@@ -553,8 +555,8 @@ class ParallaxDepth(Estimator):
         return found if agree(before, self._look) else doubted(found.depth.shape, found.origin, UNCONFIRMED)
 
     def _is_elsewhere(self, camera: Camera) -> bool:
-        """Return True if the scope is farther from every key frame than the closest two key frames
-        are from each other, or if there are still few key frames.
+        """Return True if the scope is farther from every key frame than the closest two key frames are from each other.
+        With fewer than `MOST_KEY_FRAMES` key frames, any new position counts.
         """
         if not self._kept:
             return True
@@ -578,7 +580,7 @@ def _apart(one: View, other: View) -> float:
 
 
 def _confirmed(frames: list[Frame], doubts: Counter[str], cameras: Sequence[Camera]) -> RecordingDepth:
-    """Keep the depth of all frames if most are confirmed by a neighbour, else of none.
+    """Keep the depth of all frames if a neighbour confirms at least half of the depth maps, else of none.
 
     One decision is made for the whole recording, because frames with and without depth would start at different
     distances. `agree` compares two depth maps. Reasons are added to `doubts`.

@@ -121,7 +121,7 @@ def pull_of(rays: list[Array], off: list[Array], turns: list[Array], focal_px: f
 
 WINDOW_S = 8.0
 """Length in seconds of a window (part of the recording) in which motion is assumed periodic. Windows of longer
-recordings overlap by half.
+recordings overlap by at least half.
 """
 RATE_HZ = 12.5
 """Largest number of frames used per second; several per heart beat."""

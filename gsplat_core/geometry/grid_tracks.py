@@ -87,7 +87,9 @@ def small_camera(frame: Frame, camera: Camera) -> Camera:
 
 
 def seen_by(frame: Frame, camera: Camera) -> TexturedPicture:
-    """Return the normalised texture of a frame, reduced to `LONGEST_PX`, with tools and highlights marked unusable."""
+    """Return the normalised texture of a frame, reduced to `LONGEST_PX`, with masked pixels and highlights marked
+    unusable.
+    """
     height, width = frame.image.shape[:2]
     small = small_camera(frame, camera)
     size = small.width_px, small.height_px

@@ -76,7 +76,7 @@ class SmallPictures:
         self._highlights = HighlightFinder()
 
     def of(self, frame: Frame) -> SmallPicture:
-        """Reduce a frame to grey and mark tools, highlights and the border as unusable."""
+        """Reduce a frame to grey and mark masked pixels, highlights and the border as unusable."""
         share = min(1.0, self._side_px / max(frame.width_px, frame.height_px))
         size = max(1, round(share * frame.width_px)), max(1, round(share * frame.height_px))
         small = frame.image if share == 1 else np.asarray(cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA))

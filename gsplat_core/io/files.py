@@ -76,7 +76,7 @@ def read_regular(path: str | Path, most_bytes: int, *, follow_links: bool = True
     """Return the bytes of a regular file.
 
     Raises:
-        OSError: if it is not regular, or has more than `most_bytes`.
+        OSError: if it cannot be read, is not regular, or has more than `most_bytes`.
     """
     with open_regular(path, follow_links=follow_links) as file:
         data = file.read(most_bytes + 1)

@@ -377,7 +377,7 @@ class _Streams:
 def spz_pieces(gaussians: Gaussians, version: int = 3) -> Iterator[bytes]:
     """Yield a `.spz` file of Gaussians on the CPU with unit quaternions.
 
-    Positions have as many fractional bits as the farthest one leaves.
+    Positions have as many fractional bits as the farthest one leaves, up to `MOST_FRACTIONAL_BITS`.
 
     Args:
         gaussians: Gaussians of SH degree 0 to 3.

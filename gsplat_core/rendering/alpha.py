@@ -85,7 +85,7 @@ class AlphaRenderer:
 
     def prepare(self, model: Model | Snapshot) -> None:
         """Set the model of the following frames; see `Renderer.prepare`. Raises InvalidInput for a model on another
-        device.
+        device, InvalidSetting for one of another renderer.
         """
         if model.device.type != self._device.type:
             raise InvalidInput(f"this renderer is made for {self._device.type}, the model is on {model.device}")

@@ -260,8 +260,8 @@ class SampledRenderer:
         return self._drawn
 
     def prepare(self, model: Model | Snapshot) -> None:
-        """Set the model of the following frames. Raises InvalidInput for a model on another device or trained by
-        another renderer.
+        """Set the model of the following frames. Raises InvalidInput for a model on another device, InvalidSetting for
+        one of a renderer other than `alpha` or, unless the storage is `raw`, one that moves.
         """
         if model.device.type != self._device.type:
             raise InvalidInput(f"this renderer is made for {self._device.type}, the model is on {model.device}")

@@ -141,7 +141,7 @@ def read_points(scene: ColmapScene) -> Points:
     """Read the points of a scene.
 
     Raises:
-        RecordingError: if there are less than `LEAST_POINTS` points, or their file is missing or malformed.
+        RecordingError: if there are fewer than `LEAST_POINTS` points, or their file is missing or malformed.
     """
     positions, colours = scene.points()
     if len(positions) < LEAST_POINTS:

@@ -164,7 +164,9 @@ def warm_up(settings: LiveSettings, source: FrameSource) -> LiveParts:
 
 @contextmanager
 def low_latency() -> Iterator[None]:
-    """Context manager with a short interpreter switch interval and existing objects exempt from garbage collection."""
+    """Context manager with one OpenCV thread, a short interpreter switch interval, and rare garbage collections that
+    leave out existing objects.
+    """
     interval_s = sys.getswitchinterval()
     threads = cv2.getNumThreads()
     cv2.setNumThreads(min(threads, OPENCV_THREADS))

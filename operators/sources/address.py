@@ -270,7 +270,7 @@ def _is_host(host: str) -> bool:
         ipaddress.ip_address(host.partition("%")[0])
         return True
     labels = host.removesuffix(".").split(".")
-    # A host that ends in a number must be an IPv4 address, which was rejected above.
+    # A host that ends in a number must be an IPv4 address, and this one is none.
     return len(host) <= 253 and not labels[-1].isdigit() and all(_LABEL.fullmatch(label) for label in labels)
 
 

@@ -35,7 +35,8 @@ _MEMORY_WORDS = ("can't allocate memory", "cannot allocate memory", "out of memo
 def exit_code_of(error: BaseException, arguments: Iterable[str] = ()) -> int:
     """Print an error to stderr and return its exit code.
 
-    A UserError (file, option, disk) prints one sentence. Everything else is a bug and prints a traceback.
+    An error that the user can remedy (file, option, disk, memory) and an interrupt print one line. Everything else is a
+    bug and prints a traceback.
 
     Args:
         error: the exception.

@@ -184,7 +184,7 @@ class Requests:
         """Download an answer's body to a file, atomically, verifying the stated length and digest.
 
         Returns:
-            Size of the file.
+            Size of the file in bytes.
 
         Raises:
             ClientError: if the verification fails, the file cannot be written, or it exists and `overwrite` is False.

@@ -245,6 +245,7 @@ class ModelExports:
             RegistryError: if the version does not exist.
             ExportsError: if the export fails.
             Conflict: if the version was not checked.
+            Rejected: if a requested time is outside of the model's window.
         """
         version: Any = self._registry.version(name, number)
         if version.state not in CHECKED:

@@ -331,7 +331,7 @@ def machine_facts() -> dict[str, str]:
 
 
 def processor_name() -> str:
-    """Return the processor's marketing name if the system reports it."""
+    """Return the processor's marketing name if the system reports it, else its architecture."""
     try:
         with open("/proc/cpuinfo", encoding="utf-8") as lines:
             for line in lines:

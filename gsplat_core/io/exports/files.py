@@ -114,7 +114,7 @@ def glb_pieces(rows: Rows, name: str, time_s: float) -> Iterator[bytes]:
 
 
 def packed(document: dict[str, Any], arrays: list[NDArray[Any]]) -> Iterator[bytes]:
-    """Yield a binary glTF file: the JSON document, then the arrays, each padded to a multiple of four bytes.
+    """Yield a binary glTF file: the JSON document, then the arrays, whose sizes must be multiples of four bytes.
 
     Raises:
         ExportError: if the file would be too large.

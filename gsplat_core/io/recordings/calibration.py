@@ -84,7 +84,7 @@ def default_camera(width_px: int, height_px: int) -> Camera:
 def read_poses_bounds(
     path: Path, frame_count: int, width_px: int, height_px: int, findings: Findings
 ) -> Calibration | None:
-    """Read LLFF's `poses_bounds.npy`: N x 17 = 3x5 [R | t | (H, W, f)] and near, far.
+    """Read LLFF's `poses_bounds.npy`: N x 17 = 3x5 [R | t | (H, W, f)] and near, far; None after a problem.
 
     Poses are camera-to-world in OpenCV axes, as stored by the endoscopic data sets. LLFF's axis permutation is not
     applied (gsplat's and Deform3DGS's loaders apply one to EndoNeRF's identity poses).
@@ -132,7 +132,7 @@ def read_poses_bounds(
 
 
 def read_json(path: Path, findings: Findings) -> dict[str, Any] | None:
-    """Read a JSON object from a file of bounded size with unique keys."""
+    """Read a JSON object from a file of bounded size with unique keys; None after a problem."""
     try:
         with open_plain(path) as stream:
             data = stream.read(MAX_JSON_BYTES + 1)
@@ -167,7 +167,7 @@ def _each_key_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def read_pinhole(path: Path, content: dict[str, Any], findings: Findings) -> Camera | None:
-    """Read width, height, fx, fy, cx, cy and an optional model ("pinhole") from a JSON object."""
+    """Read width, height, fx, fy, cx, cy and an optional model ("pinhole") from a JSON object; None after a problem."""
     values = {key: number(content.get(key)) for key in ("width", "height", "fx", "fy", "cx", "cy")}
     wrong = [key for key, value in values.items() if value is None]
     if wrong:

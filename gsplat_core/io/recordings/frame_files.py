@@ -250,7 +250,9 @@ class MaskFiles:
         return (~tool).astype(np.uint8)
 
     def check_polarity(self, findings: Findings) -> float | None:
-        """Return the share of tool pixels over evenly spaced frames; an implausible share is a problem."""
+        """Return the share of tool pixels over evenly spaced frames; None after a problem, such as an implausible
+        share.
+        """
         indices = np.unique(np.linspace(0, len(self.files) - 1, POLARITY_SAMPLES).round().astype(int))
         shares = []
         for index in indices:

@@ -134,7 +134,7 @@ MAX_NAME = 512
 
 
 def read_cameras_json(root: Path, findings: Findings) -> tuple[ImageFiles, Calibration] | None:
-    """Read the images named by `cameras.json`, in its order, and their cameras."""
+    """Read the images named by `cameras.json`, in its order, and their cameras; None after a problem."""
     path = root / "cameras.json"
     content = read_json(path, findings)
     if content is None:

@@ -181,7 +181,8 @@ class TrackWriter:
             wanted_ms: requested timestamp.
 
         Returns:
-            Timestamp in the file in milliseconds: `wanted_ms`, adjusted to exceed the previous one.
+            Timestamp in the file in milliseconds: `wanted_ms`, adjusted to exceed the previous one by at most
+            `MOST_MS_AHEAD`.
         """
         frame = encoded(self.coding, np.ascontiguousarray(picture))
         self._last_ms += min(max(1, wanted_ms - self._last_ms), MOST_MS_AHEAD)

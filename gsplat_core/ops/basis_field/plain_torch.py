@@ -126,7 +126,8 @@ def basis_field_move_to_(
 
     Let h_b = exp(-u_b^2) be the bump heights (see `basis_field`). The minimum-norm weight change is h_b / sum(h^2)
     times the change of the deltas. The deltas at d bump spacings from `tau` change by exp(-d^2 / 2) of it, as by
-    training on that frame alone. Rows with a non-finite result are skipped.
+    training on that frame alone. Rows with a non-finite change, or without a bump near `tau` (`LEAST_SQUARED_HEIGHTS`),
+    are skipped.
     """
     with torch.no_grad():
         change = target - basis_field(centers, log_widths, weights, tau)

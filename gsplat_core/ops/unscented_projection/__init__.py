@@ -78,7 +78,9 @@ class UnscentedTransformParameters:
 
 
 SHUTTER_STEPS = 10
-"""Fixed-point steps for the read-out time of a point, as in gsplat. The error falls by the image motion in pixels per row."""
+"""Fixed-point steps for the read-out time of a point, as in gsplat. Each step multiplies the error by about the image
+motion in pixels per row.
+"""
 
 
 class Limits(NamedTuple):

@@ -25,7 +25,9 @@ UNSEEN_PX = 0.5
 invisible.
 """
 SHRINK = 1.6
-"""Factor by which the halves of a split Gaussian shrink (Kerbl et al. 2023, section 5.2)."""
+"""Factor by which the halves of a split Gaussian are shorter along its longest axis (Kerbl et al. 2023, section
+5.2).
+"""
 APART = 0.5
 """Distance of the halves from their parent's centre, in its standard deviations along its longest axis."""
 

@@ -213,7 +213,7 @@ def pixel_rays(camera: Camera) -> tuple[Array, Array]:
 def cast_tissue(
     tissue: Tissue, tug: Tug, camera: Camera, ray_x: Array, ray_y: Array, time_s: float
 ) -> tuple[Array, Array, SurfacePoints]:
-    """Intersect rays with the tissue and return the material points (u, v).
+    """Intersect rays with the tissue. Return the material points (u, v), and their positions and tangents.
 
     Newton's method solves X - ray_x Z = 0 and Y - ray_y Z = 0.
     """

@@ -125,7 +125,9 @@ class SyntheticScene:
         return left if view == "left" else left.with_pose(self.left_to(view) @ left.world_to_camera)
 
     def _left_at(self, time_s: float) -> Camera:
-        """Return the left camera: at rest, or swaying around a fixed point on the tissue."""
+        """Return the left camera: at rest, on the path drawn for the scene, or swaying around a fixed point on the
+        tissue.
+        """
         if not self.moving:
             return self.camera
         if self.drawn is not None and self.drawn.path is not None:

@@ -74,7 +74,7 @@ def unequal(phase: float, ratio: float) -> float:
     """Map a uniform phase to one whose sine falls `ratio` times as long as it rises.
 
     The map is smooth and preserves multiples of pi: tan(after / 2) = k tan(before / 2). The rising
-    half takes 2 atan(1 / k) of a turn of 2 pi.
+    half takes 4 atan(1 / k) of a turn of 2 pi.
     """
     k = 1 / np.tan(np.pi / 2 / (1 + ratio))
     turns = round(phase / (2 * np.pi))
