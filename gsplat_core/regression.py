@@ -14,7 +14,7 @@ follow from φ = ∂L/∂ln o, the change of the loss per relative change of a s
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -72,17 +72,13 @@ class Gradients(NamedTuple):
         return Gradients(*(g / each.view(-1, *[1] * (g.dim() - 1)) for g in self))
 
 
-def loss_and_gradients(
-    splats: Splats, points: Tensor, targets: Tensor, *, centre_decay: float = 0.0, factor_decay: float = 0.0
-) -> tuple[Tensor, Gradients]:
-    """Return (1/n) Σ|y - f(x)|² + λ_b Σ|b|² + λ_A Σ|A|² and its gradients in closed form, without autograd.
+def loss_and_gradients(splats: Splats, points: Tensor, targets: Tensor) -> tuple[Tensor, Gradients]:
+    """Return (1/n) Σ|y - f(x)|² and its gradients in closed form, without autograd.
 
     Args:
         splats: the model.
         points: float32 [n, d].
         targets: y, float32 [n, m].
-        centre_decay: λ_b.
-        factor_decay: λ_A.
     """
     with torch.no_grad():
         off = splats(points) - targets
@@ -90,28 +86,7 @@ def loss_and_gradients(
         centres, factors, values = torch.ops.gsplat_core.splat_regression_backward(
             points, splats.centres, splats.factors, splats.values, off * (2 / max(len(points), 1))
         )
-        if centre_decay:
-            loss = loss + centre_decay * splats.centres.square().sum()
-            centres = centres + 2 * centre_decay * splats.centres
-        if factor_decay:
-            loss = loss + factor_decay * splats.factors.square().sum()
-            factors = factors + 2 * factor_decay * splats.factors
         return loss, Gradients(centres, factors, values)
-
-
-def wasserstein_distance(first: Splats, second: Splats) -> Tensor:
-    """Return the 2-Wasserstein distance of each pair of normal distributions, [k].
-
-    W₂² = |b - b'|² + |A|² + |A'|² - 2|A'ᵀA|_* with the nuclear norm (Gelbrich 1990).
-    """
-    nuclear = torch.linalg.svdvals(second.factors.mT @ first.factors).sum(-1)
-    squared = (
-        (first.centres - second.centres).square().sum(-1)
-        + first.factors.square().sum((-2, -1))
-        + second.factors.square().sum((-2, -1))
-        - 2 * nuclear
-    )
-    return squared.clamp(min=0).sqrt()
 
 
 @dataclass(frozen=True)
@@ -174,6 +149,14 @@ def births_and_deaths(phi: Tensor, rate: float, random: torch.Generator, *, sing
 
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-8
+BIRTH_EVERY = 10
+"""Steps between rounds of birth and death."""
+BIRTH_RATE = 0.5
+"""Death rate per round of a splat whose ∂L/∂ln|v| is one standard deviation above the mean of all splats; v is its
+value. Each dead splat is replaced by a copy of a splat below the mean.
+"""
+BIRTH_SPREAD = 2.0
+"""Distance of a copy from its parent in standard deviations of the parent, for a normal draw."""
 
 
 @dataclass(frozen=True)
@@ -192,34 +175,18 @@ class FitOptions:
     """Divide the gradients of each splat by its mass (Bures-Wasserstein metric)."""
     birth_death: bool = True
     """Replace splats by copies of others in regular rounds."""
-    birth_every: int = 10
-    """Steps between rounds of birth and death."""
     birth_until: float = 0.7
     """Share of the steps after which rounds end, so that the last copies are trained."""
-    birth_rate: float = 0.5
-    """Death rate per round of a splat whose ∂L/∂ln|v| is one standard deviation above the mean of all splats; v is its
-    value. Each dead splat is replaced by a copy of a splat below the mean.
-    """
-    birth_spread: float = 2.0
-    """Distance of a copy from its parent in standard deviations of the parent, for a normal draw."""
-    centre_decay: float = 0.0
-    """Weight λ_b of the penalty Σ|b|² on the splats' centres b."""
-    factor_decay: float = 0.0
-    """Weight λ_A of the penalty Σ|A|² on the splats' covariance factors A."""
     start_width: float = 0.05
     """Standard deviation of the first splats, relative to the extent of the points."""
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("steps", "birth_every"):
-            if getattr(self, name) < 1:
-                raise InvalidSetting(f"{name} is {getattr(self, name)}; it must be at least 1")
+        if self.steps < 1:
+            raise InvalidSetting(f"steps is {self.steps}; it must be at least 1")
         for name in ("rate", "start_width"):
             if not 0 < getattr(self, name) < math.inf:
                 raise InvalidSetting(f"{name} is {getattr(self, name)}; it must be positive")
-        for name in ("birth_rate", "birth_spread", "centre_decay", "factor_decay"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise InvalidSetting(f"{name} is {getattr(self, name)}; it must be at least 0")
         if not 0 <= self.birth_until <= 1:
             raise InvalidSetting(f"birth_until is {self.birth_until}; it must be between 0 and 1")
 
@@ -299,7 +266,7 @@ class _Fitting:
     def run(self) -> Fit:
         options, losses = self._options, []
         for step in range(options.steps):
-            loss, gradients = self._gradients()
+            loss, gradients = loss_and_gradients(self._splats, self._points, self._values)
             losses.append(loss)
             if options.metric:
                 gradients = gradients.divided_by_mass(self._splats.masses)
@@ -308,20 +275,10 @@ class _Fitting:
             phi = (self._splats.values * gradients.values).sum(1)
             self._descend(gradients, step)
             rounds = options.birth_death and step < options.birth_until * options.steps
-            if rounds and step % options.birth_every == options.birth_every - 1:
-                self._move(births_and_deaths(phi, options.birth_rate, self._random))
-        losses.append(self._gradients()[0])
+            if rounds and step % BIRTH_EVERY == BIRTH_EVERY - 1:
+                self._move(births_and_deaths(phi, BIRTH_RATE, self._random))
+        losses.append(loss_and_gradients(self._splats, self._points, self._values)[0])
         return Fit(self._splats, torch.stack(losses).cpu())
-
-    def _gradients(self) -> tuple[Tensor, Gradients]:
-        options = self._options
-        return loss_and_gradients(
-            self._splats,
-            self._points,
-            self._values,
-            centre_decay=options.centre_decay,
-            factor_decay=options.factor_decay,
-        )
 
     def _descend(self, gradients: Gradients, step: int) -> None:
         rate = self._options.rate * 0.5 * (1 + math.cos(math.pi * step / self._options.steps))
@@ -342,12 +299,7 @@ class _Fitting:
         copies = torch.bincount(parents, minlength=len(splats.values)) + 1
         splats.values.div_(copies[:, None])
         offsets = torch.randn(len(dying), dims, generator=self._random).to(splats.centres.device)
-        offsets = self._options.birth_spread * (splats.factors[parents] @ offsets[..., None])[..., 0]
+        offsets = BIRTH_SPREAD * (splats.factors[parents] @ offsets[..., None])[..., 0]
         for tensor in (*self._parameters, *self._first, *self._second):
             tensor[dying] = tensor[parents]
         splats.centres[dying] += offsets
-
-
-def adam_alone(options: FitOptions | None = None) -> FitOptions:
-    """Return the options without metric and birth-death: Adam alone, the baseline of benchmarks."""
-    return replace(options or FitOptions(), metric=False, birth_death=False)

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler, TypeAdapter, ValidationError
     from pydantic_core import CoreSchema
 
-Command = Literal["replay", "batch", "reconstruct", "live", "job", "stream", "render"]
+Command = Literal["replay", "batch", "reconstruct", "live", "job", "stream", "render", "train"]
 """Uses of options: commands of `intrasplat`, replay jobs of the service, and streams of the service. `render` stands for
 pictures of a finished model, by `intrasplat render` or through the REST API."""
 EVERYWHERE: tuple[Command, ...] = get_args(Command)

@@ -14,6 +14,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from gsplat_core.choices import DEPTHS, DEPTHS_WITH_ADDRESS, FIELDS, LOSSES, OUTPUTS, RENDERERS, STRATEGIES, Eyes
@@ -388,6 +389,50 @@ class LiveOptions(EngineOptions, SourceSection, LengthSection, PlaybackSection):
 @dataclass(frozen=True, kw_only=True)
 class RenderOptions(DisplaySection, SeedSection, StillSection, RenderSection):
     """Options of pictures and videos of a finished model."""
+
+
+def check_images_folder(images: str) -> None:
+    """Raise InvalidSetting unless the folder of a scene's images is inside the scene."""
+    if Path(images).is_absolute() or ".." in Path(images).parts:
+        raise InvalidSetting(f"images is {images!r:.80}; give a folder inside the scene")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainOptions(SeedSection):
+    """Options of the training of a static scene.
+
+    Raises:
+        InvalidSetting: if the images are not inside the scene, or one image in one is held out.
+    """
+
+    steps: Annotated[int, Option("Number of optimiser steps", ("train",), ge=1, le=10**7)] = 30_000
+    strategy: Annotated[
+        Literal["adc", "mcmc", "none"],
+        Option(
+            "Change of the Gaussians: adc splits those with large gradients, mcmc moves transparent ones, none keeps one per point",
+            ("train",),
+        ),
+    ] = "adc"
+    max_gaussians: Annotated[
+        int,
+        Option("Number of Gaussians at which mcmc stops to add, and after which adc multiplies none", ("train",), ge=1),
+    ] = 1_000_000
+    absgrad: Annotated[bool, Option("With adc: add up absolute gradients", ("train",))] = False
+    device: Annotated[Device, Option("Processor that trains and renders", ("train",))] = "cpu"
+    images: Annotated[str, Option("Folder of the scene's images, such as images_4", ("train",))] = "images"
+    every: Annotated[
+        int,
+        Option("Hold out every k-th image, in the order of names, for the evaluation; 0 for none", ("train",), ge=0),
+    ] = 8
+    scale: Annotated[float, Option("Factor by which the images are resized", ("train",), gt=0, le=64)] = 1.0
+    sh_degree: Annotated[int, Option("Degree of the spherical harmonics", ("train",), ge=0, le=4)] = 3
+    save_every: Annotated[int, Option("Interval in steps at which the model is saved", ("train",), ge=1)] = 5000
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.every == 1:
+            raise InvalidSetting("every is 1; it must be 0 (hold out no image) or at least 2")
+        check_images_folder(self.images)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,7 +17,7 @@ import torch
 
 from gsplat_core import reference
 from gsplat_core.ops.splat_regression import splat_regression
-from gsplat_core.regression import FitOptions, Splats, adam_alone, fit
+from gsplat_core.regression import FitOptions, Splats, fit
 
 SPLATS, POINTS, BUMPS = 32, 400, 6
 ADAM_RATES = (2e-2, 1e-2, 5e-3, 2.5e-3, 1e-3)
@@ -101,8 +101,9 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=10)
     chosen = parser.parse_args()
     options = FitOptions()
+    alone = replace(options, metric=False, birth_death=False)
     by_rate = {
-        rate: [final_loss(s, replace(adam_alone(options), rate=rate), chosen.device) for s in range(chosen.seeds)]
+        rate: [final_loss(s, replace(alone, rate=rate), chosen.device) for s in range(chosen.seeds)]
         for rate in ADAM_RATES
     }
     adam_rate = min(by_rate, key=lambda rate: statistics.median(by_rate[rate]))

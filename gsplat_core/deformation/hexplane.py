@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.deformation.field import Capabilities, DeformationField, WholeFieldSlot, checked_window, ops_for
-from gsplat_core.deformation.kinds import FieldKind, FieldRates, NewField
+from gsplat_core.deformation.kinds import FieldKind, NewField, OneRate
 from gsplat_core.deformation.regularisers import towards_neighbours_
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.hexplane import hexplane as compiled
@@ -413,12 +413,17 @@ class HexPlaneTraining:
         self._state = None
 
 
-@dataclass(frozen=True)
-class HexPlaneLearningRates(FieldRates):
-    """Learning rates of the feature planes and of the network."""
+PLANES_FACTOR = 4.0
 
-    planes: float = 2e-2
-    network: float = 5e-3
+
+@dataclass(frozen=True)
+class HexPlaneLearningRates(OneRate):
+    """Learning rate of the network; that of the feature planes is `PLANES_FACTOR` times as high."""
+
+    def scaled(self, mm_per_px: float, scale: float = 1.0) -> dict[str, float]:
+        """Return the rates `planes` and `network` times `scale`."""
+        network = scale * self.parameters
+        return {"planes": PLANES_FACTOR * network, "network": network}
 
     def rate_of(self, parameter: str) -> str:
         return "planes" if parameter.startswith("planes") else "network"

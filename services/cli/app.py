@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from gsplat_core.errors import InvalidSetting
-from operators.settings import JobOptions, LiveOptions, ReconstructOptions, RenderOptions, ReplayOptions
+from operators.settings import JobOptions, LiveOptions, ReconstructOptions, RenderOptions, ReplayOptions, TrainOptions
 from services.cli import service
 from services.cli.exit_codes import BAD_INPUT, INTERRUPTED, OK, exit_code_of
 from services.cli.options import (
@@ -43,7 +43,6 @@ from services.cli.options import (
     SourceArgument,
     SupersamplingOption,
     SynthesizeOptions,
-    TrainOptions,
     path_option,
     renderer_options,
     require_plain_numbers,
@@ -408,12 +407,12 @@ def evaluate(
 
 
 @app.command()
-@takes_run_options
-def train(scene: SceneArgument, out: OutOption, options: TrainOptions, json: JsonOption = False) -> int:
+@takes_options(TrainOptions, "train")
+def train(scene: SceneArgument, out: OutOption, options: Mapping[str, Any], json: JsonOption = False) -> int:
     """Train a static scene from posed images in COLMAP's format, and evaluate it on held-out images."""
     from services.cli.train import train_command
 
-    return train_command(scene, out, options, as_json=json)
+    return train_command(scene, out, TrainOptions(**options), as_json=json)
 
 
 @app.command()

@@ -15,7 +15,7 @@ from gsplat_core.evaluation.protocols import Visits
 from gsplat_core.io.model_sources import is_scene_file
 from gsplat_core.plain_numbers import plain_float
 from operators.applications.evaluate import EvaluationSettings, evaluate
-from operators.applications.evaluate_scene import RESULT_FILE, SceneScore, SceneSettings, evaluate_scene
+from operators.applications.static_scene import EVALUATION_FILE, SceneScore, SceneSettings, evaluate_scene
 from operators.output_folder import OutputFolder
 from services.cli.exit_codes import INTERRUPTED, OK
 from services.cli.options import EvaluateOptions, renderer_options
@@ -80,7 +80,7 @@ def evaluate_scene_command(model: Path, settings: SceneSettings, out: Path | Non
             f" ({printable(score.worst)})"
         )
         if out is not None:
-            typer.echo(str(out / RESULT_FILE))
+            typer.echo(str(out / EVALUATION_FILE))
     return INTERRUPTED if interrupt.requested else OK
 
 

@@ -189,30 +189,6 @@ class EvaluateOptions:
 
 
 @dataclass(frozen=True)
-class TrainOptions:
-    """Options of `train`."""
-
-    steps: Annotated[int, typer.Option(help="Number of optimiser steps.")] = 30_000
-    strategy: Annotated[
-        str,
-        typer.Option(
-            help="How the number of Gaussians changes: adc (adaptive density control), mcmc, or none (one per point)."
-        ),
-    ] = "adc"
-    max_gaussians: Annotated[
-        int, typer.Option(help="Number of Gaussians at which mcmc stops to add, and after which adc multiplies none.")
-    ] = 1_000_000
-    absgrad: Annotated[bool, typer.Option("--absgrad", help="With adc: add up absolute gradients.")] = False
-    device: DeviceOption = "cpu"
-    images: Annotated[str, typer.Option(help="Folder of the scene's images, such as images_4.")] = "images"
-    every: Annotated[int, typer.Option(help="Hold out every k-th image for the evaluation; 0 for none.")] = 8
-    scale: ScaleOption = 1.0
-    sh_degree: Annotated[int, typer.Option(help="Degree of the spherical harmonics, 0 to 4.")] = 3
-    save_every: Annotated[int, typer.Option(help="Interval in steps at which the model is saved.")] = 5000
-    seed: SeedOption = 0
-
-
-@dataclass(frozen=True)
 class SynthesizeOptions:
     """Options of `synthesize`."""
 

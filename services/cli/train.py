@@ -8,11 +8,11 @@ from pathlib import Path
 
 import typer
 
-from operators.applications.train_scene import MODEL_FOLDER, SceneTraining, TrainSettings, train_scene
+from operators.applications.static_scene import MODEL_FOLDER, SceneTraining, train_scene
 from operators.output_folder import OutputFolder
+from operators.settings import TrainOptions
 from operators.storage import mebibytes
 from services.cli.exit_codes import INTERRUPTED, OK
-from services.cli.options import TrainOptions
 from services.cli.progress import ProgressPrinter
 from services.cli.terminal import InterruptRequest, printable
 
@@ -23,11 +23,10 @@ def train_command(scene: Path, out: Path, options: TrainOptions, *, as_json: boo
     Returns:
         The exit code.
     """
-    settings = TrainSettings(scene, **asdict(options))
     with InterruptRequest() as interrupt, OutputFolder(out, "train", [scene]) as output:
         try:
             with ProgressPrinter(quiet=as_json) as progress:
-                result = train_scene(settings, output.path, progress=progress, stop_requested=interrupt)
+                result = train_scene(scene, options, output.path, progress=progress, stop_requested=interrupt)
         except KeyboardInterrupt:
             output.publish()
             raise

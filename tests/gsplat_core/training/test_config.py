@@ -41,7 +41,7 @@ def test_a_wrong_setting_is_named_with_its_value(name, value):
 
 @pytest.mark.parametrize("rate", [-1e-3, 10.0, float("nan")])
 @pytest.mark.parametrize(
-    ("kind", "name"), [(LearningRates, "quats"), (BasisLearningRates, "timing"), (HexPlaneLearningRates, "network")]
+    ("kind", "name"), [(LearningRates, "quats"), (BasisLearningRates, "timing"), (HexPlaneLearningRates, "parameters")]
 )
 def test_a_wrong_rate_is_named_with_its_value(kind, name, rate):
     with pytest.raises(InvalidSetting, match=f"{name} is {rate}"):

@@ -11,7 +11,8 @@ import pytest
 import torch
 
 from gsplat_core import Camera, Gaussians, load_bundle, load_ply, render
-from operators.applications.train_scene import TrainSettings, train_scene
+from operators.applications.static_scene import train_scene
+from operators.settings import TrainOptions
 from services.cli.app import run
 from services.cli.exit_codes import BAD_INPUT, OK
 from tests.colmap_writer import write_scene
@@ -66,8 +67,8 @@ def test_a_scene_is_trained_saved_and_evaluated(scene, tmp_path, capsys):
 
 def test_an_interrupted_training_leaves_the_steps_so_far(scene, tmp_path):
     polled = iter([False, False, True])
-    settings = TrainSettings(scene, steps=40, sh_degree=0)
-    result = train_scene(settings, tmp_path, stop_requested=lambda: next(polled))
+    options = TrainOptions(steps=40, sh_degree=0)
+    result = train_scene(scene, options, tmp_path, stop_requested=lambda: next(polled))
     assert (result.steps, result.interrupted, result.heldout) == (3, True, None)
     assert torch.equal(load_bundle(tmp_path / "model").gaussians.means, load_ply(tmp_path / "scene.ply").means)
 
@@ -82,9 +83,8 @@ def test_the_model_is_saved_during_the_training(scene, tmp_path):
         return False
 
     with pytest.raises(Killed):
-        train_scene(
-            TrainSettings(scene, steps=40, strategy="none", save_every=2, sh_degree=0), tmp_path, stop_requested=stop
-        )
+        options = TrainOptions(steps=40, strategy="none", save_every=2, sh_degree=0)
+        train_scene(scene, options, tmp_path, stop_requested=stop)
     assert load_bundle(tmp_path / "model").gaussians.count == 80
 
 
@@ -102,7 +102,7 @@ def test_the_model_is_saved_during_the_training(scene, tmp_path):
         (lambda folder: (folder / "sparse/0/points3D.txt").write_text("# none\n"), [], "has 0 points"),
         (lambda _: None, ["--every", "1"], "every is 1"),
         (lambda _: None, ["--steps", "0"], "steps is 0"),
-        (lambda _: None, ["--strategy", "streaming"], "adc, mcmc, none"),
+        (lambda _: None, ["--strategy", "streaming"], "adc, mcmc or none"),
         (lambda _: None, ["--strategy", "mcmc", "--absgrad"], "belongs to strategy adc"),
         (lambda _: None, ["--sh-degree", "7"], "sh_degree is 7"),
         (lambda _: None, ["--images", "/etc"], "inside the scene"),
