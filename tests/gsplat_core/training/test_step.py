@@ -63,7 +63,7 @@ def test_no_rate_changes_nothing(make_step, make_frame, camera, field):
 
 @pytest.mark.parametrize("field", ["basis", "hexplane"])
 def test_the_field_alone_learns_when_the_gaussians_stand_still(make_step, make_frame, camera, field):
-    learning = {"basis": {"means_px": 0.1, "sh": 1e-2}, "hexplane": {"planes": 5e-3, "network": 5e-3}}
+    learning = {"basis": {"means_px": 0.1, "sh": 1e-2}, "hexplane": {"parameters": 5e-3}}
     step = make_step(field, rates=still(field, **learning[field]))
     before = step.gaussians.clone()
     rest, moved = Observation.of(make_frame(), camera), Observation.of(make_frame(16, shift_px=2), camera)
