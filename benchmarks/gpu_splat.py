@@ -20,7 +20,7 @@ from torch import Tensor
 
 import gsplat_core
 from gsplat_core.ops.frame.frame import STATUS_LONGEST, STATUS_NEEDED, Frame, FrameMode, View, render_frame
-from gsplat_core.ops.frame_gradients.frame_gradients import (
+from gsplat_core.ops.frame_gradients import (
     RATES,
     GaussianAdam,
     render_frame_backward,

@@ -15,7 +15,7 @@ from collections.abc import Callable
 
 import torch
 
-from gsplat_core.ops.image_loss.image_loss import image_loss
+from gsplat_core.ops.image_loss import image_loss
 from gsplat_core.ops.native import instruction_set
 from gsplat_core.ops.ssim import ssim_map
 from gsplat_core.reference.image_loss import image_loss as reference_image_loss

@@ -12,7 +12,7 @@ import math
 import torch
 
 from gsplat_core import Camera, Gaussians, render
-from gsplat_core.ops.image_loss.image_loss import image_loss
+from gsplat_core.ops.image_loss import image_loss
 from gsplat_core.training.metrics import psnr_tissue_db
 
 WIDTH_PX, HEIGHT_PX, DISTANCE_MM = 96, 80, 60.0

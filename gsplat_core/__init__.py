@@ -31,8 +31,8 @@ if TYPE_CHECKING:
         rasterize_to_indices_in_range_2dgs,
         rasterize_to_pixels_2dgs,
     )
-    from gsplat_core.ops.surfel_projection.surfel_projection import fully_fused_projection_2dgs
-    from gsplat_core.ops.tiles.tiles import isect_offset_encode, isect_tiles
+    from gsplat_core.ops.surfel_projection import fully_fused_projection_2dgs
+    from gsplat_core.ops.tiles import isect_offset_encode, isect_tiles
     from gsplat_core.ops.unscented_projection import UnscentedTransformParameters, fully_fused_projection_with_ut
     from gsplat_core.ops.world_blending import rasterize_to_pixels_eval3d
     from gsplat_core.poses.rolling_shutter import RollingShutterType
@@ -145,11 +145,11 @@ _HOME = {
     "accumulate_2dgs": "ops.surfel_blending",
     "export_splats": "io.exports.export",
     "fully_fused_projection": "ops.projection.projection",
-    "fully_fused_projection_2dgs": "ops.surfel_projection.surfel_projection",
+    "fully_fused_projection_2dgs": "ops.surfel_projection",
     "fully_fused_projection_with_ut": "ops.unscented_projection",
     "fused_ssim": "ops.ssim",
-    "isect_offset_encode": "ops.tiles.tiles",
-    "isect_tiles": "ops.tiles.tiles",
+    "isect_offset_encode": "ops.tiles",
+    "isect_tiles": "ops.tiles",
     "load_bundle": "io.bundle",
     "load_ply": "io.ply",
     "new_renderer": "rendering.renderer",

@@ -90,10 +90,10 @@ MOTION_PRIORS: Registry[Callable[[Any], Any]] = Registry(
 LOSSES: Registry[LossKind] = Registry(
     "loss",
     {
-        "photometric": "gsplat_core.training.losses.photometric:Photometric",
-        "depth": "gsplat_core.training.losses.depth:Depth",
-        "ray_depth": "gsplat_core.training.losses.ray_depth:RayDepth",
-        "normal_consistency": "gsplat_core.training.losses.normal_consistency:NormalConsistency",
+        "photometric": "gsplat_core.training.losses.pictures:Photometric",
+        "depth": "gsplat_core.training.losses.pictures:Depth",
+        "ray_depth": "gsplat_core.training.losses.rays:RayDepth",
+        "normal_consistency": "gsplat_core.training.losses.rays:NormalConsistency",
         "semantics": "gsplat_core.training.losses.semantics:Semantics",
         "flow": "gsplat_core.training.losses.flow:FlowLoss",
         "triangulation": "gsplat_core.training.losses.triangulation:TriangulationLoss",

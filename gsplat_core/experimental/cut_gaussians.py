@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.tiles.grid import TileGrid
-from gsplat_core.ops.tiles.tiles import bin_splats
+from gsplat_core.ops.arguments import TileGrid
+from gsplat_core.ops.tiles import bin_splats
 from gsplat_core.rendering.flow import projected, rotations
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import SH_C0, Gaussians

@@ -3,24 +3,22 @@
 They are the reference for tests of the compiled ops.
 """
 
-from gsplat_core.reference.adam import adam_step
-from gsplat_core.reference.compositing import rasterize_to_pixels
-from gsplat_core.reference.correct_colours import correct_colours
-from gsplat_core.reference.covariance import quat_scale_to_covar_preci
-from gsplat_core.reference.deformation import (
+from gsplat_core.ops.basis_field.plain_torch import (
     basis_field,
     basis_field_add_colours_,
     basis_field_backward,
     basis_field_backward_adam_,
     basis_field_move_to_,
+)
+from gsplat_core.ops.hexplane.plain_torch import (
     hexplane_decode,
     hexplane_deltas,
     hexplane_features,
     hexplane_modulate,
     hexplane_space,
 )
-from gsplat_core.reference.densification import accumulate_gradient_norms_, diffuse_positions_
-from gsplat_core.reference.flow_blending import blend_flow
+from gsplat_core.reference.compositing import blend_flow, correct_colours, rasterize_to_pixels, weighted_sums
+from gsplat_core.reference.covariance import quat_scale_to_covar_preci
 from gsplat_core.reference.image_loss import frame_loss, image_loss, ssim_map
 from gsplat_core.reference.projection import fully_fused_projection
 from gsplat_core.reference.ray_blending import blend_rays, range_histogram, ray_depth_loss, ray_normal_loss, splat_rays
@@ -31,7 +29,7 @@ from gsplat_core.reference.stereo import fit_disparities, match_disparities, smo
 from gsplat_core.reference.stochastic import point_moments, sample_moments
 from gsplat_core.reference.surfels import fully_fused_projection_2dgs, rasterize_to_pixels_2dgs
 from gsplat_core.reference.tiles import isect_offset_encode, isect_tiles
-from gsplat_core.reference.weighted_sum import weighted_sums
+from gsplat_core.reference.training import accumulate_gradient_norms_, adam_step, diffuse_positions_
 
 __all__ = [
     "accumulate_gradient_norms_",

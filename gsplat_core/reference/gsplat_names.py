@@ -8,9 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsplat_core.ops.projection.arguments import DenseProjection
+from gsplat_core.ops.arguments import DenseProjection, DenseSurfels
 from gsplat_core.ops.projection.separate_steps import proj, world_to_cam
-from gsplat_core.ops.surfel_projection.arguments import DenseSurfels
 from gsplat_core.reference.compositing import rasterize_to_pixels
 from gsplat_core.reference.covariance import matrix_to_triu, quat_scale_to_covar_preci, quat_to_rotmat
 from gsplat_core.reference.projection import fully_fused_projection

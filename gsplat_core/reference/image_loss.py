@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.image_loss.result import ImageLoss
+from gsplat_core.ops.arguments import ImageLoss
 
 WINDOW_RADIUS_PX = 5
 WINDOW_SIGMA_PX = 1.5
@@ -155,7 +155,7 @@ def image_loss(
     depth_weight: float = 0.0,
     squared: bool = False,
 ) -> ImageLoss:
-    """Compute the loss of `gsplat_core.ops.image_loss.image_loss` for any floating dtype."""
+    """Compute the loss of `gsplat_core.ops.image_loss` for any floating dtype."""
     if target.dtype == torch.uint8:
         target = target.to(image.dtype) / 255
     with torch.enable_grad():
@@ -185,7 +185,7 @@ def frame_loss(
     depth_weight: float = 0.0,
     squared: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Compute `gsplat_core.ops.image_loss.frame_loss` for any floating dtype.
+    """Compute `gsplat_core.ops.image_loss` for any floating dtype.
 
     Returns:
         Loss, its terms, dL/dimage and dL/dalphas.

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gsplat_core.ops.projection.arguments import (
+from gsplat_core.ops.arguments import (
     ALPHA_CUTOFF,
     COMPENSATION_FLOOR,
     MAX_EXTENT_SIGMAS,

@@ -9,9 +9,10 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from gsplat_core.ops.projection.arguments import MAX_EXTENT_SIGMAS, MAX_RADIUS_PX
-from gsplat_core.ops.surfel_projection.arguments import (
+from gsplat_core.ops.arguments import (
     LEAST_EXTENT_SQUARED,
+    MAX_EXTENT_SIGMAS,
+    MAX_RADIUS_PX,
     DenseSurfels,
     PackedSurfels,
     check_surfel_arguments,

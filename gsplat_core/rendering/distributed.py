@@ -28,7 +28,7 @@ from torch import Tensor
 from torch.multiprocessing.spawn import spawn
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.projection.arguments import PackedProjection
+from gsplat_core.ops.arguments import PackedProjection
 from gsplat_core.rendering.pipeline import ColoredSplats
 from gsplat_core.rendering.settings import Arguments, RenderSettings
 

@@ -18,13 +18,12 @@ from torch import Tensor
 
 from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.geometry.registration import nearest_others
+from gsplat_core.ops.arguments import DenseProjection, TileGrid
 from gsplat_core.ops.flow_blending import blend_flow
 from gsplat_core.ops.neighbour_motion import neighbour_motion
-from gsplat_core.ops.projection.arguments import DenseProjection
 from gsplat_core.ops.projection.projection import fully_fused_projection
 from gsplat_core.ops.splat_rays import RAY_NUMBERS, splat_rays
-from gsplat_core.ops.tiles.grid import TileGrid
-from gsplat_core.ops.tiles.tiles import bin_splats
+from gsplat_core.ops.tiles import bin_splats
 from gsplat_core.rendering.settings import TILE_SIZE
 from gsplat_core.rendering.surface import COVERED, render_rays
 from gsplat_core.scene.cameras import Camera

@@ -18,9 +18,7 @@ from torch.nn.functional import pad
 
 from gsplat_core.argument_checks import require_same_kind, require_shape
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.projection.arguments import DenseProjection, PackedProjection, Pairs
-from gsplat_core.ops.surfel_projection.arguments import DenseSurfels
-from gsplat_core.ops.tiles.grid import TileGrid
+from gsplat_core.ops.arguments import DenseProjection, DenseSurfels, PackedProjection, Pairs, TileGrid
 from gsplat_core.rendering.settings import (
     CONSTANTS,
     EPS2D,

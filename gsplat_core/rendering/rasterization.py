@@ -18,7 +18,7 @@ from gsplat_core.ops.frame.frame import STATUS_NEEDED, STATUS_OVERFLOW, View, re
 from gsplat_core.ops.packed_projection import values_of_rows, visible_harmonics
 from gsplat_core.ops.projection.projection import fully_fused_projection
 from gsplat_core.ops.spherical_harmonics import spherical_harmonics
-from gsplat_core.ops.tiles.tiles import bin_splats
+from gsplat_core.ops.tiles import bin_splats
 from gsplat_core.rendering.pipeline import Operations
 from gsplat_core.rendering.settings import Arguments, RenderSettings
 from gsplat_core.rendering.single_call import single_call

@@ -14,16 +14,16 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.surfel_blending import rasterize_to_pixels_2dgs
-from gsplat_core.ops.surfel_projection.arguments import (
+from gsplat_core.ops.arguments import (
     DenseSurfels,
     PackedSurfels,
+    TileGrid,
     check_surfel_arguments,
     pack_surfels,
 )
-from gsplat_core.ops.surfel_projection.surfel_projection import fully_fused_projection_2dgs, sparse_gradients
-from gsplat_core.ops.tiles.grid import TileGrid
-from gsplat_core.ops.tiles.tiles import bin_splats
+from gsplat_core.ops.surfel_blending import rasterize_to_pixels_2dgs
+from gsplat_core.ops.surfel_projection import fully_fused_projection_2dgs, sparse_gradients
+from gsplat_core.ops.tiles import bin_splats
 from gsplat_core.rendering.depth_maps import depth_to_normal
 from gsplat_core.rendering.pipeline import Meta, Signal, check_shapes, isect_ids_of, view_colors
 from gsplat_core.rendering.rasterization import step_by_step

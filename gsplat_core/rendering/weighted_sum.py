@@ -18,11 +18,10 @@ from torch import Tensor
 from gsplat_core.errors import InvalidInput
 from gsplat_core.models.model import Model
 from gsplat_core.models.snapshots import Snapshot
-from gsplat_core.ops.projection.arguments import DenseProjection
+from gsplat_core.ops.arguments import DenseProjection, TileGrid
 from gsplat_core.ops.projection.projection import fully_fused_projection
 from gsplat_core.ops.spherical_harmonics import spherical_harmonics
-from gsplat_core.ops.tiles.grid import TileGrid
-from gsplat_core.ops.tiles.tiles import bin_splats
+from gsplat_core.ops.tiles import bin_splats
 from gsplat_core.ops.weighted_sum import weighted_sums
 from gsplat_core.rendering.rasterization import RenderOutput
 from gsplat_core.rendering.renderer import (

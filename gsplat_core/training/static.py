@@ -20,7 +20,7 @@ from gsplat_core.errors import InvalidSetting, RecordingInvalid
 from gsplat_core.geometry.registration import nearest_others
 from gsplat_core.io.recordings.colmap import ColmapScene, PosedImage
 from gsplat_core.ops.adam import adam_step_queued
-from gsplat_core.ops.image_loss.image_loss import image_loss
+from gsplat_core.ops.image_loss import image_loss
 from gsplat_core.rendering.rasterization import rasterization
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import SH_C0, Gaussians

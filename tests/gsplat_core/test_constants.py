@@ -11,7 +11,7 @@ import pytest
 
 import gsplat_core
 from gsplat_core import reference
-from gsplat_core.ops.projection import arguments
+from gsplat_core.ops import arguments
 from gsplat_core.reference import compositing
 from gsplat_core.rendering import settings
 

@@ -15,18 +15,18 @@ from torch.fx.experimental.symbolic_shapes import ShapeEnv
 
 import gsplat_core.ops
 from gsplat_core.ops import native
+from gsplat_core.ops.arguments import TileGrid
 from gsplat_core.ops.compositing import rasterize_to_pixels
 from gsplat_core.ops.frame.frame import FrameMode, View, render_frame
-from gsplat_core.ops.frame_gradients.frame_gradients import (
+from gsplat_core.ops.frame_gradients import (
     GaussianAdam,
     render_frame_backward,
     render_frame_backward_adam_,
 )
-from gsplat_core.ops.image_loss.frame_loss import frame_loss
+from gsplat_core.ops.image_loss import frame_loss
 from gsplat_core.ops.projection.projection import fully_fused_projection
 from gsplat_core.ops.spherical_harmonics import spherical_harmonics
-from gsplat_core.ops.tiles.grid import TileGrid
-from gsplat_core.ops.tiles.tiles import bin_splats
+from gsplat_core.ops.tiles import bin_splats
 
 N = 10
 

@@ -63,7 +63,7 @@ def adam_step_queued(
 
     Raises:
         InvalidInput: if shapes or devices differ, a tensor is not float32 or not contiguous, or step is below 1.
-            `gsplat_core.reference.adam` accepts any floating dtype.
+            `gsplat_core.reference.training` accepts any floating dtype.
     """
     _check(parameter, gradient, first_moment, second_moment, row_size)
     if step < 1:

@@ -18,7 +18,6 @@ from gsplat_core.argument_checks import require_shape
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native
 from gsplat_core.ops.frame.view import GAUSSIAN_TENSORS, View, check_inputs
-from gsplat_core.ops.frame_gradients import autograd  # noqa: F401  registers the gradient
 
 __all__ = [
     "GAUSSIAN_TENSORS",

@@ -98,7 +98,7 @@ class AdamOnDevice(NamedTuple):
 
 
 class Penalties(NamedTuple):
-    """Weights of the penalties of `gsplat_core.reference.plane_penalties` in the loss."""
+    """Weights of the penalties of `gsplat_core.reference.training` in the loss."""
 
     plane_smoothness: float = 0.0
     time_smoothness: float = 0.0

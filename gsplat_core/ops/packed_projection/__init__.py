@@ -15,7 +15,7 @@ from torch import Tensor
 
 from gsplat_core.argument_checks import check_spherical_harmonics_arguments
 from gsplat_core.ops import native  # noqa: F401  registers the compiled op
-from gsplat_core.ops.projection.arguments import PackedProjection, Pairs
+from gsplat_core.ops.arguments import PackedProjection, Pairs
 from gsplat_core.ops.projection.intrinsics_gradient import intrinsics_gradient_of_rows
 from gsplat_core.scene.cameras import CAMERA_MODELS
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from gsplat_core.ops.arguments import FOV_MARGIN
 from gsplat_core.ops.covariance import quat_scale_to_covar_preci
-from gsplat_core.ops.projection.arguments import FOV_MARGIN
 
 NEAR_AXIS = 0.0625
 """Squared tangent of the angle to the axis below which the fisheye's quotients use their Taylor series."""

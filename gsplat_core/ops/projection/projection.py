@@ -10,8 +10,7 @@ from torch import Tensor
 
 from gsplat_core.argument_checks import require_float32
 from gsplat_core.ops import native  # noqa: F401  registers the compiled op
-from gsplat_core.ops.packed_projection import project_visible
-from gsplat_core.ops.projection.arguments import (
+from gsplat_core.ops.arguments import (
     COMPENSATION_FLOOR,
     DenseProjection,
     PackedProjection,
@@ -19,6 +18,7 @@ from gsplat_core.ops.projection.arguments import (
     check_projection_tensors,
     check_sparse_gradient,
 )
+from gsplat_core.ops.packed_projection import project_visible
 from gsplat_core.ops.projection.intrinsics_gradient import intrinsics_gradient, world_covariances
 from gsplat_core.scene.cameras import CAMERA_MODELS
 

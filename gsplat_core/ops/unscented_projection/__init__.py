@@ -16,7 +16,7 @@ from torch import Tensor
 from gsplat_core.argument_checks import require_kernels, require_same_kind, require_shape
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled op
-from gsplat_core.ops.projection.arguments import (
+from gsplat_core.ops.arguments import (
     ALPHA_CUTOFF,
     COMPENSATION_FLOOR,
     MAX_EXTENT_SIGMAS,

@@ -12,7 +12,7 @@ from torch import Tensor
 from gsplat_core.choices import LOSSES
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.training.losses.rendered_rays import EVERY, RenderedRays, rays_of
+from gsplat_core.training.losses.rays import EVERY, RenderedRays, rays_of
 from gsplat_core.training.observations import Observation
 
 

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
+from gsplat_core.ops.arguments import TileGrid
 from gsplat_core.ops.range_histogram import Bins, range_histogram
 from gsplat_core.ops.splat_rays import splat_rays
-from gsplat_core.ops.tiles.grid import TileGrid
-from gsplat_core.ops.tiles.tiles import bin_splats
+from gsplat_core.ops.tiles import bin_splats
 from gsplat_core.rendering.flow import projected
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians

@@ -12,7 +12,7 @@ from torch import Tensor
 from gsplat_core.rendering.surface import SEMANTICS
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.losses.loss import LossContext
-from gsplat_core.training.losses.rendered_rays import rays_of
+from gsplat_core.training.losses.rays import rays_of
 from gsplat_core.training.observations import Observation
 
 CLASSES = 4

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.ops.frame_gradients.frame_gradients import ColourCorrection
+from gsplat_core.ops.frame_gradients import ColourCorrection
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import SH_C0, Gaussians

@@ -23,8 +23,8 @@ from gsplat_core.ops.frame.frame import (
     accumulate_status_,
     render_frame,
 )
-from gsplat_core.ops.frame_gradients.frame_gradients import GaussianAdam, render_frame_backward_adam_
-from gsplat_core.ops.image_loss.frame_loss import frame_loss
+from gsplat_core.ops.frame_gradients import GaussianAdam, render_frame_backward_adam_
+from gsplat_core.ops.image_loss import frame_loss
 from gsplat_core.rendering.frame_renderer import (
     CapturedSequence,
     FrameControls,
@@ -35,7 +35,7 @@ from gsplat_core.rendering.frame_renderer import (
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import COLOUR, LOG_SCALE, OPACITY, POSITION, ROTATION, Gaussians
 from gsplat_core.training.losses.loss import WeightedLosses
-from gsplat_core.training.losses.rendered_rays import compared_rays
+from gsplat_core.training.losses.rays import compared_rays
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.steps.colour_correction import ResidualTarget
 from gsplat_core.training.steps.optimiser import FusedAdam

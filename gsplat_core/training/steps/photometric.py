@@ -15,10 +15,10 @@ import torch
 from torch import Tensor
 
 from gsplat_core.ops.correct_colours import correct_colours
-from gsplat_core.ops.image_loss.image_loss import STEEP_AS_L1, image_loss
+from gsplat_core.ops.image_loss import STEEP_AS_L1, image_loss
 from gsplat_core.ops.projection.projection import fully_fused_projection
 from gsplat_core.ops.spherical_harmonics import spherical_harmonics
-from gsplat_core.ops.tiles.tiles import bin_splats
+from gsplat_core.ops.tiles import bin_splats
 from gsplat_core.rendering.pipeline import ColoredSplats, Geometry, RenderedSplats, StepOperations, render_splats
 from gsplat_core.rendering.rasterization import RenderOutput
 from gsplat_core.rendering.settings import EPS2D, RenderSettings

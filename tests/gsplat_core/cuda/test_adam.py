@@ -5,7 +5,7 @@ import torch
 
 from gsplat_core import InvalidInput
 from gsplat_core.ops.adam import adam_step, adam_step_at_
-from gsplat_core.reference.adam import adam_step as reference_adam_step
+from gsplat_core.reference.training import adam_step as reference_adam_step
 from gsplat_core.training.steps.optimiser import FusedAdam
 
 

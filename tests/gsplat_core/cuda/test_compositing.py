@@ -10,9 +10,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from gsplat_core.ops.arguments import TileGrid
 from gsplat_core.ops.compositing import rasterize_to_pixels
-from gsplat_core.ops.tiles.grid import TileGrid
-from gsplat_core.ops.tiles.tiles import bin_splats
+from gsplat_core.ops.tiles import bin_splats
 from gsplat_core.reference import compositing as reference
 
 Results = dict[str, Tensor]

@@ -10,7 +10,7 @@ import torch
 from gsplat_core import Camera, Gaussians, render
 from gsplat_core.deformation.field import displaced
 from gsplat_core.training.losses.loss import WeightedLosses
-from gsplat_core.training.losses.rendered_rays import EVERY
+from gsplat_core.training.losses.rays import EVERY
 from gsplat_core.training.observations import Observation, RightEye
 from gsplat_core.training.steps.fused_step import FusedStep
 from gsplat_core.training.steps.optimiser import FusedAdam

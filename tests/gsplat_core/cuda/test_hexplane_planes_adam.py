@@ -5,8 +5,8 @@ import torch
 
 from gsplat_core.ops.frame.frame import STATUS_OVERFLOW
 from gsplat_core.ops.hexplane_training import AdamOnDevice, Penalties, hexplane_planes_adam_
-from gsplat_core.reference import plane_penalties
-from gsplat_core.reference.adam import adam_step
+from gsplat_core.reference import training
+from gsplat_core.reference.training import adam_step
 from tests.gsplat_core.cuda.hexplane_cases import Case
 
 PENALTIES = {
@@ -39,15 +39,9 @@ def test_adam_over_the_planes_equals_the_reference(gpu, shape, penalties):
         gradients = case.exact()[2]
         leaves = [p.double().requires_grad_() for p in case.planes]
         space, time = ([p for i, p in enumerate(leaves) if (i % 6 < 3) == is_space] for is_space in (True, False))
-        loss = penalties.time_smoothness * plane_penalties.mean_over_planes(
-            plane_penalties.second_difference_in_time, time
-        )
-        loss = loss + penalties.time_sparsity * plane_penalties.mean_over_planes(
-            plane_penalties.distance_from_one, time
-        )
-        loss = loss + penalties.plane_smoothness * plane_penalties.mean_over_planes(
-            plane_penalties.total_variation, space
-        )
+        loss = penalties.time_smoothness * training.mean_over_planes(training.second_difference_in_time, time)
+        loss = loss + penalties.time_sparsity * training.mean_over_planes(training.distance_from_one, time)
+        loss = loss + penalties.plane_smoothness * training.mean_over_planes(training.total_variation, space)
         extra = torch.autograd.grad(loss, leaves, allow_unused=True)
         hexplane_planes_adam_(ours.planes, first, second, ours.time, gradient, AdamOnDevice(rate, step), penalties)
         for p, m, v, g, e in zip(*wanted, gradients, extra, strict=True):

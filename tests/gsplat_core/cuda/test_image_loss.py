@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core import InvalidInput, reference
-from gsplat_core.ops.image_loss.frame_loss import frame_loss
-from gsplat_core.ops.image_loss.image_loss import image_loss
+from gsplat_core.ops.image_loss import frame_loss, image_loss
 
 SHAPES = [(1, 1, 3), (1, 37, 3), (5, 7, 3), (33, 65, 3), (70, 131, 3), (18, 700, 3), (10, 11, 1), (40, 33, 32)]
 

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from gsplat_core import fully_fused_projection, rasterization
+from gsplat_core.ops.arguments import Pairs
 from gsplat_core.ops.packed_projection import values_of_rows, visible_harmonics
-from gsplat_core.ops.projection.arguments import Pairs
 
 LEAVES = ("means", "quats", "scales", "viewmats")
 OUTPUTS = ("means2d", "depths", "conics", "compensations")

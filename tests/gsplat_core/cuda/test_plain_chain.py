@@ -17,8 +17,8 @@ from gsplat_core import (
     rasterize_to_pixels,
     spherical_harmonics,
 )
-from gsplat_core.ops.tiles.grid import TileGrid
-from gsplat_core.ops.tiles.tiles import bin_splats
+from gsplat_core.ops.arguments import TileGrid
+from gsplat_core.ops.tiles import bin_splats
 from gsplat_core.rendering.pipeline import camera_centers
 
 

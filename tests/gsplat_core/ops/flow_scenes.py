@@ -7,8 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gsplat_core.ops.tiles.grid import TileGrid
-from gsplat_core.ops.tiles.tiles import bin_splats
+from gsplat_core.ops.arguments import TileGrid
+from gsplat_core.ops.tiles import bin_splats
 from gsplat_core.scene.cameras import Camera
 
 

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from gsplat_core import reference
+from gsplat_core.ops.arguments import TileGrid
 from gsplat_core.ops.ray_blending import blend_rays
 from gsplat_core.ops.splat_rays import splat_rays
-from gsplat_core.ops.tiles.grid import TileGrid
-from gsplat_core.ops.tiles.tiles import bin_splats
+from gsplat_core.ops.tiles import bin_splats
 
 INPUTS = ("means2d", "conics", "opacities", "rays", "values")
 OUTPUTS = ("values", "alphas", "depths", "medians", "variances")

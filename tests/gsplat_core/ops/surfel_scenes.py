@@ -9,10 +9,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gsplat_core.ops.arguments import TileGrid
 from gsplat_core.ops.surfel_blending import rasterize_to_pixels_2dgs
-from gsplat_core.ops.surfel_projection.surfel_projection import fully_fused_projection_2dgs
-from gsplat_core.ops.tiles.grid import TileGrid
-from gsplat_core.ops.tiles.tiles import bin_splats
+from gsplat_core.ops.surfel_projection import fully_fused_projection_2dgs
+from gsplat_core.ops.tiles import bin_splats
 from gsplat_core.reference import surfels as oracle
 
 PROJECTED = ("means2d", "depths", "ray_transforms", "normals")

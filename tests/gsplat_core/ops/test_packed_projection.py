@@ -9,8 +9,8 @@ import torch
 
 from gsplat_core import InvalidInput, fully_fused_projection, spherical_harmonics
 from gsplat_core.ops import packed_projection
+from gsplat_core.ops.arguments import DenseProjection, PackedProjection, Pairs
 from gsplat_core.ops.packed_projection import values_of_rows, visible_harmonics
-from gsplat_core.ops.projection.arguments import DenseProjection, PackedProjection, Pairs
 
 OUTPUTS = ("radii", "means2d", "depths", "conics", "compensations")
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gsplat_core.reference import plane_penalties
+from gsplat_core.reference import training
 
 
 @pytest.mark.parametrize(("size", "wanted"), [((1, 1), 0.0), ((1, 3), 4.0), ((3, 1), 4.0), ((3, 3), 8.0)])
 def test_total_variation_is_of_the_axes_that_have_neighbours(size, wanted):
     rows, columns = (2.0 * torch.arange(n) for n in size)  # neighbours differ by 2 along both axes
     plane = (rows[:, None] + columns)[..., None].expand(*size, 4).clone().requires_grad_()
-    value = plane_penalties.total_variation(plane)
+    value = training.total_variation(plane)
     value.backward()
     assert value.item() == wanted
     assert plane.grad.isfinite().all() and bool(plane.grad.any()) == bool(wanted)
@@ -21,6 +21,6 @@ def test_total_variation_is_of_the_axes_that_have_neighbours(size, wanted):
 @pytest.mark.parametrize("rows", [1, 2])
 def test_few_rows_have_no_second_difference(rows):
     plane = torch.rand(rows, 3, 4, requires_grad=True)
-    value = plane_penalties.second_difference_in_time(plane)
+    value = training.second_difference_in_time(plane)
     value.backward()
     assert value.item() == 0 and not plane.grad.any()

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.surfel_projection.surfel_projection import fully_fused_projection_2dgs
+from gsplat_core.ops.surfel_projection import fully_fused_projection_2dgs
 from gsplat_core.reference import surfels as reference
 from tests.gsplat_core.ops.surfel_scenes import PROJECTED, SurfelScene, close, surfel_scene
 

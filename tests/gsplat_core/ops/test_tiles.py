@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
+from gsplat_core.ops.arguments import TileGrid
 from gsplat_core.ops.compositing import rasterize_to_pixels
-from gsplat_core.ops.tiles.grid import TileGrid
-from gsplat_core.ops.tiles.tiles import bin_splats, isect_offset_encode, isect_tiles
+from gsplat_core.ops.tiles import bin_splats, isect_offset_encode, isect_tiles
 from gsplat_core.reference import tiles as reference
 from gsplat_core.reference.rendering import bin_splats_within
 

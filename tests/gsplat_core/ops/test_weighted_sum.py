@@ -9,8 +9,8 @@ import torch
 
 from gsplat_core import reference
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.tiles.grid import TileGrid
-from gsplat_core.ops.tiles.tiles import bin_splats
+from gsplat_core.ops.arguments import TileGrid
+from gsplat_core.ops.tiles import bin_splats
 from gsplat_core.ops.weighted_sum import weighted_sums
 
 NAMES = ("means2d", "conics", "channels", "opacities", "weights")

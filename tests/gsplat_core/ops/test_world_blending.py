@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.tiles.grid import TileGrid
-from gsplat_core.ops.tiles.tiles import bin_splats
+from gsplat_core.ops.arguments import TileGrid
+from gsplat_core.ops.tiles import bin_splats
 from gsplat_core.ops.unscented_projection import fully_fused_projection_with_ut
 from gsplat_core.ops.world_blending import rasterize_to_pixels_eval3d
 from gsplat_core.poses.rolling_shutter import RollingShutterType

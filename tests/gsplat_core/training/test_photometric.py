@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from gsplat_core import reference
-from gsplat_core.ops.image_loss.image_loss import image_loss
+from gsplat_core.ops.image_loss import image_loss
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame

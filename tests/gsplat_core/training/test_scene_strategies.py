@@ -8,7 +8,7 @@ import torch
 from gsplat_core.choices import STRATEGIES
 from gsplat_core.deformation import BasisField
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.ops.image_loss.image_loss import image_loss
+from gsplat_core.ops.image_loss import image_loss
 from gsplat_core.rendering.rasterization import rasterization
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.growth.initialisation import gaussians_from_frame

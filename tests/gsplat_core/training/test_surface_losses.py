@@ -9,9 +9,7 @@ import torch
 from gsplat_core import Camera, Gaussians
 from gsplat_core.rendering.surface import view_of
 from gsplat_core.training.losses.loss import LossContext, WeightedLosses
-from gsplat_core.training.losses.normal_consistency import NormalConsistency
-from gsplat_core.training.losses.ray_depth import RayDepth
-from gsplat_core.training.losses.rendered_rays import EVERY, compared_rays, rays_of
+from gsplat_core.training.losses.rays import EVERY, NormalConsistency, RayDepth, compared_rays, rays_of
 from gsplat_core.training.observations import Observation
 
 SMALL, LARGE = (90, 74), (256, 200)

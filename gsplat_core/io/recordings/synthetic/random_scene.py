@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.io.recordings.synthetic.lamp import LampPlan
+from gsplat_core.io.recordings.synthetic.light import LampPlan
 from gsplat_core.io.recordings.synthetic.paths import PATH_KINDS, ScopePath
 from gsplat_core.io.recordings.synthetic.sensor import Exposure, Field, Sensor
 from gsplat_core.io.recordings.synthetic.tissue import (

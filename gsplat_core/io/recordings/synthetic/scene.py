@@ -12,16 +12,13 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.io.recordings.synthetic.air import Air
-from gsplat_core.io.recordings.synthetic.colon import Colon
 from gsplat_core.io.recordings.synthetic.extras import CLEAR, Extras
-from gsplat_core.io.recordings.synthetic.lamp import USUAL_LAMP, Lamp
-from gsplat_core.io.recordings.synthetic.particles import Particles
+from gsplat_core.io.recordings.synthetic.light import USUAL_LAMP, Air, Lamp, Particles
 from gsplat_core.io.recordings.synthetic.paths import USUAL_SWAY, Sway, looking, rigid
 from gsplat_core.io.recordings.synthetic.random_scene import RandomScene
 from gsplat_core.io.recordings.synthetic.renderer import Eye, render_eye
 from gsplat_core.io.recordings.synthetic.sensor import RadialLens
-from gsplat_core.io.recordings.synthetic.tissue import NO_TUG, TISSUE_DISTANCE_MM, Tissue, Tug
+from gsplat_core.io.recordings.synthetic.tissue import NO_TUG, TISSUE_DISTANCE_MM, Colon, Tissue, Tug
 from gsplat_core.io.recordings.synthetic.tool import CYCLE_S, USUAL_PLAN, Part, ToolLook, ToolMotion
 from gsplat_core.scene.cameras import Camera
 

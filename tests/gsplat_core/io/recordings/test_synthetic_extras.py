@@ -11,14 +11,12 @@ import pytest
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings import open_recording, synthesize, validate_recording
-from gsplat_core.io.recordings.synthetic.air import EXPOSURE_STOPS
-from gsplat_core.io.recordings.synthetic.colon import LENGTH_MM, RADIUS_MM, Colon
 from gsplat_core.io.recordings.synthetic.extras import Extras
-from gsplat_core.io.recordings.synthetic.lamp import Lamp
+from gsplat_core.io.recordings.synthetic.light import EXPOSURE_STOPS, Lamp
 from gsplat_core.io.recordings.synthetic.renderer import cast_tissue, pixel_rays
 from gsplat_core.io.recordings.synthetic.scene import SyntheticScene, View
 from gsplat_core.io.recordings.synthetic.synthesize import motion_to, projected, seen_points
-from gsplat_core.io.recordings.synthetic.tissue import NO_TUG
+from gsplat_core.io.recordings.synthetic.tissue import COLON_LENGTH_MM, COLON_RADIUS_MM, NO_TUG, Colon
 from gsplat_core.io.recordings.truth import open_truth
 from gsplat_core.scene.cameras import Camera
 
@@ -72,7 +70,7 @@ def test_a_ray_into_the_tube_meets_it_once(view: View) -> None:
         assert np.abs(pixels - np.stack([column, row], axis=-1).reshape(-1, 2)).max() < 2e-3
         area = np.gradient(u, axis=1) * np.gradient(v, axis=0) - np.gradient(u, axis=0) * np.gradient(v, axis=1)
         assert area.min() > 0.02 * np.median(area)
-        assert z.min() < 1.5 * RADIUS_MM and z.max() > 0.8 * LENGTH_MM
+        assert z.min() < 1.5 * COLON_RADIUS_MM and z.max() > 0.8 * COLON_LENGTH_MM
 
 
 def test_derivatives_of_the_tube() -> None:
@@ -90,7 +88,7 @@ def test_near_light_dominates_in_the_tube() -> None:
     """Brightness falls with the square of the distance and with the cosine: the end of the tube is dark."""
     tube = SyntheticScene.from_seed(0, 128, 96, 2.4, False, COLON)
     eye = tube.render(0.0)
-    near, far = eye.tissue_depth < 1.5 * RADIUS_MM, eye.tissue_depth > 0.7 * LENGTH_MM
+    near, far = eye.tissue_depth < 1.5 * COLON_RADIUS_MM, eye.tissue_depth > 0.7 * COLON_LENGTH_MM
     assert eye.image[near].mean() > 1.8 * eye.image[far].mean()
     assert not eye.tool.any()
 

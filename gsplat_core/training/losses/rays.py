@@ -1,12 +1,16 @@
-"""Ray depths, normals and class logits of the scene, rendered once for all losses that compare them."""
+"""Losses along rays: depth and normals. The rays of a step are rendered once for all of them.
+
+Normals are compared with those of the rendered depth (Huang et al. 2024, "2D Gaussian Splatting").
+"""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 from torch import Tensor
 
 from gsplat_core.ops.frame.view import View
+from gsplat_core.ops.ray_losses import ray_depth_loss, ray_normal_loss
 from gsplat_core.rendering.surface import COVERED, blend_view_rays, view_of
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.observations import Observation
@@ -92,3 +96,37 @@ def compared_rays(
 
 def _sampled(plane: Tensor, view: View, stride: int) -> Tensor:
     return plane[::stride, ::stride][: view.height, : view.width]
+
+
+class RayDepth:
+    """Mean absolute difference of inverse depths over tissue of known depth, times the observation's mean depth.
+
+    `depth` compares the depths of the Gaussians' centres. On tilted tissue the centres in front hide those behind, so
+    they are biased towards the camera, and the fit compensates. The depth along the ray has no such bias and moves the
+    rotations and scales, too.
+    """
+
+    name: ClassVar[str] = "ray_depth"
+    default_weight: ClassVar[float] = 0.2
+    needs_depth: ClassVar[bool] = True
+
+    def compare(self, rays: RenderedRays) -> Tensor:
+        """Return the mean difference of inverse ray depths, relative to the mean inverse depth of the observation."""
+        assert rays.known_depth is not None
+        return ray_depth_loss(rays.depths, rays.known_depth, rays.tissue)
+
+
+class NormalConsistency:
+    """Mean of 1 - (splat normal · depth normal), weighted by the blending weights, over tissue.
+
+    It needs no depth of the observation. It flattens bumps and turns Gaussians into the surface.
+    """
+
+    name: ClassVar[str] = "normal_consistency"
+    default_weight: ClassVar[float] = 0.1
+    needs_depth: ClassVar[bool] = False
+
+    def compare(self, rays: RenderedRays) -> Tensor:
+        """Return the mean difference of both kinds of normals over the observation's tissue."""
+        view = rays.view
+        return ray_normal_loss(rays.depths, rays.alphas, rays.normals, rays.tissue, view.K, view.camera_model)

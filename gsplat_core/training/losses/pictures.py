@@ -1,4 +1,4 @@
-"""Difference of inverse depths between the rendered picture and an observation."""
+"""Colour and depth terms of the fused image loss as losses of their own."""
 
 from __future__ import annotations
 
@@ -6,11 +6,27 @@ from typing import ClassVar
 
 from torch import Tensor
 
-from gsplat_core.ops.image_loss.image_loss import image_loss
+from gsplat_core.ops.image_loss import image_loss
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.losses.loss import LossContext
 from gsplat_core.training.observations import Observation
+
+
+class Photometric:
+    """L1 difference of the colours over tissue.
+
+    Every step computes this term by the fused path of `image_loss`, with the settings `ssim_weight` and
+    `squared_error`. This class evaluates it alone.
+    """
+
+    name: ClassVar[str] = "photometric"
+    default_weight: ClassVar[float] = 1.0
+
+    def __call__(self, scene: Gaussians, observation: Observation, context: LossContext) -> Tensor | None:
+        """Return the mean colour difference between the rendered picture and the observation."""
+        output = render(scene, observation.camera, depth=False)
+        return image_loss(output.image, observation.image, observation.mask).loss
 
 
 class Depth:

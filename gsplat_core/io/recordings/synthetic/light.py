@@ -1,0 +1,268 @@
+"""Light between scope and tissue: lamp, drifting smoke, varying exposure, and floating particles.
+
+The lamp has two fibres at the tip of the scope, in the coordinates of the rendering camera. Irradiance falls with the
+squared distance to a fibre, with the cosine between surface normal and light direction, and with the angle from the beam
+axis. No other light exists, so near tissue is bright and far tissue dark.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gsplat_core.scene.cameras import Camera
+
+Array = NDArray[np.floating]
+
+LIGHTS_MM = ((-3.2, -2.2, 0.0), (3.2, -2.2, 0.0))
+"""Positions of the two light fibres in mm, around the centre of the scope's tip."""
+REFERENCE_MM = 66.0
+"""Distance in mm at which a white surface facing the scope has radiance 1."""
+SHADOW_MM = (0.0, -7.0, 0.0)
+"""Origin of the shadow rays, above the fibres so that shadows are not hidden behind the tool."""
+
+
+@dataclass(frozen=True)
+class LampPlan:
+    """Positions of the fibres in mm around the centre of the scope's tip, and width of their beam."""
+
+    lights_mm: tuple[tuple[float, float, float], tuple[float, float, float]] = LIGHTS_MM
+    beam: float = 2.0
+    """Exponent of the cosine of the angle from the beam axis; larger values darken the picture's corners."""
+
+
+USUAL_LAMP = LampPlan()
+
+
+@dataclass(frozen=True)
+class Lamp:
+    """Geometry of the light source in mm, in the coordinates of the rendering camera."""
+
+    fibres: Array
+    """Positions of the two light fibres in mm, [2, 3]."""
+    axis: Array
+    """Beam axis, a unit vector [3]."""
+    shadow_from: Array
+    """Origin of the shadow rays in mm, [3]."""
+    reference_mm: float = REFERENCE_MM
+    """Reference distance in mm that sets the exposure."""
+    beam: float = 2.0
+    """Exponent of the cosine of the angle from the beam axis."""
+
+    @classmethod
+    def of_eye(cls, scope_x_mm: float, reference_mm: float = REFERENCE_MM, plan: LampPlan = USUAL_LAMP) -> Lamp:
+        """Return the light source for an eye that looks in the scope's direction.
+
+        Args:
+            scope_x_mm: x coordinate of the centre of the scope's tip.
+            reference_mm: distance at which a white surface has radiance 1.
+            plan: positions and beam of the fibres.
+        """
+        fibres = np.array(plan.lights_mm, np.float32) + np.array([scope_x_mm, 0, 0], np.float32)
+        above = fibres.mean(axis=0) + np.array(SHADOW_MM, np.float32)
+        return cls(fibres, np.array([0, 0, 1], np.float32), above, reference_mm, plan.beam)
+
+    def seen_from(self, eye_to_view: NDArray[np.float64]) -> Lamp:
+        """Return the light source in the coordinates of another camera.
+
+        Args:
+            eye_to_view: rigid transform [4, 4] from the current camera to the other one.
+        """
+        rotation, translation = eye_to_view[:3, :3], eye_to_view[:3, 3]
+        moved = lambda points: (points @ rotation.T + translation).astype(np.float32)
+        axis = (rotation @ self.axis).astype(np.float32)
+        return replace(self, fibres=moved(self.fibres), axis=axis, shadow_from=moved(self.shadow_from))
+
+    def rays_to(self, points: Array, nearest_mm2: float = 0.0) -> list[tuple[Array, Array]]:
+        """Return, for each fibre, the light direction and irradiance at points [..., 3].
+
+        The irradiance excludes the cosine at the surface.
+
+        Args:
+            points: positions in mm.
+            nearest_mm2: squared distance in mm² below which the irradiance is constant.
+
+        Returns:
+            For each fibre, unit vectors to the fibre [..., 3] and irradiance [...].
+        """
+        found = []
+        for fibre in self.fibres:
+            to_light = fibre - points
+            distance2 = np.einsum("...i,...i->...", to_light, to_light)
+            to_light /= np.sqrt(distance2)[..., None]
+            if nearest_mm2:
+                distance2 = np.maximum(distance2, np.float32(nearest_mm2))
+            along = np.clip(-(to_light @ self.axis), 0, 1)
+            # A fibre's light falls off with the angle from the beam axis.
+            found.append((to_light, np.float32(0.5 * self.reference_mm**2) / distance2 * along**self.beam))
+        return found
+
+
+CLOUD_MM = 9.0
+"""Cell size in mm of the noise that forms the smoke density."""
+CELLS = 64
+DRIFT_MM_S = (11.0, -7.0)
+PUFF_PERIOD_S = 2.9
+"""Period in seconds with which the smoke density varies."""
+SMOKE_MM = 74.0
+"""Path length in mm over which smoke of strength 1 and mean density transmits exp(-1) of the light."""
+SMOKE_COLOUR = (0.42, 0.41, 0.44)
+EXPOSURE_PERIODS_S = (1.9, 3.1)
+EXPOSURE_STOPS = (0.45, 0.25)
+"""Amplitudes of the exposure's oscillations in stops (factors of two), one per period."""
+
+
+@dataclass(frozen=True)
+class Air:
+    """Smoke and exposure as functions of time."""
+
+    smoke: float
+    """Strength of the smoke; 0 for none."""
+    exposure_changes: bool
+    clouds: Array
+    """Periodic noise [CELLS, CELLS] from 0 to about 2, mean 1."""
+
+    @classmethod
+    def from_seed(cls, seed: np.random.SeedSequence, smoke: float, exposure_changes: bool) -> Air:
+        """Create the smoke and exposure of a scene."""
+        noise = np.random.default_rng(seed).standard_normal((CELLS, CELLS)).astype(np.float32)
+        wide = np.pad(noise, 4, mode="wrap")
+        soft = cv2.GaussianBlur(wide, (0, 0), 1.0)[4:-4, 4:-4]
+        return cls(smoke, exposure_changes, np.clip(1 + 0.55 * soft / soft.std(), 0, None).astype(np.float32))
+
+    def exposure_at(self, time_s: float) -> float:
+        """Return the exposure factor at a time; 1 at time 0."""
+        if not self.exposure_changes:
+            return 1.0
+        stops = zip(EXPOSURE_STOPS, EXPOSURE_PERIODS_S, strict=True)
+        return float(2 ** sum(most * np.sin(2 * np.pi * time_s / period) for most, period in stops))
+
+    def through(
+        self, radiance: Array, camera: Camera, ray_x: Array, ray_y: Array, depth: Array, lamp: Lamp, time_s: float
+    ) -> Array:
+        """Attenuate the radiance by smoke, add light scattered by it, and apply the exposure.
+
+        Args:
+            radiance: linear radiance [H, W, 3] leaving the surfaces.
+            camera: camera of the picture.
+            ray_x: x / z of each pixel's ray [H, W].
+            ray_y: y / z of each pixel's ray [H, W].
+            depth: depth of the surface in mm [H, W].
+            lamp: light source in camera coordinates.
+            time_s: time in seconds.
+
+        Returns:
+            Radiance at the sensor, float32 [H, W, 3].
+        """
+        if self.smoke:
+            clear = self._transmitted(camera, ray_x, ray_y, depth, time_s)[..., None]
+            # Illuminate smoke like a white surface half-way to the tissue, scaled down because smoke
+            # is thin.
+            half = np.stack([ray_x, ray_y, np.ones_like(ray_x)], axis=-1) * (0.5 * depth)[..., None]
+            arriving = sum(power for _, power in lamp.rays_to(half, nearest_mm2=400))
+            lit = np.minimum(np.float32(0.25) * arriving, np.float32(0.8))[..., None]
+            radiance = clear * radiance + (1 - clear) * lit * np.array(SMOKE_COLOUR, np.float32)
+        return np.asarray(np.float32(self.exposure_at(time_s)) * radiance, np.float32)
+
+    def _transmitted(self, camera: Camera, ray_x: Array, ray_y: Array, depth: Array, time_s: float) -> Array:
+        """Return the transmitted share of light [H, W], from the density at the middle of each ray."""
+        half = np.float32(0.5) * depth
+        local = np.stack([ray_x * half, ray_y * half, half], axis=-1)
+        r, t = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
+        world = (local - t.astype(np.float32)) @ r.astype(np.float32)
+        column, row = ((world[..., k] - DRIFT_MM_S[k] * time_s) / CLOUD_MM for k in (0, 1))
+        density = cv2.remap(
+            self.clouds,
+            np.asarray(column, np.float32) % CELLS,
+            np.asarray(row, np.float32) % CELLS,
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_WRAP,
+        )
+        puff = 0.5 * (1 - np.cos(2 * np.pi * time_s / PUFF_PERIOD_S))
+        return np.asarray(np.exp(np.float32(-2 * puff * self.smoke / SMOKE_MM) * density * depth), np.float32)
+
+
+NEAREST_PARTICLE_MM = 6.0
+FOCUS = 0.8
+"""Distance at which particles are sharp, as a share of the distance of the tissue."""
+APERTURE = 1.2
+"""Diameter of the aperture in mm, which sets the blur of particles that are out of focus."""
+
+
+@dataclass(frozen=True)
+class Particles:
+    """Particles that drift through a box in front of the scope and wrap around at its sides."""
+
+    places: NDArray[np.float64]
+    """Positions at time 0 in shares of the box, [N, 3]."""
+    velocities_mm_s: NDArray[np.float64]
+    """Velocities of the particles, [N, 3]."""
+    radii_mm: NDArray[np.float64]
+    """Radii of the particles, [N]."""
+    whiteness: NDArray[np.float64]
+    """Reflectances of the particles, [N]."""
+    box_mm: tuple[float, float, float]
+    """Size of the box, which starts at the scope's plane at time 0 and is centred on its axis."""
+
+    @classmethod
+    def drawn(cls, random: np.random.Generator, count: int, size_mm: float, distance_mm: float) -> Particles:
+        """Draw particles for tissue at a distance.
+
+        Args:
+            random: generator.
+            count: number of particles.
+            size_mm: median radius.
+            distance_mm: distance of the tissue.
+        """
+        drift, own = random.normal(0, 3, 3), random.normal(0, 2, (count, 3))
+        box = (1.6 * distance_mm, 1.6 * distance_mm, 0.9 * distance_mm)
+        return cls(
+            random.uniform(0, 1, (count, 3)),
+            drift + own,
+            size_mm * np.exp(random.normal(0, 0.5, count)),
+            random.uniform(0.25, 0.9, count),
+            box,
+        )
+
+    def over(self, radiance: Array, depth: Array, camera: Camera, lamp: Lamp, time_s: float) -> Array:
+        """Draw the particles in front of the surfaces.
+
+        Args:
+            radiance: linear radiance [H, W, 3]; changed in place.
+            depth: depth of the surfaces in mm [H, W].
+            camera: camera of the picture.
+            lamp: light source in camera coordinates.
+            time_s: time in seconds.
+        """
+        box = np.array(self.box_mm)
+        world = (self.places + self.velocities_mm_s * time_s / box) % 1.0 * box - [box[0] / 2, box[1] / 2, 0]
+        local = world @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+        focus_mm = FOCUS * box[2] / 0.9
+        height, width = depth.shape
+        for at, radius_mm, white in zip(local, self.radii_mm, self.whiteness, strict=True):
+            if at[2] < NEAREST_PARTICLE_MM:
+                continue
+            column, row = (at @ camera.K.T)[:2] / at[2]
+            if not (-20 < column < width + 20 and -20 < row < height + 20):
+                continue
+            focal_px = float(camera.K[0, 0])
+            sharp_px = focal_px * radius_mm / at[2]
+            blur_px = 0.5 * APERTURE * focal_px * abs(1 / at[2] - 1 / focus_mm)
+            spread_px = float(np.hypot(max(sharp_px, 0.3), min(blur_px, 12.0))) + 0.35
+            arriving = sum(float(power[0]) for _, power in lamp.rays_to(at[None].astype(np.float32), nearest_mm2=400))
+            cover = min(1.0, (sharp_px / spread_px) ** 2)
+            reach = int(np.ceil(2.5 * spread_px))
+            top, left = max(0, int(row) - reach), max(0, int(column) - reach)
+            bottom, right = min(height, int(row) + reach + 1), min(width, int(column) + reach + 1)
+            if top >= bottom or left >= right:
+                continue
+            y, x = np.mgrid[top:bottom, left:right].astype(np.float32) + 0.5
+            alpha = cover * np.exp(-((((x - column) ** 2 + (y - row) ** 2) / spread_px**2) ** 2))
+            alpha = (alpha * (depth[top:bottom, left:right] > at[2])).astype(np.float32)[..., None]
+            colour = np.float32(0.6 * white * min(arriving, 3.0)) * np.array([1.0, 0.93, 0.8], np.float32)
+            part = radiance[top:bottom, left:right]
+            part += alpha * (colour - part)
+        return radiance
