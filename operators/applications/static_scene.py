@@ -172,7 +172,7 @@ class SceneTraining:
     """Peak memory of tensors on the GPU; None on the CPU."""
     interrupted: bool
     heldout: SceneScore | None
-    """Scores of the held-out images; None if there are none."""
+    """Scores of the held-out images; None if there are none or the training was interrupted."""
 
 
 def train_scene(
@@ -191,7 +191,8 @@ def train_scene(
         scene: folder of the scene.
         options: options of the training.
         folder: where to write.
-        progress: called after pictures read, and every `REPORT_EVERY` steps.
+        progress: called after each picture that is read, every `REPORT_EVERY` steps, before each save, after the last
+            step, and after each evaluated image.
         stop_requested: polled after each step; True ends the training with the steps done so far.
 
     Raises:
