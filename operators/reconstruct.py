@@ -125,7 +125,7 @@ class ReconstructOp(Operator):
 
     @property
     def newest(self) -> Model | Snapshot | None:
-        """Last published model, for display."""
+        """Last published model, for display; None before the first one."""
         learner = self._learner
         return self.model if learner is None else learner.newest
 

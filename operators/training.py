@@ -290,7 +290,7 @@ class UntilDisplay(Training):
         return frame
 
     def learn(self, frame: Frame, learner: Learner, frame_waits: Callable[[], bool]) -> Reconstruction | None:
-        """Train on the frame until its display deadline, and publish the model."""
+        """Train on the frame until its display deadline, and publish the model. None for a frame that cannot be shown."""
         behind, taken_ns = frame_waits(), self._clock.now_ns()
         usable = learner.accepts(frame)
         if not learner.enter(frame, usable=usable):

@@ -374,7 +374,7 @@ class StereoDepth(Estimator):
         self._look_in = 0
 
     def estimate(self, frame: Frame, camera: Camera) -> DepthMap | None:
-        """Estimate the depth of a stereo frame by matching its two pictures."""
+        """Estimate the depth of a frame by matching its two pictures; None without a right picture."""
         if frame.right_image is None:
             return None
         shape = frame.image.shape[:2]
@@ -523,7 +523,9 @@ class StereoDepth(Estimator):
         return DepthMap(depth, confidence, STEREO, frame.right_camera is not None, remark=self._remark(middle, reach))
 
     def _remark(self, middle: float, reach: float) -> str | None:
-        """Return a remark about corrected row offsets. Their cause may have shifted columns as well."""
+        """Return a remark about corrected row offsets, whose cause may have shifted columns as well; None for an offset
+        below `SAID_FROM_PX`.
+        """
         off = float(np.median(self._rows, axis=0)[0])
         if abs(off) < SAID_FROM_PX:
             return None

@@ -157,7 +157,7 @@ class SharpnessGate:
         return usual[0], usual[1]
 
     def _judged(self, sharpness: float, clear: NDArray[np.float64]) -> str | None:
-        """Judge a frame by its relative sharpness, and its contrast, saturation and haze."""
+        """Return the fault of a frame by its relative sharpness, contrast, saturation and haze; None for a good one."""
         known = min(self._clear_count, len(self._clear))
         usual = np.maximum(np.partition(self._clear[:known], known // 2, axis=0)[known // 2], 1e-6)
         contrast, saturation = (float(share) for share in (clear / usual)[:2])

@@ -59,7 +59,9 @@ def half_way(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> NDArray[np.
 
 
 def _flow(source: NDArray[np.uint8], target: NDArray[np.uint8]) -> NDArray[np.float32] | None:
-    """Return the optical flow from `source` to `target` as offsets [H, W, 2] in pixels."""
+    """Return the optical flow from `source` to `target` as offsets [H, W, 2] in pixels; None for pictures smaller than
+    `SMALLEST_SIDE_PX`.
+    """
     if min(source.shape[:2]) < SMALLEST_SIDE_PX:
         return None
     finder = getattr(_per_thread, "finder", None)
@@ -124,22 +126,26 @@ class Baselines:
 
     @property
     def previous_frame_db(self) -> float | None:
-        """PSNR of frame i-1 against frame i, over all frames from the second on; baseline of live quality."""
+        """PSNR in dB of frame i-1 against frame i, over all frames from the second on; baseline of live quality. None
+        if no frame was scored.
+        """
         return self.copies.get(1, _NOTHING).psnr_tissue_db
 
     @property
     def heldout_previous_frame_db(self) -> float | None:
-        """PSNR of frame i-1 against held-out frame i."""
+        """PSNR in dB of frame i-1 against held-out frame i; None if no frame was scored."""
         return self.heldout.get(PREVIOUS_FRAME, _NOTHING).psnr_tissue_db
 
     @property
     def heldout_neighbour_mean_db(self) -> float | None:
-        """PSNR of the mean of frames i-1 and i+1 against held-out frame i; non-causal."""
+        """PSNR in dB of the mean of frames i-1 and i+1 against held-out frame i, non-causal; None if no frame was
+        scored.
+        """
         return self.heldout.get(NEIGHBOUR_MEAN, _NOTHING).psnr_tissue_db
 
     @property
     def heldout_train_mean_db(self) -> float | None:
-        """PSNR of the mean of all training frames against every held-out frame."""
+        """PSNR in dB of the mean of all training frames against every held-out frame; None if no frame was scored."""
         return self.heldout.get(TRAIN_MEAN, _NOTHING).psnr_tissue_db
 
 
@@ -245,7 +251,7 @@ def _tissue_in_both(frame: Frame, other: Frame) -> NDArray[np.uint8] | None:
 
 
 def _neighbourhoods(recording: Iterable[Frame], most: int) -> Iterator[tuple[Frame, list[Frame], Frame | None]]:
-    """Yield each frame with up to `most` preceding frames, newest first, and the next frame."""
+    """Yield each frame with up to `most` preceding frames, newest first, and the next frame, None for the last one."""
     window: deque[Frame] = deque(maxlen=most + 2)
     for frame in recording:
         if window and window[-1].image.shape != frame.image.shape:

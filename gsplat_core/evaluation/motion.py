@@ -280,6 +280,7 @@ class FlowSums:
             frame: frame of the recording.
             own: camera of the frame in model space.
             shown: depth z [H, W] rendered by the model.
+            tissue: bool [H, W], pixels that may be compared.
         """
         true = self._files.of(frame)
         if true is None:

@@ -67,6 +67,7 @@ def save_bundle(model: Model, folder: str | Path, *, to_host: Callable[[Tensor],
         to_host: function that copies a GPU tensor to host memory.
 
     Raises:
+        InvalidInput: if a tensor is not float32.
         BundleCorrupt: if a tensor contains NaN or infinity.
         BundleError: if the model exceeds the ranges of `docs/design/bundle.md`, or the files cannot
             be written. A previous bundle then stays intact.

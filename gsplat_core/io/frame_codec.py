@@ -204,7 +204,7 @@ def fields_of(frame: Frame) -> dict[str, Any]:
 
 
 def short(text: str | None) -> str | None:
-    """Return the text, cut to the length of `Text`."""
+    """Return the text, cut to the length of `Text`; None for None."""
     return None if text is None else text[:MAX_TEXT]
 
 

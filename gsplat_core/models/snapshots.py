@@ -57,7 +57,7 @@ class SnapshotSlot:
 
     @property
     def field(self) -> DeformationField | None:
-        """Deformation field with capacity for all rows of the slot."""
+        """Deformation field with capacity for all rows of the slot; None for a static scene."""
         return None if self._field is None else self._field.field
 
     @property

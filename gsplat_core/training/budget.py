@@ -239,5 +239,5 @@ class ObserveReport:
 
     @property
     def loss(self) -> float | None:
-        """Loss of the last step; reading it waits for the step."""
+        """Loss of the last step, None without a step; reading it waits for the step."""
         return None if self.arriving_loss is None else self.arriving_loss.item()

@@ -49,7 +49,9 @@ class Observation:
 
     @property
     def right(self) -> Observation | None:
-        """Observation of the right eye. It is created on first use, which costs host time equal to several GPU steps."""
+        """Observation of the right eye, None without one. It is created on first use, which costs host time equal to
+        several GPU steps.
+        """
         return None if self.right_eye is None else self.right_eye.observation
 
     def to_rehearse(self) -> Observation:

@@ -103,6 +103,7 @@ def evaluate_scene(
         BundleError: the model cannot be read.
         RecordingError: the scene or an image cannot be read.
         InvalidSetting: an option is out of range, or no image was scored.
+        OutputError: `folder` cannot be written.
     """
     check_device(settings.device)
     check_renderer(settings.renderer, settings.device, options=settings.options)
@@ -198,7 +199,7 @@ def train_scene(
     Raises:
         RecordingError: the scene has no cameras or points, or an image is missing or damaged.
         InvalidSetting: an option is out of range.
-        StorageFull: the disk is full.
+        OutputError: a file cannot be written, for example because the disk is full.
     """
     check_device(options.device)
     cuda = options.device == "cuda"

@@ -200,6 +200,7 @@ def run(app: Fragment, engine: Engine = "embedded") -> RunResult:
         EngineMissing: the SDK is not installed or cannot be loaded.
         EngineUnsupported: the SDK cannot run the graph faithfully.
         GraphError: as `Fragment.run` raises it.
+        ValueError: the name of the engine is unknown.
     """
     if engine == "embedded":
         return app.run()

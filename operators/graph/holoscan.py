@@ -58,7 +58,9 @@ class Gate(_Condition):
         super().__init__(fragment, name=f"{task.name}_gate")
 
     def check(self, timestamp: int) -> tuple[Any, int | None]:
-        """Return the scheduling status that results from conditions which the SDK does not know."""
+        """Return the scheduling status that results from conditions which the SDK does not know, and the time in ns to
+        wait for, None for any other status than waiting for a time.
+        """
         if not self.checked:
             self.checked = True
             self.scheduler.restore_signals()

@@ -116,7 +116,7 @@ class LockedEdge(Edge):
             self.wake_consumer()
 
     def pop(self) -> Message | None:
-        """Remove the oldest message under the scheduler's lock, and wake the producer."""
+        """Remove and return the oldest message under the scheduler's lock, None if there is none; wake the producer."""
         with self._lock:
             message = super().pop()
             self.wake_producer()
@@ -146,7 +146,9 @@ class CarriedEdge(LockedEdge):
             self.sender.emit(message, self.port)
 
     def pop(self) -> Message | None:
-        """Receive from the engine and return the oldest message. Raises EngineError for wrong order."""
+        """Receive from the engine and return the oldest message, None if there is none. Raises EngineError for wrong
+        order.
+        """
         carried = self.receiver.receive(self.port)
         if carried is None:
             return None

@@ -134,7 +134,7 @@ class Address:
     @overload
     def whole(self, name: str, default: int | None, least: int, most: int) -> int | None: ...
     def whole(self, name: str, default: int | None, least: int, most: int) -> int | None:
-        """Return an integer option between `least` and `most`. Raises InvalidSetting."""
+        """Return an integer option between `least` and `most`, or `default` if it is missing. Raises InvalidSetting."""
         text = self.text(name)
         if text is None:
             return default
@@ -145,7 +145,7 @@ class Address:
         return int(text)
 
     def flag(self, name: str, default: bool = False) -> bool:
-        """Return a boolean option. Raises InvalidSetting."""
+        """Return a boolean option, or `default` if it is missing. Raises InvalidSetting."""
         text = self.text(name)
         if text is None:
             return default
@@ -154,7 +154,9 @@ class Address:
         return _FLAGS[text.lower()]
 
     def size(self, name: str = "size") -> tuple[int, int] | None:
-        """Return an option for width and height in pixels, such as `640x512`. Raises InvalidSetting."""
+        """Return an option for width and height in pixels, such as `640x512`; None if it is missing. Raises
+        InvalidSetting.
+        """
         text = self.text(name)
         if text is None:
             return None

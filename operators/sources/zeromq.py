@@ -50,8 +50,8 @@ def require_encryption(endpoint: str, encrypted: bool) -> None:
 
 
 def keys_from(path: str) -> tuple[bytes, bytes | None]:
-    """Return public and secret key of a certificate file of `zmq.auth.create_certificates`. Raises
-    InvalidSetting.
+    """Return public and secret key of a certificate file of `zmq.auth.create_certificates`; the secret key is None in
+    a public file. Raises InvalidSetting.
     """
     try:
         return zmq.auth.load_certificate(os.fspath(path))

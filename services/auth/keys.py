@@ -234,7 +234,9 @@ class KeyStore:
             return keys.pop(key_id)
 
     def _match(self, token: str) -> ApiKey | None:
-        """Return the key of a token, expired or not. An unknown key id takes as long as a wrong secret."""
+        """Return the key of a token, expired or not; None for a wrong token. An unknown key id takes as long as a wrong
+        secret.
+        """
         prefix, _, rest = token.partition("_")
         key_id, _, secret = rest.partition("_")
         key = self._current().get(key_id)

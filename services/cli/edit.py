@@ -90,6 +90,7 @@ def edited_model(model: Model, edit: Edit) -> Model:
 
     Raises:
         InvalidInput: for a selection or change that is invalid or does not fit the model.
+        BundleError: if the model to merge cannot be used.
     """
     scene = GaussianCollection(model.gaussians)
     moves = edit.rotate is not None or edit.scale is not None or edit.translate is not None

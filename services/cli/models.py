@@ -239,6 +239,7 @@ def compare_command(
 
     Raises:
         BundleError: if the model cannot be used.
+        ExportError: if the model's camera sees no surface.
         InvalidSetting: if the mesh or the pairs cannot be used, or the alignment is ambiguous.
     """
     if inlier is not None and not 0 < inlier < float("inf"):

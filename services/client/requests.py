@@ -40,6 +40,7 @@ def pictures(url: str, path: str, ticket: str, kind: str, quality: int, verify: 
 
     Raises:
         Unreachable: if the connection fails.
+        ClientError: if the CA file `verify` is unusable.
     """
     parts = urlsplit(url)
     query = urlencode({"kind": kind, "quality": quality, "ticket": ticket})

@@ -152,7 +152,7 @@ class Batch:
         """Compare recordings with their stored fingerprints, and store the fingerprints of new recordings.
 
         Raises:
-            InvalidSetting: if a recording with a result was replaced.
+            InvalidSetting: if a recording with a result was replaced, or the stored fingerprints cannot be read.
         """
         notes = self._results.folder / RECORDINGS
         try:

@@ -289,6 +289,7 @@ class ModelRegistry:
 
         Raises:
             NotFound: if the model does not exist.
+            Conflict: if versions are activated and deleted all the time.
         """
         for _ in range(3):
             with self._database.reading() as connection:

@@ -70,7 +70,7 @@ class YamlFile:
         return cls(values or {}, lines, path.name)
 
     def line_of(self, location: tuple[int | str, ...]) -> int | None:
-        """Return the line number of a key, or of the nearest enclosing section that is in the file."""
+        """Return the line number of a key, or of the nearest enclosing section that is in the file; None without one."""
         for length in range(len(location), 0, -1):
             line = self.lines.get(tuple(str(part) for part in location[:length]))
             if line is not None:

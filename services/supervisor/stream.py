@@ -148,7 +148,9 @@ WITHHELD_FRAMES = 5
 
 
 def overall(capture: ProcessState, engine: ProcessState) -> tuple[str, str | None]:
-    """Derive the state of a stream, and its reason, from the states of its two processes."""
+    """Derive the state of a stream, and its reason, from the states of its two processes. The reason is None if there
+    is none to state, as for a live stream.
+    """
     for process in (capture, engine):
         if process.state == "failed":
             return "failed", process.reason

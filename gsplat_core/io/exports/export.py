@@ -177,6 +177,8 @@ def export_splats(
 
     Raises:
         InvalidInput: for wrong shapes or an unknown format.
+        ExportError: if the format cannot represent the splats.
+        OSError: if `save_to` cannot be written.
     """
     if format not in get_args(SplatFormat):
         raise InvalidInput(f"unknown format {format!r}; the formats are {', '.join(get_args(SplatFormat))}")

@@ -211,7 +211,9 @@ def read_distortion(path: Path, content: dict[str, Any], findings: Findings) -> 
 
 
 def invert_poses(camera_to_world: NDArray[np.float64], path: Path, findings: Findings) -> NDArray[np.float64] | None:
-    """Convert camera-to-world [N, 3, 4] to world-to-camera [N, 4, 4]; each must be rigid."""
+    """Convert camera-to-world [N, 3, 4] to world-to-camera [N, 4, 4]. A pose that is not rigid or too far away is a
+    problem, and the result is then None.
+    """
     rotation, translation = camera_to_world[:, :, :3], camera_to_world[:, :, 3]
     if np.abs(translation).max() > MAX_LENGTH:
         index = int(np.argmax((np.abs(translation) > MAX_LENGTH).any(axis=1)))

@@ -188,7 +188,7 @@ def _pose(value: object, path: Path, index: int, findings: Findings) -> np.ndarr
 def _inside(root: Path, name: object, path: Path, index: int, findings: Findings) -> Path | None:
     """Resolve a file named by a document, inside the folder.
 
-    Absolute paths, `..` and links out of the folder are problems.
+    Absolute paths, `..` and links out of the folder are problems. The result is then None.
     """
     relative = isinstance(name, str) and 0 < len(name) <= MAX_NAME and "\0" not in name
     if relative:
@@ -305,7 +305,7 @@ def _video_folder(path: Path, videos: Sequence[Path], findings: Findings) -> Con
 
 
 def _video_pair(path: Path, left: Path, right: Path, findings: Findings) -> Contents | None:
-    """Open a pair of videos, one per eye."""
+    """Open a pair of videos, one per eye; None after a problem."""
     if not (stays_inside(path, left, findings) and stays_inside(path, right, findings)):
         return None
     images = open_video(left, findings)

@@ -131,7 +131,9 @@ def _element(stream: BinaryIO, at: int) -> tuple[int, int, int | None] | None:
 
 
 def _number(data: bytes, most_bytes: int) -> tuple[int, int] | None:
-    """Parse a variable-width EBML number; return its value with the marker bit, and its width in bytes."""
+    """Parse a variable-width EBML number; return its value with the marker bit, and its width in bytes; None if
+    it is invalid or incomplete.
+    """
     if not data or not data[0]:
         return None
     width = 9 - data[0].bit_length()

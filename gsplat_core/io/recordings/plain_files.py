@@ -318,7 +318,7 @@ def natural_key(path: Path) -> list[tuple[int, int, str]]:
 
 
 def frame_number(path: Path) -> int | None:
-    """Return the last number in a file's name: 12 for `frame-000012.color.png`."""
+    """Return the last number in a file's name: 12 for `frame-000012.color.png`; None without a number."""
     numbers = re.findall(r"\d+", path.stem)
     return int(numbers[-1]) if numbers else None
 

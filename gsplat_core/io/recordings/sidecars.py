@@ -125,12 +125,12 @@ class Beside:
         return None if sensor is None else ScanFiles(found, sensor, self._size[0], path)
 
     def valid_mask(self) -> NDArray[np.uint8] | None:
-        """Read the mask [H, W] of the scope's circular image; 1 is inside."""
+        """Read the mask [H, W] of the scope's circular image, 1 inside; None without a usable file."""
         path = self._file("valid_mask.png")
         return _read_valid_mask(path, self._size, self._findings) if path else None
 
     def _file(self, name: str) -> Path | None:
-        """Return an existing file; a link that dangles or leads outside is reported as a problem."""
+        """Return an existing file, else None; a link that dangles or leads outside is reported as a problem."""
         path = self._there(name)
         return path if path is not None and stays_inside(path.parent, path, self._findings) else None
 
@@ -140,7 +140,9 @@ class Beside:
         return self._folder / name
 
     def _some(self, name: str, what: str, suffixes: frozenset[str]) -> dict[int, Path] | None:
-        """Return the files of a folder with a file for some of the frames, by index of the frame."""
+        """Return the files of a folder with a file for some of the frames, by index of the frame; None without
+        the folder or after a problem.
+        """
         folder = self._there(name)
         if folder is None or not stays_inside(folder.parent, folder, self._findings):
             return None
@@ -155,7 +157,7 @@ class Beside:
         return by_frame(self._images.numbers, files, folder, what, self._findings)
 
     def _sequence(self, name: str, what: str) -> Sequence[Path] | None:
-        """Return the files of a folder with one file per frame."""
+        """Return the files of a folder with one file per frame; None without the folder or after a problem."""
         folder = self._there(name)
         if folder is None or not stays_inside(folder.parent, folder, self._findings):
             return None

@@ -146,7 +146,7 @@ class VideoFrames:
     def frames(self, findings: Findings) -> Iterator[Picture | None]:
         """Yield the pictures in order, with damaged ones marked.
 
-        A premature end or a change of size is a problem.
+        A premature end is a problem, and so is a change of size, which yields None.
         """
         try:
             yield from self._frames(findings)

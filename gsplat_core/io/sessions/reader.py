@@ -291,7 +291,7 @@ class SessionContents:
     stereo_baseline_mm: float | None = None
 
     def frames(self, findings: Findings, limit: int | None = None) -> Generator[Frame | None, None, None]:
-        """Yield the frames in order, with their numbers and times in the session."""
+        """Yield the frames in order, with their numbers and times in the session; None after a problem."""
         yield from islice(self._frames(findings), limit)
 
     def _frames(self, findings: Findings) -> Iterator[Frame | None]:

@@ -211,6 +211,7 @@ class SessionWriter:
 
         Raises:
             FileExistsError: if the folder already contains a session.
+            OSError: if writing fails.
         """
         self.folder, self.info = folder, info
         self.options = options or WriterOptions()

@@ -158,7 +158,7 @@ def _check(
     conics: Tensor | None,
     opacities: Tensor | None,
 ) -> tuple[int, Tensor | None]:
-    """Check the arguments; return the number of images and the image of every packed splat."""
+    """Check the arguments; return the number of images and the image of every packed splat (None if not packed)."""
     shape = tuple(depths.shape)
     expected = {"means2d": (means2d, 2), "radii": (radii, 2)} | ({} if conics is None else {"conics": (conics, 3)})
     for name, (tensor, last) in expected.items():

@@ -69,7 +69,9 @@ class FlowLoss:
         return lengths.sum() / known.sum().clamp(min=1)
 
     def _other(self, observation: Observation, context: LossContext) -> Observation | None:
-        """Return the preceding or the following frame, by turns; the only one at an end of the window."""
+        """Return the preceding or the following frame, by turns; the only one at an end of the window. None without such
+        a frame of the same size.
+        """
         left = [one for one in context.frames if not one.of_right]
         index = next((k for k, one in enumerate(left) if one.seq == observation.seq), None)
         if index is None:

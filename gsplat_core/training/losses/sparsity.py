@@ -19,7 +19,7 @@ class MeanOpacity:
     default_weight: ClassVar[float] = 0.01
 
     def __call__(self, scene: Gaussians, observation: Observation, context: LossContext) -> Tensor | None:
-        """Return the mean opacity of the scene's Gaussians; the observation is not read."""
+        """Return the mean opacity of the scene's Gaussians, None without Gaussians; the observation is not read."""
         return scene.opacities.mean() if scene.count else None
 
 
@@ -36,7 +36,7 @@ class MeanScale:
 
     def __call__(self, scene: Gaussians, observation: Observation, context: LossContext) -> Tensor | None:
         """Return the mean standard deviation of the scene's Gaussians, relative to the scene's median distance at the
-        first call.
+        first call; None without Gaussians.
         """
         if not scene.count:
             return None

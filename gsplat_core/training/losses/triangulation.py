@@ -88,7 +88,7 @@ class TriangulationLoss:
         return consensus_loss(render_depth(scene, observation.camera), target, observation.camera)
 
     def _target(self, scene: Gaussians, observation: Observation, context: LossContext) -> Triangulated | None:
-        """Return the points of a frame, triangulated on first use."""
+        """Return the points of a frame, triangulated on first use; None if there are too few views or points."""
         key = observation.seq, observation.of_right
         if key in self._points:
             return self._points[key]

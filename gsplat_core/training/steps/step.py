@@ -65,7 +65,9 @@ class AutogradTraining:
         return self._deformed.detach()
 
     def update(self, gradients: Mapping[str, Tensor], rates: Mapping[str, float]) -> Mapping[str, Tensor | None]:
-        """Do one Adam step for the field's parameters and return the gradients of the canonical Gaussians."""
+        """Do one Adam step for the field's parameters and return the gradients of the canonical Gaussians by tensor
+        name, None for a tensor without a gradient.
+        """
         assert self._canonical is not None and self._deformed is not None
         tensors = self._deformed.tensors()
         pairs = [
