@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 
 from gsplat_core.io.recordings import open_recording
-from operators.sinks.video_file import VideoFile
+from operators.sinks.writers import VideoFile
 
 
 def main() -> int:

@@ -36,7 +36,7 @@ RENDERERS: Registry[RendererKind] = Registry(
     {
         "alpha": "gsplat_core.rendering.alpha:AlphaRenderer",
         "stochastic": "gsplat_core.rendering.stochastic:StochasticRenderer",
-        "points": "gsplat_core.rendering.points:PointRenderer",
+        "points": "gsplat_core.rendering.stochastic:PointRenderer",
         "weighted_sum": "gsplat_core.rendering.weighted_sum:WeightedSumRenderer",
     },
 )

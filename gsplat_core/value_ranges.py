@@ -1,4 +1,8 @@
-"""Ranges of external values (from files or messages), checked before the values are used."""
+"""Checks of external values (from files, messages or text written by a user) before the values are used.
+
+`int` and `float` also accept `1_0` and the digits of other scripts. In a command line or an address, such text is a
+typing error.
+"""
 
 from __future__ import annotations
 
@@ -83,3 +87,19 @@ def check_seen_at(time_s: float, window_s: tuple[float, float]) -> None:
         raise InvalidSetting(
             f"the model has seen nothing at {time_s:g} s; its window is {start_s:.3f} to {end_s:.3f} s"
         )
+
+
+def is_plain(text: str) -> bool:
+    """Return True if a text has ASCII characters only, and neither underscores nor surrounding blanks."""
+    return text.isascii() and "_" not in text and text == text.strip()
+
+
+def plain_float(text: str) -> float:
+    """Return the number that a text states.
+
+    Raises:
+        ValueError: if the text is no number, or is written with underscores, blanks or digits of other scripts.
+    """
+    if not is_plain(text):
+        raise ValueError(f"{text!r} is not a plain number")
+    return float(text)

@@ -53,7 +53,6 @@ from operators.reconstruct import ReconstructOp
 from operators.settings import EngineOptions, JobOptions, OutputSection
 from operators.side_by_side import SideBySideOp
 from operators.sinks.callback import CallbackSinkOp
-from operators.sinks.output_videos import OutputVideosOp
 from operators.sinks.registry import SinkOptions, input_of
 from operators.sinks.session_recorder import (
     RecordFramesOp,
@@ -61,6 +60,7 @@ from operators.sinks.session_recorder import (
     RecordPreparationOp,
     SessionRecorder,
 )
+from operators.sinks.video import OutputVideosOp
 from operators.sources.source import FrameSource
 from operators.storage import StorageReserve
 from operators.tool_mask import RecordedToolMaskOp, new_tool_mask

@@ -23,9 +23,9 @@ import torch
 from gsplat_core.choices import RENDERERS
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.models.model import Model
-from gsplat_core.plain_numbers import plain_float
 from gsplat_core.rendering.renderer import PROGRESSIVE_SAMPLES, Renderer, RendererOptions, check_renderer, new_renderer
 from gsplat_core.scene.cameras import Camera
+from gsplat_core.value_ranges import plain_float
 from operators.applications.render import typical_depth
 from operators.rasterize import displayed
 

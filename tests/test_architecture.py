@@ -133,7 +133,7 @@ def test_no_other_module_names_a_deformation_field():
 
 def test_scene_data_imports_nothing_above_it():
     files = sorted((ROOT / "gsplat_core/scene").rglob("*.py"))
-    allowed = {"scene", "errors", "registry", "value_ranges", "plain_numbers", "transfers"}
+    allowed = {"scene", "errors", "registry", "value_ranges", "transfers"}
     imported = {
         name.split(".")[1] for path in files for name in imported_modules(path) if name.startswith("gsplat_core.")
     }

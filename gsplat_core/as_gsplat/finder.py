@@ -1,4 +1,6 @@
-"""Import hook that serves the modules of `names.MODULES`."""
+"""Import hook that serves modules of gsplat 1.5.3 and of 1.6's `contrib.dynamic`, and where `gsplat_core` defines each of
+their names.
+"""
 
 from __future__ import annotations
 
@@ -11,8 +13,168 @@ from collections.abc import Mapping, Sequence
 from types import ModuleType
 from typing import Any
 
-from gsplat_core.as_gsplat.names import MODULES
 from gsplat_core.errors import InvalidInput
+
+VERSION = "1.5.3"
+"""Version of gsplat whose names and signatures the modules have."""
+
+_ABSENT_EXTENSION = "gsplat_core.as_gsplat.extension"
+_FUNCTIONS = "gsplat_core.as_gsplat.functions"
+_PLAIN = "gsplat_core.reference.gsplat_names"
+_STRATEGIES = {
+    "DefaultStrategy": "gsplat_core.training.strategies.adc",
+    "MCMCStrategy": "gsplat_core.training.strategies.mcmc",
+    "Strategy": "gsplat_core.training.strategies.strategy",
+}
+_OPERATIONS = "gsplat_core.training.strategies.operations"
+_DYNAMIC = "gsplat_core.contrib.dynamic"
+_SURGICAL = "gsplat_core.contrib.surgical"
+_DISTRIBUTED = "gsplat_core.rendering.distributed"
+_CUDA = {
+    "FThetaCameraDistortionParameters": "gsplat_core.scene.distortion",
+    "FThetaPolynomialType": "gsplat_core.scene.distortion",
+    "RollingShutterType": "gsplat_core.poses.rolling_shutter",
+    "UnscentedTransformParameters": "gsplat_core.ops.unscented_projection",
+    "fully_fused_projection": "gsplat_core.ops.projection.projection",
+    "fully_fused_projection_2dgs": "gsplat_core.ops.surfel_projection",
+    "fully_fused_projection_with_ut": "gsplat_core.ops.unscented_projection",
+    "isect_offset_encode": "gsplat_core.ops.tiles",
+    "isect_tiles": "gsplat_core.ops.tiles",
+    "proj": "gsplat_core.ops.projection.separate_steps",
+    "quat_scale_to_covar_preci": "gsplat_core.ops.covariance",
+    "rasterize_to_indices_in_range": "gsplat_core.ops.compositing",
+    "rasterize_to_indices_in_range_2dgs": "gsplat_core.ops.surfel_blending",
+    "rasterize_to_pixels": "gsplat_core.ops.compositing",
+    "rasterize_to_pixels_2dgs": "gsplat_core.ops.surfel_blending",
+    "rasterize_to_pixels_eval3d": "gsplat_core.ops.world_blending",
+    "spherical_harmonics": "gsplat_core.ops.spherical_harmonics",
+    "world_to_cam": "gsplat_core.ops.projection.separate_steps",
+}
+_RENDERING = {
+    "rasterization": "gsplat_core.rendering.rasterization",
+    "rasterization_2dgs": "gsplat_core.rendering.surfels",
+    "rasterization_2dgs_inria_wrapper": "gsplat_core.rendering.surfels",
+    "rasterization_inria_wrapper": "gsplat_core.rendering.rasterizer",
+}
+
+MODULES: Mapping[str, Mapping[str, str]] = {
+    "gsplat": {
+        **_CUDA,
+        **_RENDERING,
+        **_STRATEGIES,
+        "PngCompression": "gsplat_core.io.png_compression",
+        "SelectiveAdam": "gsplat_core.training.steps.optimiser",
+        "__version__": "gsplat_core.as_gsplat.finder:VERSION",
+        "accumulate": "gsplat_core.ops.compositing",
+        "accumulate_2dgs": "gsplat_core.ops.surfel_blending",
+        "export_splats": "gsplat_core.io.exports.export",
+    },
+    "gsplat._helper": {"load_test_data": "gsplat_core.as_gsplat.test_scene"},
+    "gsplat.compression": {"PngCompression": "gsplat_core.io.png_compression"},
+    "gsplat.compression.png_compression": {"PngCompression": "gsplat_core.io.png_compression"},
+    "gsplat.contrib": {},
+    "gsplat.contrib.dynamic": {
+        "DeformNetwork": _DYNAMIC,
+        "DynamicStrategy": _DYNAMIC,
+        "HexPlaneField": _DYNAMIC,
+        "hexplane_regularization": _DYNAMIC,
+        "plane_smoothness": _DYNAMIC,
+        "time_l1": _DYNAMIC,
+        "time_smoothness": _DYNAMIC,
+    },
+    "gsplat.contrib.dynamic.deformation": {"DeformNetwork": _DYNAMIC},
+    "gsplat.contrib.dynamic.hexplane": {"HexPlaneField": _DYNAMIC},
+    "gsplat.contrib.dynamic.regulation": {
+        "hexplane_regularization": _DYNAMIC,
+        "plane_smoothness": _DYNAMIC,
+        "time_l1": _DYNAMIC,
+        "time_smoothness": _DYNAMIC,
+    },
+    "gsplat.contrib.dynamic.strategy": {"DynamicStrategy": _DYNAMIC},
+    "gsplat.cuda": {},
+    "gsplat.cuda._backend": {"_C": _ABSENT_EXTENSION},
+    "gsplat.cuda._torch_impl": {
+        "_eval_sh_bases_fast": _PLAIN,
+        "_fisheye_proj": _PLAIN,
+        "_fully_fused_projection": _PLAIN,
+        "_isect_offset_encode": _PLAIN,
+        "_isect_tiles": _PLAIN,
+        "_ortho_proj": _PLAIN,
+        "_persp_proj": _PLAIN,
+        "_quat_scale_to_covar_preci": _PLAIN,
+        "_quat_scale_to_matrix": _PLAIN,
+        "_quat_to_rotmat": _PLAIN,
+        "_rasterize_to_pixels": _PLAIN,
+        "_spherical_harmonics": _PLAIN,
+        "_world_to_cam": _PLAIN,
+        "accumulate": "gsplat_core.ops.compositing",
+    },
+    "gsplat.cuda._torch_impl_2dgs": {
+        "_fully_fused_projection_2dgs": _PLAIN,
+        "_rasterize_to_pixels_2dgs": _PLAIN,
+        "accumulate_2dgs": "gsplat_core.ops.surfel_blending",
+    },
+    "gsplat.cuda._wrapper": {**_CUDA, "CameraModel": "gsplat_core.scene.cameras"},
+    "gsplat.distributed": {
+        "all_gather_int32": _DISTRIBUTED,
+        "all_gather_tensor_list": _DISTRIBUTED,
+        "all_to_all_int32": _DISTRIBUTED,
+        "all_to_all_tensor_list": _DISTRIBUTED,
+        "cli": _DISTRIBUTED,
+    },
+    "gsplat.exporter": {"export_splats": "gsplat_core.io.exports.export"},
+    "gsplat.init_utils": {"knn_scale_init": _SURGICAL, "multi_frame_depth_unprojection": _SURGICAL},
+    "gsplat.losses": {
+        "binocular_disparity_l1": _SURGICAL,
+        "masked_l1": _SURGICAL,
+        "masked_ssim": _SURGICAL,
+        "pearson_depth_loss": _SURGICAL,
+    },
+    "gsplat.optimizers": {"SelectiveAdam": "gsplat_core.training.steps.optimiser"},
+    "gsplat.optimizers.selective_adam": {"SelectiveAdam": "gsplat_core.training.steps.optimiser"},
+    "gsplat.regularizers": {"compute_tv_loss_targeted": _SURGICAL},
+    "gsplat.relocation": {"compute_relocation": "gsplat_core.training.strategies.operations"},
+    "gsplat.rendering": {
+        **_RENDERING,
+        **_CUDA,
+        "RasterizeMode": "gsplat_core.rendering.settings",
+        "RenderMode": "gsplat_core.rendering.settings",
+        "_rasterization": _PLAIN,
+    },
+    "gsplat.strategy": _STRATEGIES,
+    "gsplat.strategy.base": {"Strategy": _STRATEGIES["Strategy"]},
+    "gsplat.strategy.default": {"DefaultStrategy": _STRATEGIES["DefaultStrategy"]},
+    "gsplat.strategy.mcmc": {"MCMCStrategy": _STRATEGIES["MCMCStrategy"]},
+    "gsplat.strategy.ops": {
+        "_multinomial_sample": _FUNCTIONS,
+        "_update_param_with_optimizer": f"{_OPERATIONS}:update_rows",
+        "compute_relocation": "gsplat_core.training.strategies.operations",
+        "duplicate": _OPERATIONS,
+        "inject_noise_to_position": _OPERATIONS,
+        "relocate": _OPERATIONS,
+        "remove": _OPERATIONS,
+        "reset_opa": _OPERATIONS,
+        "sample_add": _OPERATIONS,
+        "split": _OPERATIONS,
+    },
+    "gsplat.training": {"TwoStageScheduleStep": _SURGICAL, "TwoStageScheduler": _SURGICAL},
+    "gsplat.utils": {
+        "depth_to_normal": "gsplat_core.rendering.depth_maps",
+        "depth_to_points": "gsplat_core.rendering.depth_maps",
+        "get_projection_matrix": _FUNCTIONS,
+        "inverse_log_transform": _FUNCTIONS,
+        "log_transform": _FUNCTIONS,
+        "normalized_quat_to_rotmat": _FUNCTIONS,
+        "save_ply": _FUNCTIONS,
+    },
+    "gsplat.version": {"__version__": "gsplat_core.as_gsplat.finder:VERSION"},
+    "fused_ssim": {"fused_ssim": "gsplat_core.ops.ssim"},
+}
+"""Modules of gsplat's API with the names in each.
+
+Each name is mapped to this package's module that defines it, or to `module:name` if the name differs there.
+"""
+
 
 CONSTANTS = ("1.6", "1.5.3")
 _OLD_CONSTANTS: Mapping[str, Mapping[str, Any]] = {

@@ -1,6 +1,7 @@
-"""Stochastic transparency (StochasticSplats, ICCV 2025): a `Renderer` without sorting, for very large models.
+"""Renderers that draw random samples, without sorting, for very large models.
 
-`sample_splats` takes scenes in three formats: without a copy, precomputed, and quantised.
+Stochastic transparency (StochasticSplats, ICCV 2025) samples the splats of each pixel. Gaussian point splatting (Rijsdijk et
+al., TOG 2026) draws random points of each Gaussian. Scenes have three formats: without a copy, precomputed, and quantised.
 """
 
 from __future__ import annotations
@@ -324,4 +325,22 @@ class StochasticRenderer(SampledRenderer):
         differentiable=False,
         deterministic=True,
         options=("samples", "supersampling", "order", "seed", "progressive", "storage"),
+    )
+
+
+class PointRenderer(SampledRenderer):
+    """Renderer that draws a Poisson number of points from every splat and keeps the nearest one of each sub-pixel.
+
+    Its expectation is alpha blending with each splat's density integrated over the sub-pixel, which approaches
+    `AlphaRenderer` with increasing `supersampling`.
+    """
+
+    name = "points"
+    method = "points"
+    capabilities = Capabilities(
+        outputs=STANDARD_OUTPUTS,
+        precisions={"cpu": ("fp32",), "cuda": ("fp32",)},
+        differentiable=False,
+        deterministic=True,
+        options=("samples", "supersampling", "seed", "progressive", "storage"),
     )

@@ -36,13 +36,11 @@ from operators.applications.limits import (
 )
 from operators.applications.progress import Progress, ProgressCallback
 from operators.errors import OutputError
-from operators.layer_pictures import mark_unobserved
+from operators.layer_pictures import OutputPictures, mark_unobserved
 from operators.output_folder import OutputFolder, check_file_path
-from operators.output_pictures import OutputPictures
 from operators.rasterize import displayed
 from operators.settings import check_option
-from operators.sinks.images import write_png
-from operators.sinks.video_file import VideoFile
+from operators.sinks.writers import VideoFile, write_png
 from operators.storage import StorageReserve, storage_errors
 
 VIEWS = ("recorded", "orbit", "stereo")

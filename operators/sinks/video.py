@@ -1,18 +1,136 @@
-"""Video of a run with raw frame and reconstruction side by side."""
+"""Pictures and videos of a run: raw frame and reconstruction side by side, error map, depth map, and a renderer's outputs in
+false colours.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
 from operators.graph import Operator, OperatorSpec
+from operators.layer_pictures import OutputPictures
 from operators.messages import RenderedFrame
 from operators.outcome import OutcomeBuilder
-from operators.sinks.pictures import fitted, side_by_side
+from operators.remembered import marked
 from operators.sinks.registry import SinkOptions
-from operators.sinks.video_file import VideoFile
+from operators.sinks.writers import VideoFile
 from operators.storage import StorageReserve
+
+MINIMUM_PANE_WIDTH_PX = 320
+"""Minimum width of a pane. Smaller pictures are enlarged by an integer factor to fit the caption."""
+CAPTION_HEIGHT_PX = 26
+ERROR_FULL_SCALE = 32
+"""Mean absolute RGB difference (0..255) at the bright end of the error colours."""
+
+_BACKGROUND = (17, 20, 24)
+_TEXT = (232, 236, 240)
+_HELD_OUT = (255, 196, 87)
+
+
+def fitted(picture: NDArray[np.uint8], height_px: int, width_px: int) -> NDArray[np.uint8]:
+    """Resize a picture without distortion to fit into a frame of background colour.
+
+    Args:
+        picture: uint8 RGB [h, w, 3].
+        height_px: height of the result.
+        width_px: width of the result.
+
+    Returns:
+        uint8 RGB [height_px, width_px, 3].
+    """
+    factor = min(height_px / picture.shape[0], width_px / picture.shape[1])
+    height, width = (max(1, round(side * factor)) for side in picture.shape[:2])
+    canvas = np.empty((height_px, width_px, 3), np.uint8)
+    canvas[...] = _BACKGROUND
+    above, left = (height_px - height) // 2, (width_px - width) // 2
+    resized = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA if factor < 1 else cv2.INTER_LINEAR)
+    canvas[above : above + height, left : left + width] = resized
+    return canvas
+
+
+def side_by_side(rendered: RenderedFrame) -> NDArray[np.uint8]:
+    """Draw raw frame and reconstruction side by side, with remembered tissue marked.
+
+    The caption above the pictures has frame number, time and model version.
+
+    Args:
+        rendered: the frame and its reconstruction.
+
+    Returns:
+        uint8 RGB [H, W, 3].
+    """
+    frame = rendered.frame
+    zoom = -(-MINIMUM_PANE_WIDTH_PX // frame.width_px) if frame.width_px < MINIMUM_PANE_WIDTH_PX else 1
+    middle = zoom * frame.width_px
+    canvas = np.empty((CAPTION_HEIGHT_PX + zoom * frame.height_px, 2 * middle, 3), np.uint8)
+    # Filling by OpenCV is faster than NumPy's broadcast of a colour.
+    cv2.rectangle(canvas, (0, 0), (2 * middle, CAPTION_HEIGHT_PX - 1), _BACKGROUND, cv2.FILLED)
+    for pane, image in (
+        (canvas[CAPTION_HEIGHT_PX:, :middle], frame.image),
+        (canvas[CAPTION_HEIGHT_PX:, middle:], marked(rendered)),
+    ):
+        pane[...] = image if zoom == 1 else image.repeat(zoom, axis=0).repeat(zoom, axis=1)
+    _caption(canvas, 8, f"{frame.status.value}  frame {frame.seq}  {frame.time_s:.2f} s")
+    right = f"reconstruction  model {rendered.model_version}"
+    if not rendered.trained:
+        right += "  held out"
+    _caption(canvas, middle + 8, right, _TEXT if rendered.trained else _HELD_OUT)
+    canvas[:, middle - 1 : middle + 1] = _BACKGROUND
+    return canvas
+
+
+def _caption(canvas: NDArray[np.uint8], x: int, text: str, colour: tuple[int, int, int] = _TEXT) -> None:
+    cv2.putText(canvas, text, (x, CAPTION_HEIGHT_PX - 9), cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, 1, cv2.LINE_AA)
+
+
+def error_map(rendered: RenderedFrame) -> NDArray[np.uint8]:
+    """Draw the absolute difference to the raw frame in colours (dark = equal), uint8 RGB [H, W, 3].
+
+    Tool pixels, which are not scored, are grey.
+    """
+    difference = np.abs(rendered.image.astype(np.int16) - rendered.frame.image).mean(axis=2)
+    level = np.clip(difference * (255 / ERROR_FULL_SCALE), 0, 255).astype(np.uint8)
+    colours = _coloured(level, cv2.COLORMAP_INFERNO)
+    if rendered.frame.mask is not None:
+        colours[rendered.frame.mask == 0] = (70, 74, 80)
+    return colours
+
+
+def depth_map(rendered: RenderedFrame) -> NDArray[np.uint8]:
+    """Draw depth in colours (bright = near) from its 2nd to its 98th percentile, uint8 RGB [H, W, 3].
+
+    Unknown depth is grey.
+    """
+    depth = rendered.depth
+    known = (depth > 0) & np.isfinite(depth) & (rendered.alpha > 0.5)
+    colours = np.full((*depth.shape, 3), (70, 74, 80), np.uint8)
+    if known.any():
+        near, far = np.percentile(depth[known], (2, 98))
+        # Minimum range, so that rounding noise of a flat scene is not drawn as relief.
+        span = max(float(far - near), 1e-3 * float(far))
+        level = np.clip(0.5 + ((near + far) / 2 - np.where(known, depth, far)) / span, 0, 1)
+        colours[known] = _coloured((level * 255).astype(np.uint8), cv2.COLORMAP_VIRIDIS)[known]
+    return colours
+
+
+def depth_range(rendered: RenderedFrame) -> tuple[float, float] | None:
+    """Return the depths at the bright and dark end of `depth_map`; None if no depth is known."""
+    known = rendered.depth[(rendered.depth > 0) & np.isfinite(rendered.depth) & (rendered.alpha > 0.5)]
+    if known.size == 0:
+        return None
+    near, far = np.percentile(known, (2, 98))
+    return float(near), float(far)
+
+
+def _coloured(level: NDArray[np.uint8], colour_map: int) -> NDArray[np.uint8]:
+    return np.ascontiguousarray(cv2.applyColorMap(level, colour_map)[..., ::-1])
+
 
 VIDEO_FILE = "reconstruction.mp4"
 
@@ -84,3 +202,61 @@ def video_sink(fragment: Any, name: str, options: SinkOptions) -> VideoSinkOp:
     return VideoSinkOp(
         fragment, name=name, path=options.out / VIDEO_FILE, fps=options.source.fps, reserve=options.reserve
     )
+
+
+def video_name(output: str) -> str:
+    """Return the name of an output's video."""
+    return f"{output}.mp4"
+
+
+class OutputVideosOp(Operator):
+    """Writes an MP4 file for each output.
+
+    Inputs:
+        rendered: `RenderedFrame`, with the outputs.
+
+    Params:
+        folder: folder of the files; they are finished when the graph stops for any reason.
+        outputs: names of the outputs.
+        fps: frames per second of the videos.
+        reserve: free disk space to be kept.
+    """
+
+    def __init__(
+        self, fragment: Any, *args: Any, folder: Path, outputs: Sequence[str], fps: float,
+        reserve: StorageReserve | None = None, **kwargs: Any,
+    ) -> None:  # fmt: skip
+        self.folder, self.names, self.fps, self.reserve = folder, tuple(outputs), fps, reserve
+        self._videos: dict[str, tuple[VideoFile, tuple[int, ...]]] = {}
+        self._pictures = OutputPictures()
+        super().__init__(fragment, *args, **kwargs)
+
+    def setup(self, spec: OperatorSpec) -> None:
+        spec.input("rendered", type=RenderedFrame)
+
+    def stop(self) -> None:
+        videos, self._videos = self._videos, {}
+        for video, _ in videos.values():
+            video.close()
+
+    def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
+        rendered: RenderedFrame = op_input.receive("rendered")
+        standard = {"depth": rendered.depth, "alpha": rendered.alpha}
+        for name in self.names:
+            if name == "image":
+                picture = np.array(rendered.image)
+            else:
+                values = {**standard, **rendered.outputs}[name]
+                picture = self._pictures.picture(name, values, rendered.alpha)
+            if name not in self._videos:
+                height, width = picture.shape[:2]
+                video = VideoFile(self.folder / video_name(name), width, height, self.fps, self.reserve)
+                self._videos[name] = video, picture.shape[:2]
+            video, size = self._videos[name]
+            video.write(picture if picture.shape[:2] == size else fitted(picture, *size), rendered.frame.time_s)
+
+    def contribute(self, outcome: OutcomeBuilder) -> None:
+        """Add the names of the written videos to the outcome of the run."""
+        for name in self.names:
+            if (path := self.folder / video_name(name)).exists():
+                outcome.output(f"video_{name}", path)

@@ -17,7 +17,7 @@ from typing import Literal, Self, get_args, overload
 from urllib.parse import parse_qsl, urlsplit
 
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.plain_numbers import plain_float
+from gsplat_core.value_ranges import plain_float
 from operators.settings import MAX_SEED, check_option
 
 StereoLayout = Literal["side_by_side", "top_bottom"]

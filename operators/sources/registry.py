@@ -30,9 +30,9 @@ SOURCES: Registry[SourceFactory] = Registry(
         "pipe": "operators.sources.pipe:pipe_source",
         "zmq+tcp": "operators.sources.zeromq:tcp_source",
         "zmq+ipc": "operators.sources.zeromq:ipc_source",
-        "v4l2": "operators.sources.v4l2:v4l2_source",
+        "v4l2": "operators.sources.url:v4l2_source",
         "folder": "operators.sources.folder:folder_source",
-        "synthetic": "operators.sources.synthetic:synthetic_source",
+        "synthetic": "operators.sources.recording:synthetic_source",
         **{scheme: f"operators.sources.url:{scheme}_source" for scheme in _URLS},
     },
 )

@@ -34,8 +34,7 @@ from services.errors import (
 )
 from services.exports.cache import ExportCache
 from services.exports.snapshots import ModelExports, SnapshotStore, StreamSnapshots
-from services.jobs.pool import PoolProcess, PoolSettings
-from services.jobs.pool_keeper import PoolKeeper
+from services.jobs.pool import PoolKeeper, PoolProcess, PoolSettings
 from services.jobs.replays import RecordingRetention, ReplayRetention, Replays
 from services.jobs.results import Results
 from services.jobs.store import JobStore, uses_recording

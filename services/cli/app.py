@@ -410,7 +410,7 @@ def evaluate(
 @takes_options(TrainOptions, "train")
 def train(scene: SceneArgument, out: OutOption, options: Mapping[str, Any], json: JsonOption = False) -> int:
     """Train a static scene from posed images in COLMAP's format, and evaluate it on held-out images."""
-    from services.cli.train import train_command
+    from services.cli.runs import train_command
 
     return train_command(scene, out, TrainOptions(**options), as_json=json)
 

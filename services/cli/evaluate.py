@@ -13,7 +13,7 @@ import typer
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.evaluation.protocols import Visits
 from gsplat_core.io.model_sources import is_scene_file
-from gsplat_core.plain_numbers import plain_float
+from gsplat_core.value_ranges import plain_float
 from operators.applications.evaluate import EvaluationSettings, evaluate
 from operators.applications.static_scene import EVALUATION_FILE, SceneScore, SceneSettings, evaluate_scene
 from operators.output_folder import OutputFolder

@@ -12,7 +12,7 @@ from typing import Annotated, Any, get_type_hints
 import typer
 
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.plain_numbers import is_plain, plain_float
+from gsplat_core.value_ranges import is_plain, plain_float
 from operators.options import Command, Declared, Section, options_for, options_of
 from operators.settings import RenderOptions, ReplayOptions
 

@@ -1,13 +1,14 @@
-"""Implementation of `intrasplat replay`, `reconstruct` and `live`: progress, interruption, reports, summary."""
+"""Implementation of `intrasplat replay`, `reconstruct`, `live` and `train`: progress, interruption, reports, summary."""
 
 from __future__ import annotations
 
+import json
 import re
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import TracebackType
@@ -23,8 +24,12 @@ from operators.applications.progress import ProgressCallback
 from operators.applications.reconstruct import ReconstructSettings, reconstruct
 from operators.applications.replay import ReplaySettings, replay
 from operators.applications.session import Report, RunOutcome
+from operators.applications.static_scene import MODEL_FOLDER, SceneTraining, train_scene
 from operators.metrics import ScoredFrame
+from operators.output_folder import OutputFolder
 from operators.pipeline import Pipeline
+from operators.settings import TrainOptions
+from operators.storage import mebibytes
 from services.cli.exit_codes import INTERRUPTED, OK
 from services.cli.progress import ProgressPrinter
 from services.cli.terminal import InterruptRequest, printable
@@ -282,3 +287,39 @@ def _summary(report: RunReport, facts: LiveFacts) -> str:
         if counts:
             lines.append(f"{name}: " + ", ".join(f"{count} x {reason}" for reason, count in counts.items()))
     return "\n".join(lines)
+
+
+def train_command(scene: Path, out: Path, options: TrainOptions, *, as_json: bool) -> int:
+    """Train a scene, publish the results in `out` and print the scores.
+
+    Returns:
+        The exit code.
+    """
+    with InterruptRequest() as interrupt, OutputFolder(out, "train", [scene]) as output:
+        try:
+            with ProgressPrinter(quiet=as_json) as progress:
+                result = train_scene(scene, options, output.path, progress=progress, stop_requested=interrupt)
+        except KeyboardInterrupt:
+            output.publish()
+            raise
+        output.publish()
+    if as_json:
+        typer.echo(json.dumps(asdict(result), indent=2))
+    else:
+        typer.echo("\n".join([*_lines(result), str(out / MODEL_FOLDER)]))
+    return INTERRUPTED if interrupt.requested else OK
+
+
+def _lines(result: SceneTraining) -> list[str]:
+    rate = result.steps / result.training_s if result.training_s else 0.0
+    lines = [
+        f"{result.steps} steps on {result.training_images} images in {result.training_s:.1f} s ({rate:.1f} steps/s):"
+        f" {result.gaussians} Gaussians, peak memory {mebibytes(result.device_peak_bytes or result.peak_memory_bytes)}"
+    ]
+    score = result.heldout
+    if score is not None:
+        lines.append(
+            f"{len(score.images)} held-out images: PSNR {score.psnr_db:.2f} dB, SSIM {score.ssim:.4f}, worst {score.worst_db:.2f} dB"
+            f" ({printable(score.worst)})"
+        )
+    return lines

@@ -14,7 +14,7 @@ from gsplat_core.scene.cameras import Orbit
 from operators.metrics import ScoredFrame
 from operators.rasterize import displayed
 from operators.remembered import marked
-from operators.sinks.pictures import depth_map, depth_range, error_map
+from operators.sinks.video import depth_map, depth_range, error_map
 
 WIDTH_PX = 420
 """Target width in pixels. Larger pictures are shrunk, smaller ones enlarged by whole factors only."""

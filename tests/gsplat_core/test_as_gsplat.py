@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import gsplat_core
-from gsplat_core.as_gsplat import finder, install, names
+from gsplat_core.as_gsplat import finder, install
 from gsplat_core.as_gsplat import functions as utils
 from gsplat_core.rendering.depth_maps import depth_to_normal, depth_to_points
 
@@ -41,7 +41,7 @@ def installed(request):
     install(getattr(request, "param", "1.6"))
     yield
     sys.meta_path[:] = [each for each in sys.meta_path if not isinstance(each, finder.Finder)]
-    for name in names.MODULES:
+    for name in finder.MODULES:
         sys.modules.pop(name, None)
         if name in before:
             sys.modules[name] = before[name]
@@ -58,7 +58,7 @@ def test_a_program_runs_unchanged_with_the_modules_in_its_folder(tmp_path):
 
 
 def test_every_name_exists(installed):
-    for module_name, homes in names.MODULES.items():
+    for module_name, homes in finder.MODULES.items():
         module = importlib.import_module(module_name)
         for name in homes:
             assert getattr(module, name) is not None, (module_name, name)
@@ -67,7 +67,7 @@ def test_every_name_exists(installed):
 
 def test_names_are_those_of_the_package_itself(installed):
     module = importlib.import_module("gsplat")
-    for name in names.MODULES["gsplat"]:
+    for name in finder.MODULES["gsplat"]:
         if name in gsplat_core.__all__:
             assert getattr(module, name) is getattr(gsplat_core, name)
 

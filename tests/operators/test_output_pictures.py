@@ -7,10 +7,10 @@ import pytest
 
 from gsplat_core.choices import OUTPUTS
 from gsplat_core.errors import InvalidSetting
-from operators.layer_pictures import UNOBSERVED
-from operators.output_pictures import (
+from operators.layer_pictures import (
     CLASS_COLOURS,
     UNDECIDED,
+    UNOBSERVED,
     OutputPictures,
     class_colours,
     flow_colours,

@@ -8,7 +8,7 @@ import av
 import numpy as np
 
 from operators.outcome import OutcomeBuilder
-from operators.sinks.output_videos import OutputVideosOp
+from operators.sinks.video import OutputVideosOp
 
 
 def test_each_output_is_a_video_of_all_frames(tmp_path, rendered, compute):

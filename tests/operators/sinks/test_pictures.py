@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from operators.sinks.pictures import CAPTION_HEIGHT_PX, depth_map, depth_range, error_map, fitted, side_by_side
+from operators.sinks.video import CAPTION_HEIGHT_PX, depth_map, depth_range, error_map, fitted, side_by_side
 
 GREY = (70, 74, 80)
 

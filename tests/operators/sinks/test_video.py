@@ -37,7 +37,7 @@ def test_the_video_shows_raw_and_reconstruction_side_by_side(tmp_path, rendered,
 
 def test_the_caption_tells_frame_and_model(tmp_path, rendered, compute):
     """The caption changes with the frame number and never covers the picture; no character recognition is used."""
-    from operators.sinks.pictures import CAPTION_HEIGHT_PX, side_by_side
+    from operators.sinks.video import CAPTION_HEIGHT_PX, side_by_side
 
     one, other = side_by_side(rendered(1)), side_by_side(rendered(1, model_version=77))
     differs = np.abs(one.astype(int) - other).sum(axis=2) > 0

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from operators.errors import OutputError, StorageFull
-from operators.sinks.video_file import VideoFile
+from operators.sinks.writers import VideoFile
 from operators.storage import StorageReserve
 
 

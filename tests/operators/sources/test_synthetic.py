@@ -8,7 +8,7 @@ import pytest
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings import open_recording, synthesize
 from gsplat_core.io.recordings.synthetic.rendered import RenderSettings, render_recording
-from operators.sources import synthetic
+from operators.sources import recording
 from operators.sources.address import SourceOptions
 from operators.sources.registry import open_source
 
@@ -59,7 +59,7 @@ def test_scale_seed_and_eyes_reach_it():
 
 
 def test_no_more_frames_are_kept_than_the_memory_may_take(monkeypatch):
-    monkeypatch.setattr(synthetic, "MOST_BYTES", 3 * 48 * 40 * 8)
+    monkeypatch.setattr(recording, "MOST_BYTES", 3 * 48 * 40 * 8)
     assert open_source(f"synthetic:?{SMALL}").recording.frame_count == 3
 
 

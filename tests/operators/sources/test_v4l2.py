@@ -14,7 +14,7 @@ import pytest
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.frames import FrameStatus
 from operators.errors import SourceUnavailable
-from operators.sources import v4l2
+from operators.sources import url
 from operators.sources.process import ProcessSource
 from operators.sources.registry import SourceOptions, open_source
 from operators.sources.source import SourceState
@@ -121,9 +121,9 @@ def test_a_camera_that_is_not_there_is_a_sentence(driver):
 
 
 def test_what_is_a_file_is_no_camera(monkeypatch):
-    monkeypatch.setattr(v4l2.os, "stat", lambda path: SimpleNamespace(st_mode=stat.S_IFREG))
+    monkeypatch.setattr(url.os, "stat", lambda path: SimpleNamespace(st_mode=stat.S_IFREG))
     with pytest.raises(SourceUnavailable, match="it is no device"):
-        v4l2.device_of("/dev/video0")
+        url.device_of("/dev/video0")
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ import threading
 import pytest
 from control_fakes import FakeModels, FakeRecordings, NotNow, NotThere, fake_parts
 
-from services.jobs.pool_keeper import relayed
+from services.jobs.pool import relayed
 
 OCTETS = "application/octet-stream"
 

@@ -11,8 +11,8 @@ from types import SimpleNamespace
 import pytest
 
 from services.errors import StoreUnavailable
-from services.jobs import pool_keeper as keepers
-from services.jobs.pool_keeper import PoolKeeper, relayed
+from services.jobs import pool as keepers
+from services.jobs.pool import PoolKeeper, relayed
 
 
 @pytest.fixture

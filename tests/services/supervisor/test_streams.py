@@ -158,7 +158,7 @@ def test_a_process_ends_when_its_supervisor_is_killed(runtime):
 
 def test_capture_loads_no_torch(runtime):
     program = (
-        "import sys, services.supervisor.capture, services.supervisor.capture, operators.sources.synthetic\n"
+        "import sys, services.supervisor.capture, services.supervisor.capture, operators.sources.recording\n"
         "assert 'torch' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", program], check=True)

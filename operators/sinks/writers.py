@@ -1,4 +1,4 @@
-"""Writer of video files that are either complete and playable, or absent."""
+"""Writers of pictures and videos on disk: lossless images, and video files that are either complete and playable, or absent."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import av
 import cv2
@@ -17,9 +17,10 @@ import numpy as np
 from av.video.reformatter import ColorRange, Colorspace
 from numpy.typing import NDArray
 
+from gsplat_core.errors import InvalidInput
 from gsplat_core.io.files import PartialFile
 from operators.errors import OutputError
-from operators.storage import StorageReserve, storage_errors
+from operators.storage import StorageReserve, storage_errors, write_whole
 
 CODEC = "libvpx-vp9"
 """VP9 by libvpx: playable in an MP4 by browsers, readable by OpenCV, and BSD-licensed."""
@@ -189,3 +190,26 @@ class VideoFile:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def write_png(path: Path, image: NDArray[Any], reserve: StorageReserve | None = None) -> None:
+    """Write a PNG file atomically.
+
+    Args:
+        path: the file.
+        image: uint8 or uint16, RGB [H, W, 3] or one channel [H, W].
+        reserve: free disk space to be kept; None for no check.
+
+    Raises:
+        InvalidInput: the array has another shape or type.
+        StorageFull, OutputError: the file cannot be written.
+    """
+    pictured = image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)
+    if not pictured or image.dtype not in (np.uint8, np.uint16):
+        raise InvalidInput(
+            f"{path.name}: an image must be [H, W] or [H, W, 3] of uint8 or uint16, got {list(image.shape)} of {image.dtype}"
+        )
+    coded, data = cv2.imencode(".png", image[..., ::-1] if image.ndim == 3 else image)
+    if not coded:
+        raise OutputError(f"{path}: OpenCV {cv2.__version__} cannot code an image {list(image.shape)} as PNG")
+    write_whole(path, data.tobytes(), reserve)
