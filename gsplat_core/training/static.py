@@ -170,7 +170,9 @@ class CompiledAdam(torch.optim.Optimizer):
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> float | None:  # type: ignore[override]
-        """Update every tensor that has a gradient, without waiting for the device."""
+        """Update every tensor that has a gradient, without waiting for the device. Returns the loss of `closure`, which
+        is called first, None without one.
+        """
         loss = None
         if closure is not None:
             with torch.enable_grad():

@@ -20,8 +20,8 @@ from operators.tool_mask import check_tool_mask
 LIVE_WINDOW_FRAMES = {"cpu": 60, "cuda": 150}
 LIVE_BUMP_SPACING_S = {"cpu": 0.2, "cuda": 0.1}
 LIVE_HISTORY_S = {"cpu": 3.0, "cuda": 6.0}
-"""Duration of the past that stays deformable, in seconds, slightly more than the training window at
-30 frames/s. Longer histories slow down every step on a CPU.
+"""Duration of the past that stays deformable, in seconds, one more than the training window
+(`LIVE_WINDOW_FRAMES`) takes at 30 frames/s. Longer histories slow down every step on a CPU.
 """
 LIVE_MOTION_DETAIL: Detail = "half"
 LIVE_GAUSSIANS = {"cpu": 12_000, "cuda": 45_000}

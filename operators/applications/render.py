@@ -366,8 +366,11 @@ def _images(
 
 
 def write_video(images: Iterator[NDArray], out: Path, size_px: tuple[int, int], fps: float, overwrite: bool) -> int:
-    """Write the video atomically. After a UserError, such as a full disk, the frames so far are kept only if no earlier
-    video exists at `out`; after any other exception they are removed."""
+    """Write the video atomically and return its number of frames.
+
+    After a UserError, such as a full disk, the frames so far are kept only if no earlier video exists at `out`; after
+    any other exception they are removed.
+    """
     replaces = os.path.lexists(out)
     reserve = StorageReserve(out.parent, lambda: RESERVE_BYTES)
     with storage_errors(out.parent), PartialFile(out, overwrite=overwrite) as partial:
@@ -386,8 +389,10 @@ def write_video(images: Iterator[NDArray], out: Path, size_px: tuple[int, int], 
 
 
 def _write_images(images: Iterator[NDArray], inputs: Sequence[Path], out: Path) -> int:
-    """Write numbered PNG files. After a UserError, such as a full disk, the images written so far are kept only if the
-    folder was empty before."""
+    """Write numbered PNG files and return their number.
+
+    After a UserError, such as a full disk, the images written so far are kept only if the folder was empty before.
+    """
     written = 0
     with OutputFolder(out, "render", inputs) as output:
         reserve = StorageReserve(output.path, lambda: RESERVE_BYTES)

@@ -17,7 +17,8 @@ _LOOK_S = 0.25
 
 
 def interruptible_wait(event: threading.Event, timeout_s: float | None = None) -> bool:
-    """Wait for an event in short steps. Raises KeyboardInterrupt within one step after Ctrl-C.
+    """Wait for an event in short steps; False after `timeout_s` seconds without it. Raises KeyboardInterrupt within
+    one step after Ctrl-C.
 
     A single long wait would not notice a signal that arrives just before it blocks or in another thread.
     """

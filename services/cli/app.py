@@ -295,12 +295,12 @@ def _whole_command() -> Any:
 
 
 def _is_empty(word: str) -> bool:
-    """Detect an empty argument, or an option with an empty value (`--out=`). No option means anything by one."""
+    """Return True for an empty argument, or an option with an empty value (`--out=`), which has no meaning."""
     return not word or (word.startswith("--") and word.endswith("=") and word.count("=") == 1)
 
 
 def _say_usage(error: Any) -> int:
-    """Print a usage error in one sentence, or the help if the command is missing."""
+    """Print a usage error in one sentence, or the help if the command is missing. Returns the exit code."""
     if type(error).__name__ == "NoArgsIsHelpError":
         error.show()
         return BAD_INPUT

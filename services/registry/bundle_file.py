@@ -82,7 +82,7 @@ def members_of(file: BinaryIO, size: int) -> tuple[Member, Member]:
 
 
 def read_pieces(file: BinaryIO, member: Member) -> Iterator[bytes]:
-    """Read a member in pieces.
+    """Yield the bytes of a member in pieces.
 
     Raises:
         Rejected: if the file ends inside the member.

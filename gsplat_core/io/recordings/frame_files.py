@@ -381,7 +381,9 @@ def _npy_size(path: Path) -> tuple[int, int]:
 def check_pairing(
     numbers: Sequence[int | None], files: Sequence[Path], folder: Path, what: str, findings: Findings
 ) -> bool:
-    """Check that the files match the frames in number, and in numbering if both are numbered."""
+    """Return True if the files match the frames in number, and in numbering if both are numbered; else report a
+    problem.
+    """
     if len(files) != len(numbers):
         findings.problem(
             folder,

@@ -85,7 +85,7 @@ def stays_inside(root: Path, path: Path, findings: Findings) -> bool:
 
 
 def all_stay_inside(root: Path, files: list[Path], findings: Findings) -> bool:
-    """Run `stays_inside` for files of one checked folder; only links need to be resolved."""
+    """Return True if `stays_inside` holds for all files of a checked folder, of which only links are tested."""
     return all(stays_inside(root, path, findings) for path in files if path.is_symlink())
 
 
