@@ -79,7 +79,7 @@ class LiveDisplayResult:
     states: dict[str, int]
     """Number of transitions into each state, by name."""
     first_picture_ms: float | None
-    """Time from the arrival of the first frame to the first picture, in milliseconds."""
+    """Time from the arrival of the first frame to the first picture, in milliseconds; None without a picture."""
 
 
 class DisplayOp(Operator):

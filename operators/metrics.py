@@ -134,7 +134,7 @@ SIMILARITY_EVERY = 8
 
 @dataclass(frozen=True)
 class OnScreenResult:
-    """Scores of a live stream that complement `QualityResult`."""
+    """Scores of a live stream that complement `QualityResult`; None if no frame was scored."""
 
     settled_db: float | None
     """Mean tissue PSNR after the first second, in dB: training error of the displayed pictures,

@@ -85,9 +85,11 @@ class Live:
     settled_previous: BaselineScore
     """Baseline for `settled`: the previous raw frame, over the same frames and pixels."""
     age_when_shown: Ages | None
-    """Time from a frame's arrival until its picture is displayed."""
+    """Time from a frame's arrival until its picture is displayed; None without a picture."""
     age_on_screen: Ages | None
-    """Age of the displayed picture at the arrival of the next frame; at least one frame interval."""
+    """Age of the displayed picture at the arrival of the next frame, at least one frame interval; None without a
+    picture.
+    """
     in_time: int
     """Number of frames whose own picture was on the screen when the next frame arrived."""
     behind: Mapping[int, int]

@@ -108,7 +108,7 @@ class HeldOut:
     score: Score
     """Score of the pictures rounded to 8 bits, as EndoGaussian measures its PNG files."""
     unrounded_db: float | None
-    """Mean tissue PSNR of the pictures before they are rounded."""
+    """Mean tissue PSNR in dB of the pictures before they are rounded; None if no frame was scored."""
     depth: DepthErrors | None
     """None if the recording has no depth."""
 
@@ -438,7 +438,7 @@ class Return:
 
     visits: Visits
     first_db: tuple[float | None, ...]
-    """Tissue PSNR of the first frames of the second stay."""
+    """Tissue PSNR in dB of the first frames of the second stay; None for a frame without a score."""
     frames_until_found: int | None
     """1-based index of the first frame that scored `FOUND_DB` or more; None if none did."""
 

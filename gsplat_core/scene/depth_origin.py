@@ -55,7 +55,7 @@ class DepthOrigin:
     """Margin around tools within which the depth may belong to the tool."""
     surface: str | None = None
     """Import path of a function (frame, camera) -> frame, called before training on a complete recording. The function
-    replaces the depth by a smooth surface.
+    replaces the depth by a smooth surface. None to keep the depth.
     """
 
     def is_metric(self, eyes_calibrated: bool) -> bool:

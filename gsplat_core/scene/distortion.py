@@ -83,6 +83,8 @@ class Rays(NamedTuple):
 class Lens:
     """Lens model and distortion coefficients of C cameras; leading dimensions as those of the cameras.
 
+    Coefficients of OpenCV that are None count as 0.
+
     Raises:
         InvalidInput: for an unknown model, or coefficients that the model does not have.
     """

@@ -41,7 +41,7 @@ class Frame:
     image: NDArray[np.uint8]
     """RGB uint8 [H, W, 3]."""
     right_image: NDArray[np.uint8] | None = None
-    """The right eye of a rectified stereo pair, RGB uint8 [H, W, 3]."""
+    """Picture of the right eye of a rectified stereo pair, RGB uint8 [H, W, 3]; None without one."""
     right_camera: Camera | None = None
     """Camera of `right_image`; its pose maps left-camera coordinates to its own. None if unknown."""
     depth: NDArray[np.float32] | None = None
@@ -55,9 +55,9 @@ class Frame:
     ranges: RangeScan | None = None
     """Scan of a range sensor at the camera's position; None without one."""
     mask: NDArray[np.uint8] | None = None
-    """Tissue mask [H, W]; 1 = tissue (keep), 0 = tool."""
+    """Tissue mask uint8 [H, W]: 1 tissue, 0 tool. None for tissue everywhere."""
     pose: NDArray[np.float64] | None = None
-    """World-to-camera [4, 4], OpenCV axes."""
+    """World-to-camera matrix [4, 4] in OpenCV axes; None if unknown."""
     status: FrameStatus = FrameStatus.REPLAY
     damage: str | None = None
     """Description of the damage; None for an intact frame."""
@@ -71,7 +71,7 @@ class Frame:
     rehearsal_mask: NDArray[np.uint8] | None = None
     """Mask uint8 [H, W] for training again on past frames; 0 excludes a pixel from that loss but not from display.
 
-    Used for highlights, which move with the light instead of the tissue.
+    Used for highlights, which move with the light instead of the tissue. None excludes nothing.
     """
     labels: NDArray[np.uint8] | None = None
     """Class of each pixel uint8 [H, W] for the loss `semantics`; 255 = unknown. None for a frame without labels."""

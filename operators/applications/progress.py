@@ -8,7 +8,9 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Progress:
-    """Report of a running application: how far its current stage is, with the newest frame's scores."""
+    """Report of a running application: how far its current stage is, with the newest frame's scores (None if not
+    scored).
+    """
 
     stage: str
     """Name of the current stage as one word, such as "train"."""

@@ -19,7 +19,7 @@ class KeyframesResult:
     keyframes: tuple[ScoredFrame, ...]
     """Frames in temporal order, without `right_image` and `depth` of the raw frames."""
     worst_seq: int | None
-    """Sequence number of the frame with the lowest tissue PSNR."""
+    """Sequence number of the frame with the lowest tissue PSNR; None if no frame was scored."""
 
 
 class KeyframesOp(Operator):

@@ -45,11 +45,11 @@ class JobRecord:
     frames_done: int
     frames: int | None
     psnr_db: float | None
-    """Tissue PSNR of the newest displayed frame (training error)."""
+    """Tissue PSNR in dB of the newest displayed frame (training error); None if not scored."""
     previous_frame_db: float | None
-    """Baseline: tissue PSNR of the previous raw frame."""
+    """Baseline: tissue PSNR in dB of the previous raw frame; None if not scored."""
     next_frame_db: float | None
-    """Tissue PSNR of the newest predicted frame, before training on it."""
+    """Tissue PSNR in dB of the newest predicted frame, before training on it; None if not scored."""
     created_by: str
     created_at: str
     started_at: str | None

@@ -52,7 +52,7 @@ class VersionRecord:
     version: int
     state: State
     reason: str | None
-    """Reason of a rejection or a rollback."""
+    """Reason of a rejection or a rollback; None if there was none."""
     digest: str
     """SHA-256 of the uploaded file in hex."""
     size_bytes: int

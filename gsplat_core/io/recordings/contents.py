@@ -157,16 +157,20 @@ class Contents:
     right: FrameImages | None = None
     masks: MaskFiles | None = None
     valid_mask: NDArray[np.uint8] | None = None
-    """Mask uint8 [H, W], 1 inside the scope's circular image. Pixels outside are never tissue."""
+    """Mask uint8 [H, W], 1 inside the scope's circular image. Pixels outside are never tissue. None without such a
+    file.
+    """
     depth: DepthFiles | None = None
     labels: LabelFiles | None = None
-    """Files with a class for each pixel of some frames."""
+    """Files with a class for each pixel of some frames; None without them."""
     scans: ScanFiles | None = None
-    """Scans of a range sensor at some frames."""
+    """Scans of a range sensor at some frames; None without them."""
     tool_share: float | None = None
     stereo_baseline_mm: float | None = None
     rectification: Rectification | None = None
-    """Rectification of both eyes; `calibration` is then that of the rectified left camera."""
+    """Rectification of both eyes; `calibration` is then that of the rectified left camera. None if the pictures are used
+    as they are.
+    """
     undistortion: Undistortion | None = None
     """Maps of a distorted lens; `calibration` is then that of the camera without distortion."""
     other_files: tuple[Path, ...] = ()

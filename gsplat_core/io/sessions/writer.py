@@ -188,7 +188,7 @@ class Shown:
     new: bool = True
     """False if only status or age of the picture on the screen changed."""
     shown_ns: int | None = None
-    """Display time in nanoseconds of `time.monotonic_ns`."""
+    """Display time in nanoseconds of `time.monotonic_ns`; None if unknown."""
     age_ns: int | None = None
     state: str | None = None
     """Status label: `live`, `stale`, …"""

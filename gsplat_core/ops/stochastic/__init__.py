@@ -37,6 +37,7 @@ class SplatScene(NamedTuple):
     """Splats in one of three formats, in the op's argument order.
 
     The formats are `covars` and `opacities`; `quats`, `log_scales` and `logits`; or `packed`, `chunks` and `packed_sh`.
+    The tensors of the other formats are None.
     """
 
     means: Tensor | None = None
