@@ -31,7 +31,8 @@ from gsplat_core import Camera, Gaussians
 from gsplat_core.io.bundle import load_bundle
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.io.recordings.truth import open_truth
-from gsplat_core.rendering.flow import render_flow, rotations
+from gsplat_core.rendering.flow import render_flow
+from gsplat_core.scene.gaussians import rotations
 from operators.applications.evaluate import SeenFromAnywhere, measure_geometry
 from operators.applications.reconstruct import reconstruct
 from operators.applications.replay import ReplaySettings

@@ -17,9 +17,9 @@ from torch import Tensor
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.arguments import TileGrid
 from gsplat_core.ops.tiles import bin_splats
-from gsplat_core.rendering.flow import projected, rotations
+from gsplat_core.rendering.flow import projected
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.gaussians import SH_C0, Gaussians
+from gsplat_core.scene.gaussians import SH_C0, Gaussians, rotations
 
 CURVES = "curves"
 """Name of the control points in `Gaussians.extra`."""

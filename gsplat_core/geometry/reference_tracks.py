@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.geometry.tracks import BORDER_PX, LEAST_QUALITY, PATCH_PX, Observations, Points, followed
+from gsplat_core.geometry.tracks import BORDER_PX, LEAST_QUALITY, PATCH_PX, Observations, Points, followed, gathered
 
 EVERY = 20
 """Number of pictures from one reference to the next."""
@@ -119,13 +119,7 @@ class ReferenceTracks:
 
     def observations(self, least: int = 3) -> Observations:
         """Return all observations so far of points observed at least `least` times, with the points renumbered from 0."""
-        frames = np.concatenate([np.full(len(numbers), index) for index, (numbers, _) in enumerate(self._seen)])
-        points = np.concatenate([numbers for numbers, _ in self._seen])
-        pixels = np.concatenate([pixels for _, pixels in self._seen])
-        often = np.bincount(points, minlength=self._next) >= least
-        renumbered = np.cumsum(often) - 1
-        kept = often[points]
-        return Observations(frames[kept].astype(np.int64), renumbered[points[kept]], pixels[kept])
+        return gathered(self._seen, self._next, least)
 
 
 class _Reference:

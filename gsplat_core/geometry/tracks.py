@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -87,6 +88,23 @@ class Observations:
         return Observations(self.frame[chosen], self.point[chosen], self.pixels[chosen])
 
 
+def gathered(seen: Sequence[tuple[NDArray[np.int64], NDArray[np.float64]]], count: int, least: int) -> Observations:
+    """Return the observations of points that are observed at least `least` times, with the points renumbered from 0.
+
+    Args:
+        seen: numbers [N] and pixels [N, 2] of the points in each picture.
+        count: number of points in all.
+        least: smallest number of observations.
+    """
+    frames = np.concatenate([np.full(len(numbers), index, np.int64) for index, (numbers, _) in enumerate(seen)])
+    points = np.concatenate([numbers for numbers, _ in seen])
+    pixels = np.concatenate([pixels for _, pixels in seen])
+    often = np.bincount(points, minlength=count) >= least
+    renumbered = np.cumsum(often) - 1
+    kept = often[points]
+    return Observations(frames[kept], renumbered[points[kept]], pixels[kept])
+
+
 class FeatureTracks:
     """Point tracker. A point keeps its number while it is tracked. Results are deterministic."""
 
@@ -123,13 +141,7 @@ class FeatureTracks:
 
     def observations(self, least: int = 3) -> Observations:
         """Return all observations so far of points observed at least `least` times, with the points renumbered from 0."""
-        frames = np.concatenate([np.full(len(numbers), index) for index, (numbers, _) in enumerate(self._seen)])
-        points = np.concatenate([numbers for numbers, _ in self._seen])
-        pixels = np.concatenate([pixels for _, pixels in self._seen])
-        often = np.bincount(points, minlength=self._next) >= least
-        renumbered = np.cumsum(often) - 1
-        kept = often[points]
-        return Observations(frames[kept], renumbered[points[kept]], pixels[kept])
+        return gathered(self._seen, self._next, least)
 
     def _usable(self, grey: NDArray[np.uint8], mask: NDArray[np.uint8] | None) -> NDArray[np.uint8]:
         inside = np.zeros(grey.shape, np.uint8)

@@ -27,7 +27,7 @@ from gsplat_core.ops.tiles import bin_splats
 from gsplat_core.rendering.settings import TILE_SIZE
 from gsplat_core.rendering.surface import COVERED, render_rays
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.gaussians import Gaussians
+from gsplat_core.scene.gaussians import Gaussians, rotations
 
 FlowMode = Literal["neighbours", "gaussianflow"]
 NEIGHBOURS = 12
@@ -221,17 +221,6 @@ def deformation_gradients(first: Gaussians, second: Gaussians, neighbours: Tenso
     both = after.transpose(1, 2) @ before / unit + STIFFNESS * turned
     # In double precision, because neighbours on a line or plane leave small determinants.
     return torch.where(apart, both @ _inverse(moments.double()).to(both.dtype), turned)
-
-
-def rotations(quats: Tensor) -> Tensor:
-    """Convert quaternions [N, 4] (wxyz, any non-zero length) to rotation matrices [N, 3, 3]."""
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
-    rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    return torch.stack(rows, -1).unflatten(-1, (3, 3))
 
 
 def _inverse(matrices: Tensor) -> Tensor:

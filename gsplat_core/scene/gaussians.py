@@ -316,3 +316,14 @@ class GaussianRows:
     def _make_inert(self, first: int) -> None:
         self.all.quats[first:, 0] = 1
         self.all.logit_opacities[first:] = -math.inf
+
+
+def rotations(quats: Tensor) -> Tensor:
+    """Convert quaternions [N, 4] (wxyz, any non-zero length) to rotation matrices [N, 3, 3]."""
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, -1).unflatten(-1, (3, 3))

@@ -26,7 +26,6 @@ from operators.out_of_body import OutOfBodyFrames
 from operators.reconstruct import ModelResult, TrainedEyes
 from operators.sinks.keyframes import KeyframesResult
 from operators.sinks.video import DisplayResult
-from operators.sources.source import SourceDescription
 from operators.training import TrainingCounts
 from operators.truth import TruthResult
 from services.reports.html import write_html
@@ -117,7 +116,7 @@ def build_report(outcome: RunOutcome) -> RunReport:
         raise InvalidInput(f"a report needs a SourceResult and a QualityResult; the {outcome.command} has none")
     model, training = outcome.find(ModelResult), outcome.find(TrainingCounts)
     return RunReport(
-        recording=_recording(source.description),
+        recording=RecordingFacts.of(source.description),
         run=_run(outcome),
         frames=FrameCounts(
             ingested=source.frames,
@@ -164,17 +163,6 @@ def displayed(outcome: RunOutcome) -> int:
 
 def _entry(entry: LogLine, kind: type[FrameEntry]) -> FrameEntry:
     return kind.model_validate({name: value for name, value in entry.items() if name in kind.model_fields})
-
-
-def _recording(description: SourceDescription) -> RecordingFacts:
-    return RecordingFacts(
-        name=description.name,
-        frames=description.frame_count,
-        width_px=description.width_px,
-        height_px=description.height_px,
-        fps=description.fps,
-        digest=description.digest,
-    )
 
 
 def _run(outcome: RunOutcome) -> RunFacts:

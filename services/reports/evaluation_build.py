@@ -56,18 +56,10 @@ def build_evaluation(
     path: Path, model: Model, run: EvaluatedRun | None, settings: EvaluationSettings, evaluation: Evaluation
 ) -> EvaluationReport:
     """Convert the evaluation of the model at `path` to a report."""
-    description = evaluation.description
     per_entry = {name: frames_per_entry(_lines(log), MAX_SERIES) for name, log in evaluation.logs.items()}
     retention = evaluation.retention
     return EvaluationReport(
-        recording=RecordingFacts(
-            name=description.name,
-            frames=description.frame_count,
-            width_px=description.width_px,
-            height_px=description.height_px,
-            fps=description.fps,
-            digest=description.digest,
-        ),
+        recording=RecordingFacts.of(evaluation.description),
         evaluated=_evaluated(path, model, run, settings, evaluation),
         heldout=None if evaluation.heldout is None else HeldOutFacts.model_validate(asdict(evaluation.heldout)),
         causal=None if evaluation.causal is None else CausalFacts.model_validate(asdict(evaluation.causal)),

@@ -10,7 +10,7 @@ from operators.storage import write_whole
 from services.reports.charts import NARROW, Chart, Line
 from services.reports.evaluation_rows import at_age, decibels, future, geometry_section, measured
 from services.reports.evaluation_schema import BaselineFacts, EvaluationReport, ScoreFacts
-from services.reports.html import POLICY, style
+from services.reports.html import facts_table, notes_section, page, tile
 
 _LINES = {
     "live": ("Live", (("previous_frame_db", "Previous frame shown instead", "base"),)),
@@ -117,17 +117,13 @@ def tiles_section(report: EvaluationReport) -> str:
         if versus is not None:
             gain, baseline = versus
             more = f'<span class="{"good" if gain >= 0 else "bad"}">{gain:+.2f} dB</span> against: {escape(future(baseline).lower())}'
-        tiles.append(_tile(f"{each.name}, tissue", decibels(each.score.psnr_tissue_db), "dB", more))
+        tiles.append(tile(f"{each.name}, tissue", decibels(each.score.psnr_tissue_db), "dB", more))
     if report.live is not None and report.live.age_when_shown is not None:
         ages = report.live.age_when_shown
         tiles.append(
-            _tile("Age when shown", f"{ages.p50_ms:.1f}", "ms", f"p99 {ages.p99_ms:.1f}, max {ages.max_ms:.1f} ms")
+            tile("Age when shown", f"{ages.p50_ms:.1f}", "ms", f"p99 {ages.p99_ms:.1f}, max {ages.max_ms:.1f} ms")
         )
     return f'<ul class="tiles">{"".join(tiles)}</ul>' if tiles else ""
-
-
-def _tile(name: str, value: str, unit: str, more: str) -> str:
-    return f'<li><span class="name">{name}</span><b>{value}<span>{unit}</span></b><span class="more">{more}</span></li>'
 
 
 def table_section(report: EvaluationReport) -> str:
@@ -245,9 +241,7 @@ def depth_section(report: EvaluationReport) -> str:
         "Covered": f"{100 * depth.covered:.1f} % of the pixels whose depth is known",
         "Frames": f"{depth.frames:,}",
     }
-    return (
-        f'<section><h2>Depth, held-out frames</h2><table class="facts"><tbody>{_rows(facts)}</tbody></table></section>'
-    )
+    return facts_table("Depth, held-out frames", facts)
 
 
 def places_section(report: EvaluationReport) -> str:
@@ -301,24 +295,7 @@ def facts_section(report: EvaluationReport) -> str:
         facts["Causal learning"] = (
             f"{causal.steps_per_frame} steps a frame, {causal.field} field, motion prior {causal.motion_prior}, seed {causal.seed}"
         )
-    rows = _rows(facts)
-    digests = {"Recording": recording.digest, "Model": model.sha256}
-    rows += "".join(
-        f'<tr><th scope="row">{k} SHA-256</th><td><code>{v}</code></td></tr>' for k, v in digests.items() if v
-    )
-    return f'<section><h2>Evaluation</h2><table class="facts"><tbody>{rows}</tbody></table></section>'
-
-
-def notes_section(report: EvaluationReport) -> str:
-    """Return the section with the notes."""
-    if not report.notes:
-        return ""
-    items = "".join(f"<li>{escape(note)}</li>" for note in report.notes)
-    return f'<section><h2>Notes</h2><ul class="notes">{items}</ul></section>'
-
-
-def _rows(facts: dict[str, str]) -> str:
-    return "".join(f'<tr><th scope="row">{escape(k)}</th><td>{escape(v)}</td></tr>' for k, v in facts.items())
+    return facts_table("Evaluation", facts, {"Recording": recording.digest, "Model": model.sha256})
 
 
 def write_evaluation_html(report: EvaluationReport, path: Path) -> None:
@@ -328,7 +305,7 @@ def write_evaluation_html(report: EvaluationReport, path: Path) -> None:
 
 def render_evaluation(report: EvaluationReport) -> str:
     """Render the page: inline style and SVG, no script, no external resources."""
-    evaluated, name = report.evaluated, escape(report.recording.name)
+    evaluated = report.evaluated
     small = [hold_section(report), ages_section(report), depth_section(report), facts_section(report)]
     sections = [
         tiles_section(report),
@@ -337,32 +314,20 @@ def render_evaluation(report: EvaluationReport) -> str:
         charts_section(report),
         places_section(report),
         f'<div class="two">{"".join(small)}</div>',
-        notes_section(report),
+        notes_section(report.notes),
     ]
     ended = (
         '<p class="notice ended" role="alert">This evaluation was interrupted. All figures cover the frames that were reached.</p>'
         if evaluated.interrupted
         else ""
     )
-    when = escape(evaluated.started_at)
-    return f"""<!doctype html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta http-equiv="Content-Security-Policy" content="{POLICY}">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta name="referrer" content="no-referrer">
-<title>{name} - IntraSplat evaluation</title>
-<style>{style()}</style>
-</head>
-<body>
-<main>
-<header><h1>{name}<small>IntraSplat evaluation</small></h1>
-<div class="when"><time datetime="{when}">{when.replace("T", " ").replace("+00:00", " UTC")}</time></div></header>
-<p class="notice" role="note">{escape(report.notice)}</p>{ended}
-{"".join(sections)}
-<footer>Written by IntraSplat {escape(evaluated.version)}. The same figures for programs: <code>evaluation.json</code>. {escape(report.notice)}</footer>
-</main>
-</body>
-</html>
-"""
+    return page(
+        report.recording.name,
+        "evaluation",
+        evaluated.started_at,
+        evaluated.version,
+        report.notice,
+        ended,
+        sections,
+        "evaluation.json",
+    )

@@ -9,6 +9,7 @@ from importlib.resources import files
 from itertools import pairwise
 from pathlib import Path
 from statistics import fmean
+from types import MappingProxyType
 from urllib.parse import quote
 
 from operators.storage import write_whole
@@ -21,7 +22,8 @@ def _decibels(value: float | None) -> str:
     return "–" if value is None else f"{value:.2f}"
 
 
-def _tile(name: str, value: str, unit: str, more: str) -> str:
+def tile(name: str, value: str, unit: str, more: str) -> str:
+    """Return a tile with a figure, its name, its unit and HTML with more about it."""
     return f'<li><span class="name">{name}</span><b>{value}<span>{unit}</span></b><span class="more">{more}</span></li>'
 
 
@@ -41,14 +43,14 @@ def _quality_tiles(report: RunReport) -> list[str]:
     if (next_frame := quality.next_frame) is not None:
         value, previous_db = next_frame.psnr_tissue_db, next_frame.previous_frame_db
         more = f"{against(value, previous_db)}; before training on the frame"
-        tiles.append(_tile("Next frame, predicted", _decibels(value), "dB", more))
+        tiles.append(tile("Next frame, predicted", _decibels(value), "dB", more))
     if (heldout := quality.heldout) is not None:
         more = against(heldout.psnr_tissue_db, baselines.heldout_previous_frame_db)
-        tiles.append(_tile("Held-out frames", _decibels(heldout.psnr_tissue_db), "dB", more))
+        tiles.append(tile("Held-out frames", _decibels(heldout.psnr_tissue_db), "dB", more))
     # `tiles_section` adds the tile of a live run, whose score excludes the first second.
     if (live := quality.live) is not None and report.live is None:
         more = f"training error; {against(live.psnr_tissue_db, baselines.previous_frame_db)}"
-        tiles.append(_tile("Displayed frame", _decibels(live.psnr_tissue_db), "dB", more))
+        tiles.append(tile("Displayed frame", _decibels(live.psnr_tissue_db), "dB", more))
     return tiles
 
 
@@ -59,7 +61,7 @@ def tiles_section(report: RunReport) -> str:
     damaged = f", {frames.damaged:,} damaged" if frames.damaged else ""
     tiles = [
         *_quality_tiles(report),
-        _tile(
+        tile(
             "Frames displayed",
             f"{frames.displayed:,}",
             f"of {frames.ingested:,}",
@@ -70,17 +72,17 @@ def tiles_section(report: RunReport) -> str:
         path = _display_path(report)
         latency = report.latency_ms[path]
         tiles.append(
-            _tile(
+            tile(
                 "Latency to display",
                 f"{latency.p50:,.0f}",
                 "ms",
                 f"p95 {latency.p95:,.0f} ms, max {latency.max:,.0f} ms",
             )
         )
-    tiles.append(_tile("Run time", f"{wall:,.1f}", "s", f"{rate:.2f} frames a second"))
+    tiles.append(tile("Run time", f"{wall:,.1f}", "s", f"{rate:.2f} frames a second"))
     if report.model:
         tiles.append(
-            _tile(
+            tile(
                 "Gaussians",
                 f"{report.model.gaussians:,}",
                 "",
@@ -347,18 +349,25 @@ def facts_section(report: RunReport) -> str:
         **run.machine,
     }
     digests = {"Recording": recording.digest, "Model": model.sha256 if model else None, "Frames": report.frames_sha256}
+    return facts_table("Run", facts, digests)
+
+
+def facts_table(
+    heading: str, facts: Mapping[str, str], digests: Mapping[str, str | None] = MappingProxyType({})
+) -> str:
+    """Return a section with a table of facts, and of the SHA-256 digests that are known."""
     rows = "".join(f'<tr><th scope="row">{escape(k)}</th><td>{escape(v)}</td></tr>' for k, v in facts.items())
     rows += "".join(
         f'<tr><th scope="row">{k} SHA-256</th><td><code>{v}</code></td></tr>' for k, v in digests.items() if v
     )
-    return f'<section><h2>Run</h2><table class="facts"><tbody>{rows}</tbody></table></section>'
+    return f'<section><h2>{heading}</h2><table class="facts"><tbody>{rows}</tbody></table></section>'
 
 
-def notes_section(report: RunReport) -> str:
-    """Return the notes, which state fallbacks."""
-    if not report.notes:
+def notes_section(notes: Sequence[str]) -> str:
+    """Return the section with the notes, which state fallbacks; empty without notes."""
+    if not notes:
         return ""
-    items = "".join(f"<li>{escape(note)}</li>" for note in report.notes)
+    items = "".join(f"<li>{escape(note)}</li>" for note in notes)
     return f'<section><h2>Notes</h2><ul class="notes">{items}</ul></section>'
 
 
@@ -612,7 +621,7 @@ def render_html(
         quality_over_time_section(report),
         f'<div class="two">{baselines_section(report)}{latency_section(report)}</div>',
         f'<div class="two">{operators_section(report)}{facts_section(report)}</div>',
-        notes_section(report),
+        notes_section(report.notes),
     ]
     ended = (
         f'<p class="notice ended" role="alert">This run did not reach the end of the recording: {escape(run.stop_reason)}. '
@@ -620,7 +629,32 @@ def render_html(
         if run.stop_reason not in ("end of recording", "end of stream", "end of the time asked for")
         else ""
     )
-    title = f"{recording.name} - IntraSplat {run.command}"
+    return page(recording.name, run.command, run.started_at, run.version, report.notice, ended, sections, "report.json")
+
+
+def page(
+    name: str,
+    kind: str,
+    started_at: str,
+    version: str,
+    notice: str,
+    ended: str,
+    sections: Sequence[str],
+    data: str,
+) -> str:
+    """Return a self-contained HTML page.
+
+    Args:
+        name: name of the recording, the heading.
+        kind: command that made the page, in the title.
+        started_at: start of the run, ISO 8601 in UTC.
+        version: version of IntraSplat.
+        notice: notice shown above the sections and in the footer.
+        ended: HTML about an early end of the run, or an empty string.
+        sections: HTML of the sections.
+        data: name of the file with the same figures.
+    """
+    name, when, notice = escape(name), escape(started_at), escape(notice)
     return f"""<!doctype html>
 <html lang="en">
 <head>
@@ -628,16 +662,16 @@ def render_html(
 <meta http-equiv="Content-Security-Policy" content="{POLICY}">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <meta name="referrer" content="no-referrer">
-<title>{escape(title)}</title>
+<title>{name} - IntraSplat {kind}</title>
 <style>{style()}</style>
 </head>
 <body>
 <main>
-<header><h1>{escape(recording.name)}<small>IntraSplat {run.command}</small></h1>
-<div class="when"><time datetime="{escape(run.started_at)}">{escape(run.started_at.replace("T", " ").replace("+00:00", " UTC"))}</time></div></header>
-<p class="notice" role="note">{escape(report.notice)}</p>{ended}
+<header><h1>{name}<small>IntraSplat {kind}</small></h1>
+<div class="when"><time datetime="{when}">{when.replace("T", " ").replace("+00:00", " UTC")}</time></div></header>
+<p class="notice" role="note">{notice}</p>{ended}
 {"".join(sections)}
-<footer>Written by IntraSplat {escape(run.version)}. The same figures for programs: <code>report.json</code>. {escape(report.notice)}</footer>
+<footer>Written by IntraSplat {escape(version)}. The same figures for programs: <code>{data}</code>. {notice}</footer>
 </main>
 </body>
 </html>

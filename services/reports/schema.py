@@ -19,6 +19,7 @@ from gsplat_core.choices import Eyes
 from gsplat_core.io.files import read_regular
 from gsplat_core.ops.native import instruction_set
 from gsplat_core.threads import usable_cores
+from operators.sources.source import SourceDescription
 from operators.storage import write_whole
 
 MOST_REPORT_BYTES = 256 << 20
@@ -45,6 +46,18 @@ class RecordingFacts(Part):
     fps: Annotated[float, Field(gt=0)]
     digest: str | None = None
     """SHA-256 over the recording's files."""
+
+    @classmethod
+    def of(cls, description: SourceDescription) -> RecordingFacts:
+        """Return the facts of a source's description."""
+        return cls(
+            name=description.name,
+            frames=description.frame_count,
+            width_px=description.width_px,
+            height_px=description.height_px,
+            fps=description.fps,
+            digest=description.digest,
+        )
 
 
 class TrialFacts(Part):

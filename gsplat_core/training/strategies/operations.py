@@ -18,6 +18,7 @@ from torch.nn import Parameter
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.densification import diffuse_positions_
+from gsplat_core.scene.gaussians import rotations
 from gsplat_core.training.strategies.strategy import InvalidParameters, Optimizers, Params
 
 MOST_COPIES = 51
@@ -156,7 +157,7 @@ def split(
     chosen, rest = mask.nonzero()[:, 0], (~mask).nonzero()[:, 0]
     scales = params["scales"][chosen].exp()
     noise = torch.randn(2, len(chosen), 3, device=mask.device, dtype=scales.dtype, generator=generator)
-    axes = rotation_matrices(params["quats"][chosen])
+    axes = rotations(params["quats"][chosen])
     offsets = torch.einsum("nij,nj,bnj->bni", axes, scales, noise)
 
     def samples(name: str, tensor: Tensor) -> Tensor:
@@ -327,17 +328,6 @@ def draw(weights: Tensor, count: int, generator: torch.Generator | None = None) 
     total = weights.double().cumsum(0)
     draws = torch.rand(count, dtype=total.dtype, device=total.device, generator=generator) * total[-1]
     return torch.searchsorted(total, draws, right=True).clamp(max=len(weights) - 1)
-
-
-def rotation_matrices(quats: Tensor) -> Tensor:
-    """Return the rotation matrices [N, 3, 3] of quaternions wxyz [N, 4] of any norm."""
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
-    rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    return torch.stack(rows, -1).reshape(*quats.shape[:-1], 3, 3)
 
 
 def _append(params: Params, optimizers: Optimizers, parents: Tensor, copies: Callable[[str, Tensor], Tensor]) -> None:

@@ -156,7 +156,7 @@ def test_noise_follows_covariances_and_spares_visible_gaussians():
     with torch.no_grad():
         params["opacities"][:] = torch.tensor([-9.0, 3.0])
         params["scales"][:, 0] += 4
-    before, axes = params["means"].detach().clone(), ops.rotation_matrices(params["quats"].detach())
+    before, axes = params["means"].detach().clone(), ops.rotations(params["quats"].detach())
     ops.inject_noise_to_position(params, optimizers, {}, 1.0)
     moved = params["means"].detach() - before
     along = (moved[0] @ axes[0]).abs()
