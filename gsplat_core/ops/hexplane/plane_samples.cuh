@@ -83,7 +83,7 @@ __device__ __forceinline__ Channels<kLane> between(const Channels<kLane>& a, con
 // Grid nodes around a point: four in a plane, two in a line. Offsets are integers that count floats.
 struct Corners {
   int64_t start;         // offset of the first node from the start of the plane
-  int32_t right, below;  // offsets from the first node to its neighbours; 0 if the axis has only one cell
+  int32_t right, below;  // offsets from the first node to its neighbours; 0 if the axis has only one node
   LinePosition u, v;
 
   __device__ Corners(const FeaturePlane& plane, const LinePosition& along_u, const LinePosition& along_v, int channels)
