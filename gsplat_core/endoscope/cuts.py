@@ -182,7 +182,7 @@ KEPT_VIEWS = 4
 VIEW_EVERY = 15
 """Number of frames between two kept views."""
 RATE_RATIO = 1.4
-"""Factor by which a new frame rate must differ."""
+"""Factor from the usual to the new frame rate, in either direction, above which the rate counts as changed."""
 RATE_FRAMES = 15
 """Number of frames over which the frame rate is observed."""
 

@@ -45,9 +45,11 @@ FROZEN_FRAMES = 8
 TORN_SHARE = 0.08
 """Share of rows, up to the lower edge, equal to the previous picture from which a picture is torn."""
 CHANGED_SHARE = 0.01
-"""Share of pixels of a row from which it has changed."""
+"""Share of changed pixels in a row of the picture from which the row counts as changed."""
 LEAST_CHANGED, ABRUPT_SHARE = 0.03, 0.5
-"""Median of this share over the rows above a tear, and part of it that the rows next to the tear must have."""
+"""Smallest median share of changed pixels in the rows above a tear, and part of this median that the rows next to the
+tear must have.
+"""
 TORN_FRAMES = 5
 """Largest number of consecutive torn pictures. After that the layout counts as changed, as by an overlay."""
 MOVING_SHARE = 0.9

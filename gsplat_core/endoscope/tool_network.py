@@ -32,7 +32,7 @@ LOGARITHMS = np.log(np.arange(256, dtype=np.float32) / 255 + np.float32(0.06))
 SURROUND = 16
 """Largest channel below which a pixel counts as surround of the field of view. As in training."""
 CERTAIN = 2.0
-"""Logit to which larger ones are reduced before they are smoothed along edges."""
+"""Largest magnitude of a logit; logits beyond it are clipped before the smoothing along edges."""
 EDGE_RADIUS_PX, EDGE_CONTRAST = 3, 0.01
 """Radius of the guided filter and its squared contrast, of logarithms of colours, above which edges are kept."""
 

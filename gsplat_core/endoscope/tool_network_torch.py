@@ -106,7 +106,7 @@ class Graph:
     """Content of an ONNX file."""
 
     nodes: tuple[Node, ...]
-    """In an order in which each follows those whose output it reads."""
+    """Operators in an order in which each follows the operators whose outputs it reads."""
     weights: Mapping[str, NDArray[Any]]
     input: str
     input_shape: tuple[int, ...]

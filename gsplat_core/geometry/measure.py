@@ -23,9 +23,9 @@ from gsplat_core.scene.depth_origin import UNKNOWN_ERROR
 from gsplat_core.transfers import HostCopy
 
 MOST_STEPS = 4096
-"""Largest number of steps of a length along the surface."""
+"""Largest number of steps into which a length along the surface is divided."""
 STEP_PX = 2.0
-"""Length of such a step in pixels."""
+"""Length in pixels of the steps along the surface."""
 COMMON = 0.5
 """Share of the variance of the depth source's error that is common to the whole scene."""
 SMOOTHED_SPLATS = 3.0

@@ -37,9 +37,9 @@ _REPORTED_FACTS = (
 )
 MOST_PROBLEMS = 3
 CHECK_MEMORY_BYTES = 4 << 30
-"""Memory of the check beyond its libraries, in bytes."""
+"""Limit of the memory of the check beyond its libraries, in bytes."""
 CHECK_S = 3600.0
-"""Processor time of the check in seconds. Exceeding it rejects the recording."""
+"""Limit of the processor time of the check in seconds. Exceeding it rejects the recording."""
 
 
 def main(arguments: list[str] | None = None) -> int:

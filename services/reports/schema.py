@@ -183,9 +183,9 @@ class TruthFacts(Part):
     """PSNR over pixels that are behind a tool and were visible in an earlier frame, against the true picture
     without the tool."""
     last_seen_psnr_db: float | None
-    """Trivial baseline: each of these pixels with its last visible value."""
+    """Trivial baseline of `behind_tools_psnr_db`: each pixel with its last visible value."""
     inpainted_psnr_db: float | None
-    """Trivial baseline: the frame's own picture, inpainted from the tool's surroundings."""
+    """Trivial baseline of `behind_tools_psnr_db`: the frame's own picture, inpainted from the tool's surroundings."""
     frames: Count
     """Number of frames scored behind their tools."""
     depth: DepthErrors | None
@@ -232,7 +232,9 @@ class LiveFacts(Part):
     age_p99_ms: float
     age_max_ms: float
     settled_age_p99_ms: float | None = None
-    """99th percentile of these ages after the first second, in milliseconds; None in older reports and shorter runs."""
+    """99th percentile of the age of new pictures at display after the first second, in milliseconds; None in older
+    reports and shorter runs.
+    """
     used_age_p99_ms: float | None = None
     """99th percentile after the first second without pictures of withheld and damaged frames, which show the content of
     an earlier frame.
