@@ -43,7 +43,8 @@ class OnnxToolFinder:
         """Do nothing, since no state is kept between pictures."""
 
     def find(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Segment a picture RGB uint8 [H, W, 3]. Returns uint8 [H, W], 1 = tissue, 0 = tool.
+        """Segment a picture RGB uint8 [H, W, 3]. Returns uint8 [H, W], 1 = tissue, 0 = tool; 0 everywhere if the network
+        gives NaN.
 
         Raises:
             InvalidInput: for an array that is no picture.

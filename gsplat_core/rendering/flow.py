@@ -242,7 +242,7 @@ def _moved_planes(means_1: Tensor, means_2: Tensor, gradients: Tensor, camera_1:
 
 def _screen_planes(first: DenseProjection, second: DenseProjection, camera_1: Camera, camera_2: Camera) -> Tensor:
     """Return the map between screen ellipses as X -> a + B X from points at depth 1 on the first camera's rays to the
-    second camera's coordinates: a and B by rows, [N, 12].
+    second camera's coordinates: a and B by rows, [N, 12]; NaN for a splat that is not in both pictures.
     """
     _, K_1 = camera_1.matrices(first.depths.device, first.depths.dtype)
     _, K_2 = camera_2.matrices(first.depths.device, first.depths.dtype)

@@ -228,7 +228,7 @@ class Orbit:
     elevation_deg: float = 0.0
     """Upward rotation around the point at the centre of the picture, in degrees."""
     zoom: float = 1.0
-    """Factor by which the camera is closer to that point."""
+    """Factor by which the camera is closer to the point at the centre of the picture."""
 
     def __post_init__(self) -> None:
         for name, value in (("azimuth", self.azimuth_deg), ("elevation", self.elevation_deg)):

@@ -69,7 +69,7 @@ class Fragment:
             capacity: queue capacity in messages; None for that of the input port.
 
         Raises:
-            GraphInvalid: unknown ports or an invalid capacity.
+            GraphInvalid: unknown or ambiguous ports, or an invalid capacity.
         """
         self.add_operator(upstream)
         self.add_operator(downstream)

@@ -520,7 +520,9 @@ class ProcessSource(LiveSource):
         self._end()
 
     def frames(self) -> Iterator[Frame]:
-        """Yield the frames of the child process, and of its replacements after an exit, hang or failure."""
+        """Yield the frames of the child process, and of its replacements after an exit, hang or failure. Raises SourceLost
+        after `MOST_FAILURES` failures without a frame.
+        """
         backoff, crashes = Backoff(), 0
         try:
             while True:

@@ -247,7 +247,7 @@ def own_folder(path: Path) -> None:
     """Create a folder for this user alone, or verify an existing one.
 
     Raises:
-        RuntimeFolderUnusable: if the folder has another owner or is accessible to other users.
+        RuntimeFolderUnusable: if it cannot be created, is no folder, has another owner or is accessible to other users.
     """
     try:
         path.mkdir(mode=0o700, parents=True, exist_ok=True)

@@ -62,7 +62,7 @@ class Results:
         """Move the folder `made` into place by one rename.
 
         Returns:
-            False if the target already exists; it stays unchanged.
+            False if the target already exists and is not empty; it stays unchanged.
         """
         sync_folder(made)
         try:

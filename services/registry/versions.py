@@ -63,7 +63,7 @@ def add_version(
         wanted: required version number; None takes the next number.
 
     Raises:
-        Conflict: if the number was already used.
+        Conflict: if the number was already used, or is above `LAST_NUMBER`.
     """
     at = now().isoformat()
     last = _last_version(connection, name, at)

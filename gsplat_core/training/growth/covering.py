@@ -369,7 +369,8 @@ class OutOfView:
             self.last_seen.close_gaps(step.remove(leaving))
 
     def bring_back(self, step: TrainingStep, observation: Observation, wanted: Tensor) -> None:
-        """Restore archived Gaussians whose centre is near a marked pixel of `wanted`, bool [H, W].
+        """Restore archived Gaussians whose centre is near a marked pixel of `wanted`, bool [H, W], as many as the
+        capacity allows.
         Synchronises with the device.
         """
         marks = HostCopy(wanted).numpy().astype(np.uint8)

@@ -189,7 +189,7 @@ def triangulate(
 
     Returns:
         World points [P, 3], and which of them are reliable, bool [P]: at least two other views at 1.5° or more, in
-        front of all views, and within 1 px of the matches.
+        front of all views, and within 1 px (root mean square) of the matches.
     """
     P = np.stack([camera.K @ camera.world_to_camera[:3] for camera in cameras])
     scaled = P / np.linalg.norm(P, axis=(1, 2), keepdims=True)
