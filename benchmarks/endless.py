@@ -28,16 +28,16 @@ import numpy as np
 import torch
 
 from gsplat_core.io.recordings import open_recording
-from gsplat_core.memory import return_freed_memory
 from gsplat_core.rendering.alpha import AlphaRenderer
 from gsplat_core.rendering.renderer import PendingFrame
+from gsplat_core.resources import return_freed_memory
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.budget import Budget
 from gsplat_core.training.metrics import psnr_tissue_db
 from gsplat_core.training.reconstructor import Reconstructor
 from operators.applications.live_settings import LiveSettings
-from operators.applications.warm_reconstructor import warm_reconstructor
 from operators.frame_clock import FrameClock
+from operators.reconstruct import warm_reconstructor
 
 SCORED_EVERY = 10
 REHEARSED_AT_ONCE = {"cpu": 1, "cuda": 3}

@@ -40,7 +40,7 @@ from gsplat_core.training.metrics import psnr_tissue_db
 from gsplat_core.training.reconstructor import Reconstructor
 from operators.applications.live_settings import LiveSettings
 from operators.applications.replay import ReplaySettings
-from operators.applications.warm_reconstructor import warm_reconstructor
+from operators.reconstruct import warm_reconstructor
 
 Arguments = argparse.Namespace
 PLANE_MM = 60.0

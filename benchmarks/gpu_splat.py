@@ -19,7 +19,7 @@ from gpu_timing import Times, Work, captured, compare, extra_mib, gsplat, measur
 from torch import Tensor
 
 import gsplat_core
-from gsplat_core.ops.frame.frame import STATUS_LONGEST, STATUS_NEEDED, Frame, FrameMode, View, render_frame
+from gsplat_core.ops.frame import STATUS_LONGEST, STATUS_NEEDED, Frame, FrameMode, View, render_frame
 from gsplat_core.ops.frame_gradients import (
     RATES,
     GaussianAdam,

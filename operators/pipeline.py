@@ -52,8 +52,7 @@ from operators.rasterize import DeformOp, RasterizeOp, Rasterizer
 from operators.reconstruct import ReconstructOp
 from operators.settings import EngineOptions, JobOptions, OutputSection
 from operators.side_by_side import SideBySideOp
-from operators.sinks.callback import CallbackSinkOp
-from operators.sinks.registry import SinkOptions, input_of
+from operators.sinks.registry import CallbackSinkOp, SinkOptions, input_of
 from operators.sinks.session_recorder import (
     RecordFramesOp,
     RecordPicturesOp,

@@ -17,8 +17,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from gsplat_core.choices import DEPTHS, DEPTHS_WITH_ADDRESS, FIELDS, LOSSES, OUTPUTS, RENDERERS, STRATEGIES, Eyes
-from gsplat_core.combinations import STANDARD, check_losses, check_outputs, check_renderer_options, check_strategy
+from gsplat_core.choices import (
+    DEPTHS,
+    DEPTHS_WITH_ADDRESS,
+    FIELDS,
+    LOSSES,
+    OUTPUTS,
+    RENDERERS,
+    STANDARD,
+    STRATEGIES,
+    Eyes,
+    check_losses,
+    check_outputs,
+    check_renderer_options,
+    check_strategy,
+)
 from gsplat_core.errors import InvalidSetting
 from operators.choices import SINKS, TOOL_MASKS, TOOL_MASKS_WITH_ADDRESS, Device, Policy, Poses
 from operators.graph.application import Engine

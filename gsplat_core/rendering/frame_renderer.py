@@ -23,7 +23,7 @@ from torch import Tensor
 
 from gsplat_core.deformation.field import FrameDeltas
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.frame.frame import (
+from gsplat_core.ops.frame import (
     MAX_SEGMENT,
     STATUS_LONGEST,
     STATUS_NEEDED,

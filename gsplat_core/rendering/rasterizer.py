@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.argument_checks import require_shape
-from gsplat_core.ops.frame.frame import TILE_SIZE as FRAME_TILE_SIZE
+from gsplat_core.ops.frame import TILE_SIZE as FRAME_TILE_SIZE
 from gsplat_core.ops.native import CUDA_MISSING
 from gsplat_core.rendering.frame_renderer import FrameRenderer, TileListCapacity
 from gsplat_core.rendering.rasterization import rasterization

@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.argument_checks import require_shape
-from gsplat_core.ops.arguments import DenseProjection, TileGrid
-from gsplat_core.ops.frame.view import View
+from gsplat_core.ops.arguments import DenseProjection, TileGrid, View
 from gsplat_core.ops.projection.projection import fully_fused_projection
 from gsplat_core.ops.tiles import bin_splats
 from gsplat_core.rendering.depth_maps import depth_normals

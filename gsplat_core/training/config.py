@@ -7,8 +7,7 @@ import math
 from dataclasses import dataclass
 from typing import get_args
 
-from gsplat_core.choices import FIELDS, MOTION_PRIORS, RENDERERS, STRATEGIES, Eyes
-from gsplat_core.combinations import check_losses, check_strategy
+from gsplat_core.choices import FIELDS, MOTION_PRIORS, RENDERERS, STRATEGIES, Eyes, check_losses, check_strategy
 from gsplat_core.deformation.kinds import FieldRates, check_rates
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.depth_origin import RELATIVE_DISTANCE

@@ -20,7 +20,7 @@ from torch.nn.functional import grid_sample
 
 from gsplat_core.deformation.field import CapturedMotion, EditableMotion
 from gsplat_core.depth.maps import possible_depth
-from gsplat_core.ops.frame.frame import STATUS_OVERFLOW, FrameMode, View, render_frame
+from gsplat_core.ops.frame import STATUS_OVERFLOW, FrameMode, View, render_frame
 from gsplat_core.rendering.frame_renderer import (
     CapturedSequence,
     FrameControls,

@@ -30,7 +30,6 @@ from operators.applications.device import check_device, seeded
 from operators.applications.limits import check_picture
 from operators.applications.live_settings import LIVE_PREDICT_EVERY, LiveSettings
 from operators.applications.session import Report, RunOutcome, Session, delivered, saves_model
-from operators.applications.warm_reconstructor import warm_reconstructor
 from operators.applications.working_size import (
     SHARE_OF_INTERVAL,
     PacedTissue,
@@ -46,6 +45,7 @@ from operators.output_folder import RECORDINGS
 from operators.pipeline import REPORT_RESERVE_BYTES, Outputs, Pace, Pipeline
 from operators.pose import check_poses
 from operators.rasterize import Rasterizer
+from operators.reconstruct import warm_reconstructor
 from operators.sinks.session_recorder import SessionRecorder
 from operators.sources.address import SourceOptions
 from operators.sources.derived import ScaledSource, scaled_description

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsplat_core.combinations import check_outputs
+from gsplat_core.choices import check_outputs
 from gsplat_core.errors import InvalidSetting, RecordingError, UserError
 from gsplat_core.io.camera_path import read_camera_path
 from gsplat_core.io.files import PartialFile

@@ -14,7 +14,7 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from gsplat_core.combinations import check_compared
+from gsplat_core.choices import check_compared
 from gsplat_core.depth.registry import check_depth, depth_inputs, of_recording
 from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.io.frame_codec import camera_of
@@ -38,11 +38,11 @@ from operators.applications.session import (
     measures_baselines,
     saves_model,
 )
-from operators.applications.warm_reconstructor import warm_reconstructor
 from operators.depth import without_depth
 from operators.metrics import ScoredFrame
 from operators.pipeline import REPORT_RESERVE_BYTES, Outputs, Pace, Pipeline
 from operators.pose import check_poses
+from operators.reconstruct import warm_reconstructor
 from operators.settings import ReplayOptions, check_option
 from operators.sources.recording import SessionSource
 from operators.sources.registry import SourceOptions, open_source

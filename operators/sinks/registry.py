@@ -1,12 +1,14 @@
-"""Parameters and inputs of sinks. `operators.choices.SINKS` lists them."""
+"""Parameters and inputs of sinks, which `operators.choices.SINKS` lists, and the sink that calls a function."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from gsplat_core.errors import InvalidInput
-from operators.graph import Operator
+from operators.graph import Operator, OperatorSpec
 from operators.messages import RenderedFrame
 from operators.metrics import ScoredFrame
 from operators.sources.source import SourceDescription
@@ -32,3 +34,29 @@ def input_of(sink: Operator) -> tuple[str, type]:
             f"sink {sink.name!r} has the inputs {ports}; it must have one, declared with type=RenderedFrame or type=ScoredFrame"
         )
     return ports[0]
+
+
+class CallbackSinkOp(Operator):
+    """Calls a function with each message, in the operator's thread. Its exceptions fail the operator.
+
+    Inputs:
+        message: any value.
+
+    Params:
+        callback: called with the message.
+    """
+
+    def __init__(self, fragment: Any, *args: Any, callback: Callable[[Any], None], **kwargs: Any) -> None:
+        self.callback = callback
+        self.received = 0
+        super().__init__(fragment, *args, **kwargs)
+
+    def setup(self, spec: OperatorSpec) -> None:
+        spec.input("message")
+
+    def start(self) -> None:
+        self.received = 0
+
+    def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
+        self.callback(op_input.receive("message"))
+        self.received += 1

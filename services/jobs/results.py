@@ -15,8 +15,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gsplat_core.choices import OUTPUTS
-from gsplat_core.combinations import STANDARD
+from gsplat_core.choices import OUTPUTS, STANDARD
 from gsplat_core.io.files import sync_folder
 from services.errors import StoreUnavailable
 from services.jobs.records import JobProgress, JobState

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from gsplat_core.choices import LOSSES, RENDERERS
-from gsplat_core.combinations import (
+from gsplat_core.choices import (
+    LOSSES,
     OF_EVERY_STEP,
     OPTIONS,
     OUTPUTS_OF,
     OWN_OPACITIES,
+    RENDERERS,
     check_compared,
     check_losses,
     check_outputs,

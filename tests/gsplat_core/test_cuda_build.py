@@ -17,7 +17,7 @@ import gsplat_core.ops
 from gsplat_core.ops import native
 from gsplat_core.ops.arguments import TileGrid
 from gsplat_core.ops.compositing import rasterize_to_pixels
-from gsplat_core.ops.frame.frame import FrameMode, View, render_frame
+from gsplat_core.ops.frame import FrameMode, View, render_frame
 from gsplat_core.ops.frame_gradients import (
     GaussianAdam,
     render_frame_backward,

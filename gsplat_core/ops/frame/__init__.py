@@ -1,1 +1,195 @@
-"""Op `render_frame`: a whole frame on CUDA, from raw Gaussians to the image, in a few launches."""
+"""Op `render_frame`: a whole frame on CUDA, from raw Gaussians to the image, in a few launches without host synchronisation.
+
+The steps are deform, activate, project, sort and blend. Splatting follows Kerbl et al. 2023 and Zwicker et al. 2001,
+with the same picture as `gsplat_core.rasterization`. An instance is a pair of a splat and a tile that it touches.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from enum import IntEnum
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gsplat_core.argument_checks import require_shape
+from gsplat_core.errors import InvalidInput
+from gsplat_core.ops import native
+from gsplat_core.ops.arguments import GAUSSIAN_TENSORS, View, check_inputs
+
+__all__ = [
+    "GAUSSIAN_TENSORS",
+    "MAX_SEGMENT",
+    "STATUS_LONGEST",
+    "STATUS_NEEDED",
+    "STATUS_OVERFLOW",
+    "TILE_SIZE",
+    "Frame",
+    "FrameMode",
+    "View",
+    "accumulate_status_",
+    "render_frame",
+]
+
+TILE_SIZE = 16
+"""Side of the square tiles that `render_frame` divides the image into, in pixels."""
+MAX_SEGMENT = 1024
+"""Largest capacity of a tile's own segment, in instances."""
+STATUS_NEEDED, STATUS_LONGEST, STATUS_OVERFLOW = range(3)
+"""Indices into `Frame.status`: number of instances of the frame, largest number in a tile, and 1 if instances were
+dropped.
+"""
+
+
+class FrameMode(IntEnum):
+    """Purpose of a frame, which determines the layout of its tile lists."""
+
+    SHARED = 0
+    """Picture. Tile lists of any length are stored consecutively in a buffer of `capacity` instances."""
+    TRAINING = 1
+    """Layout of SHARED. Also returns the values needed by the backward pass; depth is the sum of weight times z."""
+    SEGMENTS = 2
+    """Mode for a picture in which every tile's list has its own segment of the buffer, with space for `capacity`
+    instances.
+
+    `capacity` is at most MAX_SEGMENT. A frame takes two kernel launches instead of four, because no prefix sum over
+    the list lengths is needed. The buffer takes 8 bytes for each of tiles x `capacity` instances, used or not.
+    """
+
+
+class Frame(NamedTuple):
+    """Rendered frame and the values needed by its backward pass."""
+
+    image: Tensor
+    """[H, W, 4]: red, green, blue over the background, and depth.
+
+    Depth is the weighted mean of z, or the weighted sum when training.
+    """
+    alphas: Tensor
+    """Accumulated opacity [H, W]."""
+    last: Tensor
+    """Index in `sorted` of the last blended instance, int32 [H, W]; -1 for none. Empty unless training."""
+    records: Tensor
+    """Projected splats [N, 12] in the kernels' format; rows of culled Gaussians are undefined.
+
+    A colour of exactly 0 was clamped. Columns: x, y, coefficients of log2 alpha (xx, xy, yy, 1),
+    infinity, red, green, blue, z, 0.
+    """
+    tile_offsets: Tensor
+    """Start of each tile's instances in `sorted`, int32 [tiles + 1]. Empty with segments."""
+    sorted: Tensor
+    """Instances sorted by tile and depth, int32 [capacity]. Empty unless training; may contain -1 if the lists
+    overflowed.
+    """
+    splat_starts: Tensor
+    """First instance of each splat, int32 [N + 1]. Empty unless training."""
+    instance_splats: Tensor
+    """Splat of each instance, int32 [capacity]. Empty unless training."""
+    status: Tensor
+    """Frame status, int32 [4], indexed by `STATUS_NEEDED` and the following constants. Reading it synchronises with the
+    host.
+    """
+
+
+def render_frame(
+    gaussians: Sequence[Tensor],
+    deltas: Tensor | None,
+    view: View,
+    capacity: int,
+    mode: FrameMode = FrameMode.SHARED,
+) -> Frame:
+    """Render N Gaussians, given by their raw parameters, for one camera.
+
+    With float16 `sh` (not when training), blending runs in half precision on the tensor cores. This is faster and
+    nearly the same picture. Colours saturate at 65,504, and splats thinner than 0.01 pixel (with `eps2d` 0) are culled.
+    All other arithmetic is float32.
+
+    The picture is that of `gsplat_core.reference.render_frame`. Gaussians with a non-finite value or a zero-length
+    rotation are culled. The host does not synchronise, and torch allocates all memory, so a CUDA graph can capture the
+    call. The view's tensors and the deltas are read on the device at each replay. Equal inputs give bit-identical
+    results.
+
+    Args:
+        gaussians: float32 on CUDA: means [N, 3], quats [N, 4] (wxyz, non-zero), log_scales [N, 3], logit_opacities [N],
+            and sh [N, B, 3] with B = (degree + 1)², degree at most 4.
+        deltas: [N, 16], added to the raw parameters in the layout of `gsplat_core.scene.gaussians`, or None.
+        view: camera with its tensors on the device.
+        capacity: allocated instances, in all tiles together or, with segments, in each tile. If a frame needs more,
+            `status` reports how many, and the picture is invalid. Render again with at least as many.
+        mode: purpose of the frame.
+
+    Returns:
+        Frame with image, alphas and status.
+
+    Raises:
+        InvalidInput: for other devices, dtypes or shapes.
+    """
+    if capacity < 1:
+        raise InvalidInput(f"capacity must be at least 1 instance, got {capacity}")
+    if mode == FrameMode.SEGMENTS and capacity > MAX_SEGMENT:
+        raise InvalidInput(
+            f"a tile's own segment holds at most {MAX_SEGMENT} instances, got {capacity}; use FrameMode.SHARED"
+        )
+    check_inputs("render_frame", gaussians, deltas, view, half_sh=mode != FrameMode.TRAINING)
+    if native.CUDA_MISSING is not None:
+        raise InvalidInput(f"render_frame needs the CUDA kernels, which are {native.CUDA_MISSING}")
+    return Frame(
+        *torch.ops.gsplat_core.render_frame(
+            list(gaussians), deltas, *view.tensors, view.width, view.height, view.eps2d, view.near_plane, view.far_plane,
+            view.model_index, capacity, mode,
+        )
+    )  # fmt: skip
+
+
+def accumulate_status_(status: Tensor, totals: Tensor, step: Tensor) -> Tensor:
+    """Merge a frame's status into the totals of a series of frames, on the device.
+
+    Args:
+        status: int32 [4] of a `Frame`, on CUDA.
+        totals: int32 [4]; receives the maximum of every entry, but in STATUS_OVERFLOW the number of overflowed frames.
+        step: int64 [1]; incremented unless the frame overflowed.
+
+    Returns:
+        float32 [1]: 0 if the frame overflowed, otherwise 1.
+    """
+    for name, tensor, dtype, size in (
+        ("status", status, torch.int32, 4),
+        ("totals", totals, torch.int32, 4),
+        ("step", step, torch.int64, 1),
+    ):
+        require_shape(name, tensor, (size,), "[numbers]")
+        if tensor.dtype != dtype or tensor.device != status.device or status.device.type != "cuda":
+            raise InvalidInput(f"{name} must be {dtype} on one CUDA device, got {tensor.dtype} on {tensor.device}")
+    return torch.ops.gsplat_core.accumulate_status_(status, totals, step)
+
+
+@torch.library.register_fake("gsplat_core::render_frame")
+def _render_frame_fake(gaussians: list[Tensor], *rest: Tensor | float | None) -> tuple[Tensor, ...]:
+    *_, width, height, _eps2d, _near_plane, _far_plane, _camera_model, capacity, mode = rest
+    means = gaussians[0]
+    n = means.shape[0]
+    assert isinstance(width, int) and isinstance(height, int) and isinstance(capacity, int)
+    tiles = math.ceil(width / TILE_SIZE) * math.ceil(height / TILE_SIZE)
+    training = mode == FrameMode.TRAINING
+
+    def ints(*shape: int) -> Tensor:
+        return means.new_empty(shape, dtype=torch.int32)
+
+    return (
+        means.new_empty((height, width, 4)),
+        means.new_empty((height, width)),
+        ints(height, width) if training else ints(0, 0),
+        means.new_empty((n, 12)),
+        ints(0 if mode == FrameMode.SEGMENTS else tiles + 1),
+        ints(capacity if training else 0),
+        ints(n + 1 if training else 0),
+        ints(capacity if training else 0),
+        ints(4),
+    )
+
+
+@torch.library.register_fake("gsplat_core::accumulate_status_")
+def _accumulate_status_fake(status: Tensor, totals: Tensor, step: Tensor) -> Tensor:
+    return status.new_empty(1, dtype=torch.float32)

@@ -15,11 +15,11 @@ from torch import Tensor
 from gsplat_core.argument_checks import require_shape
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
-from gsplat_core.ops.frame.view import GAUSSIAN_TENSORS, View, check_inputs
+from gsplat_core.ops.arguments import GAUSSIAN_TENSORS, View, check_inputs
 from gsplat_core.scene.gaussians import COLOUR, LOG_SCALE, OPACITY, POSITION, RAW_COLUMNS, ROTATION
 
 if TYPE_CHECKING:
-    from gsplat_core.ops.frame.frame import Frame
+    from gsplat_core.ops.frame import Frame
 
 RATES = len(GAUSSIAN_TENSORS)
 """Number of learning rates of the fused Adam: one for each of `GAUSSIAN_TENSORS`."""

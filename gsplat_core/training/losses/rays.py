@@ -9,7 +9,7 @@ from typing import ClassVar, NamedTuple
 
 from torch import Tensor
 
-from gsplat_core.ops.frame.view import View
+from gsplat_core.ops.arguments import View
 from gsplat_core.ops.ray_losses import ray_depth_loss, ray_normal_loss
 from gsplat_core.rendering.surface import COVERED, blend_view_rays, view_of
 from gsplat_core.scene.gaussians import Gaussians

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from gsplat_core.deformation.kinds import CapturedTraining
 from gsplat_core.ops.adam import adam_step_at_
-from gsplat_core.ops.frame.frame import (
+from gsplat_core.ops.frame import (
     GAUSSIAN_TENSORS,
     STATUS_NEEDED,
     STATUS_OVERFLOW,

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core import rasterization, reference
-from gsplat_core.ops.frame.frame import MAX_SEGMENT, Frame, FrameMode, View, render_frame
+from gsplat_core.ops.frame import MAX_SEGMENT, Frame, FrameMode, View, render_frame
 from gsplat_core.scene.gaussians import COLOUR, LOG_SCALE, OPACITY, POSITION, ROTATION
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gsplat_core import fully_fused_projection, spherical_harmonics
 from gsplat_core.ops.arguments import TileGrid
-from gsplat_core.ops.frame.frame import Frame, FrameMode, View, render_frame
+from gsplat_core.ops.frame import Frame, FrameMode, View, render_frame
 from gsplat_core.ops.frame_gradients import RawGradients, render_frame_backward
 from gsplat_core.ops.tiles import bin_splats
 from gsplat_core.reference.rendering import render_frame as reference_frame

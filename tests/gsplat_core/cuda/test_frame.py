@@ -8,7 +8,7 @@ from dataclasses import fields, replace
 import pytest
 import torch
 
-from gsplat_core.ops.frame.frame import MAX_SEGMENT, STATUS_NEEDED, Frame, FrameMode
+from gsplat_core.ops.frame import MAX_SEGMENT, STATUS_NEEDED, Frame, FrameMode
 from tests.gsplat_core.cuda.frame_checks import assert_near, check, plain, scene
 
 

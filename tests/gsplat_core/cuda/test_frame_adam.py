@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from gsplat_core.ops.frame.frame import STATUS_OVERFLOW, Frame
+from gsplat_core.ops.frame import STATUS_OVERFLOW, Frame
 from gsplat_core.ops.frame_gradients import GaussianAdam, render_frame_backward_adam_
 from gsplat_core.reference.training import adam_step
 from gsplat_core.scene.gaussians import OPACITY

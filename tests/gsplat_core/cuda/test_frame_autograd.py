@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gsplat_core import InvalidInput
-from gsplat_core.ops.frame.frame import FrameMode, render_frame
+from gsplat_core.ops.frame import FrameMode, render_frame
 from tests.gsplat_core.cuda.frame_scenes import NAMES, backward, by_name, frame_scene, on_gpu, rendered
 
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core import InvalidInput
-from gsplat_core.ops.frame.frame import STATUS_OVERFLOW
+from gsplat_core.ops.frame import STATUS_OVERFLOW
 from gsplat_core.ops.frame_gradients import RawGradients, render_frame_backward
 from gsplat_core.scene.gaussians import COLOUR
 from tests.gsplat_core.cuda.frame_scenes import (

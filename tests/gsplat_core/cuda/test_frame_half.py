@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core import InvalidInput
-from gsplat_core.ops.frame.frame import (
+from gsplat_core.ops.frame import (
     MAX_SEGMENT,
     STATUS_LONGEST,
     STATUS_NEEDED,

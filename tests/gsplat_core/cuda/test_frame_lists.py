@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gsplat_core import InvalidInput
-from gsplat_core.ops.frame.frame import STATUS_LONGEST, STATUS_NEEDED, STATUS_OVERFLOW, FrameMode
+from gsplat_core.ops.frame import STATUS_LONGEST, STATUS_NEEDED, STATUS_OVERFLOW, FrameMode
 from tests.gsplat_core.cuda.frame_checks import assert_near, check, check_lists, plain, scene
 
 

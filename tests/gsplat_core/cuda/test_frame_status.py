@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.frame.frame import accumulate_status_
+from gsplat_core.ops.frame import accumulate_status_
 
 
 def ints(*values):

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from gsplat_core.ops.frame.frame import STATUS_OVERFLOW
+from gsplat_core.ops.frame import STATUS_OVERFLOW
 from gsplat_core.ops.hexplane_training import AdamOnDevice, Penalties, hexplane_planes_adam_
 from gsplat_core.reference import training
 from gsplat_core.reference.training import adam_step

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from gsplat_core import InvalidInput, reference
-from gsplat_core.ops.frame.frame import Frame, FrameMode, View, render_frame
+from gsplat_core.ops.frame import Frame, FrameMode, View, render_frame
 
 WIDTH, HEIGHT = 40, 30
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from gsplat_core.ops.frame.frame import MAX_SEGMENT
+from gsplat_core.ops.frame import MAX_SEGMENT
 from gsplat_core.rendering.frame_renderer import HEADROOM, TILE_STEP, TileListCapacity, capacity_for
 
 

@@ -7,7 +7,7 @@ from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.schedule import LiveTraining
 from gsplat_core.training.upkeep import Upkeep
-from operators.applications.warm_reconstructor import warm_reconstructor
+from operators.reconstruct import warm_reconstructor
 
 
 def test_upkeep_is_done_once_in_each_scene_and_nothing_of_it_stays(monkeypatch):

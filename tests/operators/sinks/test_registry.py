@@ -9,8 +9,7 @@ from operators.applications.replay import ReplaySettings
 from operators.choices import SINKS
 from operators.messages import RenderedFrame
 from operators.metrics import ScoredFrame
-from operators.sinks.callback import CallbackSinkOp
-from operators.sinks.registry import SinkOptions, input_of
+from operators.sinks.registry import CallbackSinkOp, SinkOptions, input_of
 from operators.sources.recording import RecordingSource
 from operators.storage import StorageReserve
 

@@ -11,8 +11,7 @@ from typing import Any
 import pytest
 from control_fakes import FakeVersion, NotThere, fake_parts
 
-from gsplat_core.choices import OUTPUTS, RENDERERS
-from gsplat_core.combinations import OUTPUTS_OF, STANDARD
+from gsplat_core.choices import OUTPUTS, OUTPUTS_OF, RENDERERS, STANDARD
 from services.api.problems import Conflicting
 
 STREAM = "/v1/streams/endoscope"
