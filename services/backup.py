@@ -154,7 +154,7 @@ def restore_backup(settings: ServiceSettings, folder: Path) -> Backup:
     """Check a backup and restore it into the service's folders, which must be empty. Nothing is ever replaced.
 
     Raises:
-        BackupFailed: if the backup is damaged or a folder is not empty.
+        BackupFailed: if the backup is damaged, a folder is not empty, or the copy fails.
     """
     backup = check_backup(folder)
     places = Places.of(settings)

@@ -98,7 +98,7 @@ def load_model(path: Path) -> Model:
 
 
 def static_model(gaussians: Gaussians, path: Path) -> Model:
-    """Return a model that does not move, with a camera that shows all of it.
+    """Return a model that does not move, with a camera that shows all of it except outliers.
 
     Args:
         gaussians: Gaussians of the model.

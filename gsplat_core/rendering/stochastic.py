@@ -81,7 +81,7 @@ def prepared_splats(gaussians: Gaussians) -> SplatScene:
 
 
 def quantised_splats(gaussians: Gaussians) -> SplatScene:
-    """Quantise Gaussians to 16 bytes each, plus one byte per further spherical-harmonics coefficient.
+    """Quantise Gaussians to 16 bytes each, plus three bytes (one per colour) per further spherical-harmonics coefficient.
 
     Splats with an opacity below 1/255 are dropped. The others are sorted along a Morton curve. Positions and log-scales
     are stored relative to their ranges in chunks of `CHUNK` neighbours, colours relative to those of `COLOUR_CHUNK`

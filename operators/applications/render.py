@@ -105,7 +105,8 @@ def view_of(model: Model, camera: Camera, wish: ViewWish) -> View:
         wish: the requested view.
 
     Raises:
-        InvalidSetting: unknown view, unreadable path, or a path outside of the model's time window.
+        InvalidSetting: unknown view, unreadable path, a path outside of the model's time window, or a camera that sees
+            no part of the scene.
     """
     name, baseline = wish.name, wish.baseline
     if name == "recorded":

@@ -55,8 +55,8 @@ def export_model(model: Model, path: Path, wish: ExportWish, *, overwrite: bool 
 
     Raises:
         InvalidSetting: if the time is outside the model's window.
-        ExportError: if the format cannot represent the model, or if it is empty or was not trained by `alpha`. OSError:
-        if the file cannot be written.
+        ExportError: if the format cannot represent the model, or if it is empty or was not trained by `alpha`.
+        OSError: if the file cannot be written.
     """
     times_s = wish.times_in(model.time_window_s)
     if model.gaussians.count == 0:

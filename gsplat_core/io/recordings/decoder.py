@@ -82,7 +82,7 @@ def checksum(frame: av.VideoFrame) -> int:
 
 
 def padded_packet(data: bytes, length_bytes: int) -> bytes:
-    """Append padding bytes to the last picture unit of a packet.
+    """Append padding bytes to the last picture unit of a packet; a packet without a valid one is returned unchanged.
 
     Args:
         data: packet.

@@ -66,7 +66,8 @@ def hexplane_decode(
         [N, outputs].
 
     Raises:
-        InvalidInput: if a tensor is not float32. RuntimeError: if the layers do not fit together.
+        InvalidInput: if a tensor is not float32.
+        RuntimeError: if the layers do not fit together.
     """
     for tensor in (coordinates, *spaces, *lines, *weights, *biases):
         if tensor.dtype != torch.float32:
