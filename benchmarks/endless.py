@@ -28,9 +28,9 @@ import numpy as np
 import torch
 
 from gsplat_core.io.recordings import open_recording
+from gsplat_core.memory import return_freed_memory
 from gsplat_core.rendering.alpha import AlphaRenderer
 from gsplat_core.rendering.renderer import PendingFrame
-from gsplat_core.resources import return_freed_memory
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.budget import Budget
 from gsplat_core.training.metrics import psnr_tissue_db

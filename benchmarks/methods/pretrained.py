@@ -34,7 +34,7 @@ LOAD = """
 import json, sys, time
 from pathlib import Path
 from gsplat_core.io.model_sources import READERS
-from gsplat_core.resources import peak_bytes
+from gsplat_core.memory import peak_bytes
 path = Path(sys.argv[1])
 Path("/proc/self/clear_refs").write_text("5")  # the peak counts from here
 before, begun = peak_bytes(), time.perf_counter()

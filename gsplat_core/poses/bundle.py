@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsplat_core.poses.se3 import exp
-from gsplat_core.resources import one_thread
+from gsplat_core.threads import one_thread
 
 State = TypeVar("State")
 DONE = 1e-6

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.model_sources import load_model
+from gsplat_core.memory import peak_bytes
 from gsplat_core.rendering.renderer import RendererOptions, check_renderer, new_renderer
-from gsplat_core.resources import peak_bytes
 from operators.applications.device import check_device
 from operators.applications.limits import check_picture, render_bytes, require_memory
 from operators.applications.progress import Progress, ProgressCallback

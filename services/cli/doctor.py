@@ -84,7 +84,7 @@ def _versions() -> list[Check]:
 def _processor() -> list[Check]:
     import torch
 
-    from gsplat_core.resources import usable_cores
+    from gsplat_core.threads import usable_cores
     from services.reports.schema import processor_name
 
     threads, cores = torch.get_num_threads(), usable_cores()

@@ -23,9 +23,9 @@ from gsplat_core.models.model import Model
 from gsplat_core.models.snapshots import Snapshot
 from gsplat_core.rendering.rasterization import RenderOutput, render
 from gsplat_core.rendering.surface import certainty
-from gsplat_core.resources import step_back
 from gsplat_core.scene.cameras import Camera, Orbit
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
+from gsplat_core.threads import step_back
 from gsplat_core.transfers import HostCopy
 from operators.display import draw_label, picture_state
 from operators.layer_pictures import DepthColours, confidence_picture, mark_unobserved, mark_virtual
