@@ -204,7 +204,7 @@ def evaluate(
         DeviceMissing: the device is not available.
         MemoryTooSmall: the evaluation does not fit into memory.
         RecordingError: the recording cannot be read.
-        StorageFull: the disk is full.
+        OutputError: a log cannot be written, for example because the disk is full (StorageFull).
     """
     check_device(settings.device)
     check_renderer(settings.renderer, settings.device)

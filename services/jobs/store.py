@@ -276,7 +276,7 @@ class Claims:
         self._most, self._is_published = most_attempts, is_published
 
     def take(self) -> Claimed | None:
-        """Claim the oldest free job. Jobs with too many attempts are marked as failed.
+        """Claim the oldest free job. Free jobs with a published result, a cancellation or too many attempts are ended.
 
         Returns:
             The job, or None.

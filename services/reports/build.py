@@ -250,7 +250,7 @@ def write_reports(outcome: RunOutcome, folder: Path) -> RunReport:
     """Write `report.json` and `report.html`, each atomically.
 
     Raises:
-        StorageFull: if the disk is full.
+        OutputError: if a file cannot be written, for example because the disk is full (StorageFull).
     """
     report = build_report(outcome)
     report = report.model_copy(update={"outputs": {**report.outputs, "report": "report.json", "page": "report.html"}})

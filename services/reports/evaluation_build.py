@@ -121,7 +121,7 @@ def write_evaluation(report: EvaluationReport, folder: Path) -> EvaluationReport
     """Write `evaluation.json` and `evaluation.html`, each atomically.
 
     Raises:
-        StorageFull: if the disk is full.
+        OutputError: if a file cannot be written, for example because the disk is full (StorageFull).
     """
     outputs = {**report.outputs, "report": "evaluation.json", "page": "evaluation.html"}
     report = report.model_copy(update={"outputs": outputs})

@@ -80,7 +80,8 @@ def _columns(points: list[tuple]) -> tuple[list[float], list[float | None]]:
 
 def hold_section(report: EvaluationReport) -> str:
     """Return the frame-hold curve: the score of a raw frame displayed late. A live picture is
-    useful if it scores above the curve at its age."""
+    useful if it scores above the curve at its age. Empty if fewer than two ages were scored.
+    """
     copies = [each for each in report.baselines if each.age_frames is not None and each.psnr_tissue_db is not None]
     if len(copies) < 2:
         return ""

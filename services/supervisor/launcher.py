@@ -225,8 +225,8 @@ class ByLauncher:
         *,
         fresh: bool = False,
     ) -> int:
-        """Start a process by a fork of the launcher, or in a new interpreter if the launcher is not available. Return
-        its process id.
+        """Start a process by a fork of the launcher and return its process id. With `fresh`, for a module that is not in
+        `FORKED`, and without a running launcher, it is started in a new interpreter.
         """
         if fresh or module not in FORKED or not await self._is_there(module):
             return await self._direct.start(module, arguments, output, environment)
