@@ -137,7 +137,9 @@ MOST_OFF_PX = 1.0
 OWN_MOTION = 3.0
 """Factor from a point's error across its ray to its assumed error along the ray."""
 PULL_FRAMES = 3
-"""Frames before and after, at the sampled rate, in which a tool's pull is assumed to have one direction."""
+"""Number of frames before a frame, and from it on, at the sampled rate, in which a tool's pull is assumed to have one
+direction.
+"""
 PULL_ERROR = 0.4
 """Relative uncertainty of the depth change caused by a pull."""
 TOO_SHORT = (
