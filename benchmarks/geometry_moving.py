@@ -20,8 +20,8 @@ from run_facts import run_facts
 
 from gsplat_core.evaluation.depth import MOST_DEPTH_PIXELS, flat_depths, pixels_to_compare
 from gsplat_core.experimental.breathing_depth import MovingTissue
-from gsplat_core.io.recordings.synthetic.extras import CLEAR, Extras
 from gsplat_core.io.recordings.synthetic.rendered import RenderSettings, render_recording
+from gsplat_core.io.recordings.synthetic.scene import CLEAR, Extras
 from gsplat_core.scene.depth_origin import BELIEVED
 
 

@@ -37,7 +37,7 @@ from gsplat_core.evaluation.geometry import Geometry
 from gsplat_core.io.bundle import load_bundle
 from gsplat_core.io.recordings import open_recording, synthesize
 from gsplat_core.io.recordings.calibration import POSES_FILE, write_poses
-from gsplat_core.io.recordings.synthetic.extras import Extras
+from gsplat_core.io.recordings.synthetic.scene import Extras
 from gsplat_core.io.recordings.truth import open_truth
 from gsplat_core.poses.odometry import trajectory_of
 from operators.applications.evaluate import SeenFromAnywhere, measure_geometry

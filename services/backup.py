@@ -28,6 +28,7 @@ import sqlalchemy as sa
 
 from gsplat_core.errors import UserError
 from gsplat_core.io.files import PartialFolder, open_regular, read_regular, sync_folder
+from services import product_version
 from services.api.app import AUDIT_FILE, KEYS_FILE
 from services.audit import verify
 from services.audit.files import MOST_LINE_BYTES, parse_line, read_head
@@ -35,7 +36,6 @@ from services.jobs.results import RUNNING
 from services.missing_files import StoredFiles, missing_files
 from services.registry.models import DATABASE_FILE
 from services.settings import ServiceSettings
-from services.version import product_version
 
 MANIFEST = "backup.json"
 DATA = "data"

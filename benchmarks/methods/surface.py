@@ -30,7 +30,7 @@ from gsplat_core.evaluation.depth import DepthShareSums, NormalSums
 from gsplat_core.evaluation.geometry import _is_chosen, _known
 from gsplat_core.io.bundle import load_bundle
 from gsplat_core.io.recordings import open_recording, synthesize
-from gsplat_core.io.recordings.synthetic.extras import Extras
+from gsplat_core.io.recordings.synthetic.scene import Extras
 from gsplat_core.io.recordings.truth import open_truth
 from gsplat_core.rendering.surface import render_surface
 from gsplat_core.scene.frames import Frame

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 from fastapi import APIRouter, FastAPI
 from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
+from services import product_version
 from services.api import audit as audit_routes
 from services.api import display, models, pages, recordings, replays, service, snapshots, streams
 from services.api import keys as key_routes
@@ -27,7 +28,6 @@ from services.audit import AuditLog, AuditUnwritable, Keeping
 from services.auth.keys import KeyStore, changed_outside, first_admin_key, keys_read_again
 from services.auth.roles import Tickets
 from services.settings import ServiceSettings, SettingsInvalid
-from services.version import product_version
 
 if TYPE_CHECKING:
     from services.auth.oidc import OpenIdPersons

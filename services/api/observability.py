@@ -20,8 +20,8 @@ from prometheus_client.platform_collector import PlatformCollector
 from prometheus_client.process_collector import ProcessCollector
 from prometheus_client.registry import Collector
 
+from services import product_version
 from services.settings.sections import LogSettings, masked_address
-from services.version import product_version
 
 REQUEST_ID: ContextVar[str] = ContextVar("request_id", default="")
 _FACTS = "facts"

@@ -170,7 +170,7 @@ def edit(
     json: JsonOption = False,
 ) -> int:
     """Select Gaussians of a model and delete, recolour, rotate, scale or move them, or add those of another model."""
-    from services.cli.edit import Edit, edit_command
+    from services.cli.models import Edit, edit_command
 
     changes = Edit(tuple(select or ()), outside, delete, recolour, rotate, scale, translate, merge)
     return edit_command(model, out, changes, overwrite=overwrite, as_json=json)
@@ -312,7 +312,7 @@ def _say_usage(error: Any) -> int:
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        from services.version import product_version
+        from services import product_version
 
         typer.echo(f"intrasplat {product_version()}")
         raise typer.Exit

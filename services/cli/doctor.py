@@ -12,8 +12,8 @@ from importlib.metadata import PackageNotFoundError, version
 
 import typer
 
+from services import product_version
 from services.cli.exit_codes import BAD_INPUT, OK
-from services.version import product_version
 
 PACKAGES = (
     "torch",

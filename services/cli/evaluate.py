@@ -19,8 +19,7 @@ from operators.applications.static_scene import EVALUATION_FILE, SceneScore, Sce
 from operators.output_folder import OutputFolder
 from services.cli.exit_codes import INTERRUPTED, OK
 from services.cli.options import EvaluateOptions, renderer_options
-from services.cli.progress import ProgressPrinter
-from services.cli.terminal import InterruptRequest, printable
+from services.cli.terminal import InterruptRequest, ProgressPrinter, printable
 from services.reports.evaluation_build import build_evaluation, write_evaluation
 from services.reports.evaluation_rows import decibels, future, geometry_lines, measured
 from services.reports.evaluation_schema import EvaluationReport, load_evaluated

@@ -14,8 +14,8 @@ from gsplat_core.errors import InvalidInput, RecordingInvalid
 from gsplat_core.io.recordings import open_recording, synthesize, validate_recording
 from gsplat_core.io.recordings.calibration import POSES_FILE, write_poses
 from gsplat_core.io.recordings.recording import FileRecording
-from gsplat_core.io.recordings.synthetic.extras import CLEAR, Extras
 from gsplat_core.io.recordings.synthetic.random_scene import draw_scene
+from gsplat_core.io.recordings.synthetic.scene import CLEAR, Extras
 from gsplat_core.poses.focal_length import FocalLength, trajectory_without_calibration, with_focal_length
 from gsplat_core.poses.odometry import Trajectory, trajectory_of
 from gsplat_core.scene.cameras import Camera
@@ -27,8 +27,7 @@ from operators.output_folder import check_file_path, check_folder_path
 from operators.storage import storage_errors
 from services.cli.exit_codes import BAD_INPUT, OK
 from services.cli.options import SynthesizeOptions
-from services.cli.progress import ProgressPrinter
-from services.cli.terminal import InterruptRequest, printable
+from services.cli.terminal import InterruptRequest, ProgressPrinter, printable
 
 
 def validate_command(recording: Path, *, as_json: bool) -> int:

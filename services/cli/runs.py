@@ -31,8 +31,7 @@ from operators.pipeline import Pipeline
 from operators.settings import TrainOptions
 from operators.storage import mebibytes
 from services.cli.exit_codes import INTERRUPTED, OK
-from services.cli.progress import ProgressPrinter
-from services.cli.terminal import InterruptRequest, printable
+from services.cli.terminal import InterruptRequest, ProgressPrinter, printable
 from services.reports.build import require_shown, write_reports
 from services.reports.schema import LiveFacts, RunReport
 

@@ -28,6 +28,7 @@ from operators.sinks.keyframes import KeyframesResult
 from operators.sinks.video import DisplayResult
 from operators.training import TrainingCounts
 from operators.truth import TruthResult
+from services import product_version
 from services.reports.html import write_html
 from services.reports.pictures import hidden_pictures, keyframe_pictures
 from services.reports.schema import (
@@ -51,7 +52,6 @@ from services.reports.schema import (
     TruthFacts,
     machine_facts,
 )
-from services.version import product_version
 
 
 def live_facts(outcome: RunOutcome) -> LiveFacts | None:

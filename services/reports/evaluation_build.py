@@ -22,6 +22,7 @@ from gsplat_core.models.model import Model
 from operators.applications.evaluate import Evaluation, EvaluationSettings
 from operators.applications.evaluated import EvaluatedRun
 from operators.frame_log import MAX_SERIES, LogLine, frames_per_entry, read_frames, series
+from services import product_version
 from services.reports.evaluation_html import write_evaluation_html
 from services.reports.evaluation_schema import (
     BaselineFacts,
@@ -38,7 +39,6 @@ from services.reports.evaluation_schema import (
     SecondEyeFacts,
 )
 from services.reports.schema import ModelFacts, RecordingFacts, machine_facts
-from services.version import product_version
 
 LABELS = {
     PREVIOUS_FRAME: "Previous frame shown instead",

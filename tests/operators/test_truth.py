@@ -7,7 +7,7 @@ import pytest
 
 from gsplat_core.errors import RecordingInvalid
 from gsplat_core.io.recordings import open_recording, synthesize
-from gsplat_core.io.recordings.synthetic.extras import Extras
+from gsplat_core.io.recordings.synthetic.scene import Extras
 from gsplat_core.io.recordings.truth import open_behind, open_truth
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import FrameStatus

@@ -11,7 +11,7 @@ import pytest
 
 from gsplat_core.io.recordings import open_recording, synthesize
 from gsplat_core.io.recordings.calibration import write_poses
-from gsplat_core.io.recordings.synthetic.extras import Extras
+from gsplat_core.io.recordings.synthetic.scene import Extras
 from services.cli.app import run
 from services.reports.evaluation_schema import EvaluationReport
 

@@ -10,8 +10,7 @@ import pytest
 from gsplat_core.evaluation.geometry import Geometry, evaluate_geometry
 from gsplat_core.evaluation.protocols import PictureMaker
 from gsplat_core.io.recordings import open_recording, synthesize
-from gsplat_core.io.recordings.synthetic.extras import Extras
-from gsplat_core.io.recordings.synthetic.scene import SyntheticScene
+from gsplat_core.io.recordings.synthetic.scene import Extras, SyntheticScene
 from gsplat_core.io.recordings.truth import open_truth
 from tests.gsplat_core.evaluation.true_model import true_model
 

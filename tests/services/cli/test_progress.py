@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from operators.applications.progress import Progress
-from services.cli.progress import ProgressPrinter
+from services.cli.terminal import ProgressPrinter
 
 
 def test_plain_lines_have_counts_rates_and_an_estimate(capsys, monkeypatch):
     now = iter([0.0, 4.0, 5.0, 10.0, 13.0, 14.0])
-    monkeypatch.setattr("services.cli.progress.time.monotonic", lambda: next(now))
+    monkeypatch.setattr("services.cli.terminal.time.monotonic", lambda: next(now))
     with ProgressPrinter() as printer:
         printer(Progress("replay", 0, 10))
         printer(Progress("replay", 1, 10))

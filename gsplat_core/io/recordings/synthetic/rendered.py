@@ -29,8 +29,7 @@ from safetensors.numpy import load_file, save
 
 from gsplat_core.io.files import PartialFile
 from gsplat_core.io.recordings.calibration import DEFAULT_FOCAL_FACTOR
-from gsplat_core.io.recordings.synthetic.extras import CLEAR, Extras
-from gsplat_core.io.recordings.synthetic.scene import BASELINE_MM, SyntheticScene
+from gsplat_core.io.recordings.synthetic.scene import BASELINE_MM, CLEAR, Extras, SyntheticScene
 from gsplat_core.io.recordings.synthetic.synthesize import check_arguments, threads_that_fit
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame

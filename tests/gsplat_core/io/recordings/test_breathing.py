@@ -10,9 +10,8 @@ import pytest
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings import synthesize
-from gsplat_core.io.recordings.synthetic.extras import CLEAR, Extras
 from gsplat_core.io.recordings.synthetic.rendered import RenderSettings, render_recording
-from gsplat_core.io.recordings.synthetic.scene import SyntheticScene
+from gsplat_core.io.recordings.synthetic.scene import CLEAR, Extras, SyntheticScene
 from gsplat_core.io.recordings.synthetic.tissue import NO_TUG, PERIOD_S, Breathing
 
 TIMES = np.arange(0, 20 * PERIOD_S, 0.004)

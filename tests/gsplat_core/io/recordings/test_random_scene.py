@@ -12,9 +12,8 @@ import pytest
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings import open_recording, synthesize, validate_recording
-from gsplat_core.io.recordings.synthetic.extras import Extras
 from gsplat_core.io.recordings.synthetic.random_scene import draw_scene
-from gsplat_core.io.recordings.synthetic.scene import SyntheticScene
+from gsplat_core.io.recordings.synthetic.scene import Extras, SyntheticScene
 from gsplat_core.io.recordings.synthetic.sensor import Field, RadialLens
 from gsplat_core.io.recordings.synthetic.synthesize import projected
 

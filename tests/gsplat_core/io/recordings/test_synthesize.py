@@ -10,7 +10,7 @@ import pytest
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings import open_recording, synthesize, validate_recording
-from gsplat_core.io.recordings.synthetic.extras import Extras
+from gsplat_core.io.recordings.synthetic.scene import Extras
 
 
 def _bytes(folder: Path) -> dict[str, bytes]:

@@ -11,10 +11,9 @@ import pytest
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings import open_recording, synthesize, validate_recording
-from gsplat_core.io.recordings.synthetic.extras import Extras
 from gsplat_core.io.recordings.synthetic.light import EXPOSURE_STOPS, Lamp
 from gsplat_core.io.recordings.synthetic.renderer import cast_tissue, pixel_rays
-from gsplat_core.io.recordings.synthetic.scene import SyntheticScene, View
+from gsplat_core.io.recordings.synthetic.scene import Extras, SyntheticScene, View
 from gsplat_core.io.recordings.synthetic.synthesize import motion_to, projected, seen_points
 from gsplat_core.io.recordings.synthetic.tissue import COLON_LENGTH_MM, COLON_RADIUS_MM, NO_TUG, Colon
 from gsplat_core.io.recordings.truth import open_truth
