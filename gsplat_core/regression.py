@@ -117,7 +117,7 @@ def probabilities(phi: Tensor, rate: float) -> tuple[Tensor, Tensor]:
     return -torch.expm1(-rate * off.clamp(min=0)), -torch.expm1(-rate * (-off).clamp(min=0))
 
 
-def births_and_deaths(phi: Tensor, rate: float, random: torch.Generator, *, single: bool = False) -> BirthDeath:
+def births_and_deaths(phi: Tensor, rate: float, random: torch.Generator) -> BirthDeath:
     """Draw the splats that die, and a parent for each.
 
     Synchronises with the device. The draws take place on the CPU, so the same φ gives the same moves on every device.
@@ -126,25 +126,17 @@ def births_and_deaths(phi: Tensor, rate: float, random: torch.Generator, *, sing
         phi: ∂L/∂ln o of each splat, [N].
         rate: see `probabilities`.
         random: generator on the CPU.
-        single: draw each parent at most once. Splats without a parent then survive.
     """
     death, birth = probabilities(phi.detach().cpu().double(), rate)
     marked = torch.nonzero(torch.rand(len(death), generator=random, dtype=death.dtype) < death)[:, 0]
-    possible = int(torch.count_nonzero(birth))
-    if possible == 0:
+    if not birth.any():
         marked = marked[:0]
-    elif single:
-        marked = marked[torch.randperm(len(marked), generator=random)[:possible]].sort().values
     if len(marked) == 0:
         return BirthDeath(marked.to(phi.device), marked.to(phi.device))
     # Inverse transform sampling, because torch.multinomial is limited to 2^24 splats.
-    if single:
-        keys = torch.rand(len(birth), generator=random, dtype=birth.dtype).log() / birth
-        parents = keys.argsort(descending=True, stable=True)[: len(marked)]
-    else:
-        total = birth.cumsum(0)
-        draws = torch.rand(len(marked), generator=random, dtype=birth.dtype) * total[-1]
-        parents = torch.searchsorted(total, draws, right=True).clamp(max=len(birth) - 1)
+    total = birth.cumsum(0)
+    draws = torch.rand(len(marked), generator=random, dtype=birth.dtype) * total[-1]
+    parents = torch.searchsorted(total, draws, right=True).clamp(max=len(birth) - 1)
     return BirthDeath(marked.to(phi.device), parents.to(phi.device))
 
 

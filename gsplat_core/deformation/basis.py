@@ -193,14 +193,7 @@ class BasisField(BumpTensors):
         each = (rates.position, rates.rotation, rates.log_scale, rates.colour, rates.centers, rates.widths)
         self.adam_step_at(self.frame_time(time_s), gradient, each)
 
-    def adam_step_at(
-        self,
-        tau: float | Tensor,
-        gradient: Tensor,
-        rates: Sequence[float] | Tensor,
-        betas: tuple[float, float] = (0.9, 0.999),
-        epsilon: float = 1e-8,
-    ) -> None:
+    def adam_step_at(self, tau: float | Tensor, gradient: Tensor, rates: Sequence[float] | Tensor) -> None:
         """Take the step of `adam_step` at a normalised time.
 
         `tau` and `rates` may be float32 tensors on the field's device, which a CUDA graph reads at every replay.
@@ -209,14 +202,12 @@ class BasisField(BumpTensors):
             tau: time as returned by `self.frame_time`, float or float32 [1].
             gradient: dL/d(deltas) [N, 13], or [N, 16] from the backward pass of `render_frame`.
             rates: the six rates of `BasisLearningRates` in order, floats or float32 [6].
-            betas: Adam's decay rates.
-            epsilon: Adam's epsilon.
         """
         count = gradient.shape[0]
         moments = self._moments_in_use().of_first(count)
         parameters = [p.data for p in self._parameters_of(count)]
         self._ops.basis_field_backward_adam_(
-            gradient, tau, parameters, moments.first, moments.second, moments.steps, rates, betas, epsilon
+            gradient, tau, parameters, moments.first, moments.second, moments.steps, rates
         )
 
     def smooth_in_time(self, amount: float) -> None:

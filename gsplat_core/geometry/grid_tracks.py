@@ -116,22 +116,19 @@ def seen_by(frame: Frame, camera: Camera) -> TexturedPicture:
     return TexturedPicture(texture, np.asarray(cv2.erode(usable, np.ones((3, 3), np.uint8)), np.uint8), small)
 
 
-def follow_grids(
-    pictures: Sequence[TexturedPicture], times_s: NDArray[np.float64], keys: Sequence[int], spacing_px: int = SPACING_PX
-) -> GridTracks:
+def follow_grids(pictures: Sequence[TexturedPicture], times_s: NDArray[np.float64], keys: Sequence[int]) -> GridTracks:
     """Track the grids of the key pictures through all pictures.
 
     Args:
         pictures: T pictures of one size.
         times_s: float64 [T], times in seconds.
         keys: indices of the key pictures.
-        spacing_px: grid spacing in pixels.
 
     Returns:
         Tracks of the points observed in at least `LEAST_SEEN` of the pictures.
     """
     height, width = pictures[0].texture.shape
-    row, column = np.mgrid[spacing_px // 2 : height : spacing_px, spacing_px // 2 : width : spacing_px]
+    row, column = np.mgrid[SPACING_PX // 2 : height : SPACING_PX, SPACING_PX // 2 : width : SPACING_PX]
     start = np.stack([column.ravel(), row.ravel()], 1).astype(np.float32)
     found = [_from_key(pictures, key, start) for key in keys]
     pixels, seen = (np.concatenate(parts, axis=1) for parts in zip(*found, strict=True))

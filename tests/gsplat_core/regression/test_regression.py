@@ -65,16 +65,13 @@ def test_probabilities_follow_the_distance_from_the_mean():
     assert not any(p.any() for p in probabilities(torch.ones(4), 0.5))
 
 
-@pytest.mark.parametrize("single", [False, True])
-def test_births_replace_deaths(single):
+def test_births_replace_deaths():
     phi = torch.randn(2000, generator=torch.Generator().manual_seed(1))
-    moves = births_and_deaths(phi, 0.5, torch.Generator().manual_seed(2), single=single)
+    moves = births_and_deaths(phi, 0.5, torch.Generator().manual_seed(2))
     assert 100 < len(moves.dying) == len(moves.parents)
     assert (phi[moves.dying] > phi.mean()).all()
     assert (phi[moves.parents] < phi.mean()).all()
     assert len(moves.dying.unique()) == len(moves.dying)
-    if single:
-        assert len(moves.parents.unique()) == len(moves.parents)
     assert len(births_and_deaths(torch.ones(5), 0.5, torch.Generator()).dying) == 0
 
 
