@@ -29,8 +29,8 @@ from operators.sinks.video import DisplayResult
 from operators.training import TrainingCounts
 from operators.truth import TruthResult
 from services import product_version
+from services.reports.figures import hidden_pictures, keyframe_pictures
 from services.reports.html import write_html
-from services.reports.pictures import hidden_pictures, keyframe_pictures
 from services.reports.schema import (
     BaselineQuality,
     BinEntry,

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from gsplat_core.evaluation.live import MOST_BEHIND
 from operators.storage import write_whole
-from services.reports.charts import NARROW, Chart, Line
 from services.reports.evaluation_rows import at_age, decibels, future, geometry_section, measured
 from services.reports.evaluation_schema import BaselineFacts, EvaluationReport, ScoreFacts
+from services.reports.figures import NARROW, Chart, Line
 from services.reports.html import facts_table, notes_section, page, tile
 
 _LINES = {

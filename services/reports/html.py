@@ -13,8 +13,7 @@ from types import MappingProxyType
 from urllib.parse import quote
 
 from operators.storage import write_whole
-from services.reports.charts import NARROW, Chart, Line
-from services.reports.pictures import HiddenPictures, KeyframePictures
+from services.reports.figures import NARROW, Chart, HiddenPictures, KeyframePictures, Line
 from services.reports.schema import DepthErrors, FrameEntry, LiveFacts, RunFacts, RunReport, TruthFacts
 
 

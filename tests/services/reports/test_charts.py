@@ -8,7 +8,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from services.reports.charts import NARROW, WIDE, Chart, Line, _axis, _log_axis, _number
+from services.reports.figures import NARROW, WIDE, Chart, Line, _axis, _log_axis, _number
 
 
 def chart(*lines, **options):

@@ -13,8 +13,8 @@ import torch
 from gsplat_core.models.model import Model
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
+from services.reports.figures import NOTHING_THERE, hidden_pictures
 from services.reports.html import render_html
-from services.reports.pictures import NOTHING_THERE, hidden_pictures
 from services.reports.schema import DepthErrors, TruthFacts
 
 TRUTH = TruthFacts(

@@ -7,8 +7,8 @@ from html.parser import HTMLParser
 
 import pytest
 
+from services.reports.figures import keyframe_pictures
 from services.reports.html import render_html, write_html
-from services.reports.pictures import keyframe_pictures
 
 
 class Page(HTMLParser):

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from services.reports.pictures import _outlined, data_uri
+from services.reports.figures import _outlined, data_uri
 
 
 def bytes_of(uri: str) -> bytes:

@@ -12,8 +12,8 @@ from operators.messages import PictureState, ShownPicture
 from operators.metrics import NextFrameResult
 from services.cli.runs import LiveStatus, _summary, print_report
 from services.reports.build import _next_frame
+from services.reports.figures import keyframe_pictures
 from services.reports.html import render_html
-from services.reports.pictures import keyframe_pictures
 from services.reports.schema import LiveFacts, NextFrameQuality, RunReport
 from services.supervisor.screen import Screen
 
