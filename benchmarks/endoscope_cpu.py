@@ -17,7 +17,7 @@ import numpy as np
 
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.scene.frames import Frame
-from operators.checks import PICTURE_STAGES, TISSUE_STAGES
+from operators.checks import PICTURE_STAGES, MaskAndDepthStage
 
 
 def main() -> int:
@@ -34,7 +34,7 @@ def main() -> int:
             Frame(k, k * 33_333_333, cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA))
             for k, frame in enumerate(islice(open_recording(path), arguments.frames))
         ]
-        for name, make in {**PICTURE_STAGES, **TISSUE_STAGES}.items():
+        for name, make in {**PICTURE_STAGES, "mask and depth": MaskAndDepthStage}.items():
             stage, spent_ms = make(), []
             for index, frame in enumerate(frames):
                 before = time.process_time()

@@ -1,6 +1,6 @@
 """Checks of endoscopic video. Each stage annotates frames with one kind of fault; operators run the stages in sequence.
 
-`PICTURE_STAGES` and `TISSUE_STAGES` list the stages in order of execution. A frame is ordinary if its picture is as
+`PICTURE_STAGES` lists the stages that need only the picture, in order of execution. A frame is ordinary if its picture is as
 expected from the previous ones. To save time, each ordinary frame is checked by some of the stages in rotation. An
 unusual frame is checked by every stage. The image analysis is in `gsplat_core.endoscope`.
 """
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.endoscope.cuts import CutDetector
-from gsplat_core.endoscope.exposure import UNCHANGED, ExposureEstimator
 from gsplat_core.endoscope.field_of_view import FieldOfView
 from gsplat_core.endoscope.highlights import HighlightFinder
 from gsplat_core.endoscope.interlacing import Deinterlacer, without_combs
@@ -149,52 +148,6 @@ class OrdinaryFrames:
     ordinary: int
 
 
-class OrdinaryStream:
-    """State shared by `PictureStagesOp` and `TissueStagesOp`: whether the current frame is ordinary, and the stages
-    that are due for it.
-
-    A frame is ordinary if its picture is as expected from the previous ones. It is checked by the due stages only, and
-    any other frame by all stages.
-    """
-
-    def __init__(self) -> None:
-        self.pictures = OrdinaryPictures()
-        self.frame_is_ordinary = False
-        self._members = 0
-        self.reset()
-
-    def join(self, stages: int) -> range:
-        """Add stages to the rotation, in which each stage checks only some of the ordinary frames.
-
-        Args:
-            stages: number of stages to add.
-
-        Returns:
-            Number of each added stage, the argument of `looks`.
-        """
-        first, self._members = self._members, self._members + stages
-        return range(first, self._members)
-
-    def reset(self) -> None:
-        """Clear the state, at the start of a stream."""
-        self.pictures.reset()
-        self.frame_is_ordinary = False
-        self._turns = Turns(self._members, LOOK_EVERY_S)
-        self._due: frozenset[int] = frozenset()
-
-    def begin(self, ordinary: bool, pts_ns: int) -> None:
-        """Select the stages for the next frame: those due in the rotation if it is `ordinary`, otherwise all."""
-        self.frame_is_ordinary = ordinary
-        if ordinary:
-            self._due = self._turns.due(pts_ns)
-        else:
-            self._turns.all_looked(pts_ns)
-
-    def looks(self, member: int) -> bool:
-        """Return True if the stage with this member number runs on the current frame."""
-        return not self.frame_is_ordinary or member in self._due
-
-
 class PictureStagesOp(StageOp):
     """Runs its first stage on each frame. The other stages run on unusual frames, and in rotation on ordinary ones.
 
@@ -209,34 +162,38 @@ class PictureStagesOp(StageOp):
 
     Params:
         stages: stages that use no field but the picture; the first compares each picture with the previous one.
-        stream: state shared with the following `TissueStagesOp`.
     """
 
-    def __init__(
-        self, fragment: Any, *args: Any, stages: Sequence[Stage], stream: OrdinaryStream, **kwargs: Any
-    ) -> None:
-        self.stream = stream
-        self._members = stream.join(len(stages) - 1)
+    def __init__(self, fragment: Any, *args: Any, stages: Sequence[Stage], **kwargs: Any) -> None:
+        super().__init__(fragment, *args, stages=stages, **kwargs)
+        self.pictures = OrdinaryPictures()
+        self._reset()
+
+    def _reset(self) -> None:
+        self.pictures.reset()
+        self._turns = Turns(len(self.stages) - 1, LOOK_EVERY_S)
         self._settled = False
         """True if the previous frame allows the next to be ordinary: it was unchanged and did not begin a scene."""
         self._counts = [0, 0]
-        super().__init__(fragment, *args, stages=stages, **kwargs)
 
     def start(self) -> None:
         super().start()
-        self.stream.reset()
-        self._settled, self._counts = False, [0, 0]
+        self._reset()
 
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
         came: Frame = op_input.receive("frame")
-        ordinary = self.stream.pictures.is_ordinary(came.image, came.pts_ns) and self._settled
+        ordinary = self.pictures.is_ordinary(came.image, came.pts_ns) and self._settled
         frame = self.stages[0].apply(came)
         ordinary = ordinary and _settled(frame, came)
-        self.stream.begin(ordinary, frame.pts_ns)
         self._counts[ordinary] += 1
-        for member, stage in zip(self._members, self.stages[1:], strict=True):
-            frame = stage.apply(frame) if self.stream.looks(member) else stage.carried(frame)
-            self.stream.frame_is_ordinary &= _settled(frame, came)
+        due: Collection[int] = ()
+        if ordinary:
+            due = self._turns.due(frame.pts_ns)
+        else:
+            self._turns.all_looked(frame.pts_ns)
+        for number, stage in enumerate(self.stages[1:]):
+            frame = stage.carried(frame) if ordinary and number not in due else stage.apply(frame)
+            ordinary = ordinary and _settled(frame, came)
         self._settled = _settled(frame, came)
         op_output.emit(frame, "frame")
 
@@ -250,44 +207,6 @@ def _settled(frame: Frame, came: Frame) -> bool:
     """Return True if the stages changed only the masks, and did not withhold the frame or begin a scene."""
     unchanged = frame.image is came.image and frame.pts_ns == came.pts_ns
     return unchanged and frame.new_scene is None and frame.unusable is None
-
-
-class TissueStagesOp(StageOp):
-    """Runs some stages on each frame. The others run on unusual frames, and in rotation on ordinary ones.
-
-    Inputs:
-        frame: `Frame`.
-
-    Outputs:
-        frame: `Frame` with more fields.
-
-    Params:
-        always: stages that run on every frame.
-        stages: stages that run on every unusual or withheld frame, and in rotation on ordinary frames.
-        stream: state shared with the preceding `PictureStagesOp`.
-    """
-
-    def __init__(
-        self,
-        fragment: Any,
-        *args: Any,
-        always: Sequence[Stage],
-        stages: Sequence[Stage],
-        stream: OrdinaryStream,
-        **kwargs: Any,
-    ) -> None:
-        self.stream, self._always, self._seldom = stream, tuple(always), tuple(stages)
-        self._members = stream.join(len(self._seldom))
-        super().__init__(fragment, *args, stages=(*always, *stages), **kwargs)
-
-    def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
-        frame: Frame = op_input.receive("frame")
-        for stage in self._always:
-            frame = stage.apply(frame)
-        for member, stage in zip(self._members, self._seldom, strict=True):
-            looks = self.stream.looks(member) or frame.withheld is not None
-            frame = stage.apply(frame) if looks else stage.carried(frame)
-        op_output.emit(frame, "frame")
 
 
 @dataclass(frozen=True)
@@ -449,38 +368,6 @@ class HighlightStage(Stage):
 
 
 @dataclass(frozen=True)
-class ExposureCounts(StageCounts):
-    """Number of frames whose exposure differs from the start of their scene, and of frames during an exposure
-    change."""
-
-
-class ExposureStage(Stage):
-    """Sets `Frame.exposure` relative to the start of the scene.
-
-    Withheld and damaged frames keep the previous exposure. The stage must run after the tool mask,
-    the loss masks and the cuts.
-    """
-
-    counts_type = ExposureCounts
-
-    def reset(self) -> None:
-        self._estimator = ExposureEstimator()
-
-    def annotate(self, frame: Frame) -> Frame:
-        if frame.new_scene is not None:
-            self._estimator.start_scene()
-        if frame.unusable is None:
-            self._estimator.observe(frame.image, frame.tissue, frame.pts_ns)
-            self.found["changing"] += self._estimator.following
-        self.found["other than the scene's"] += self._estimator.gains != UNCHANGED
-        return self.carried(frame)
-
-    def carried(self, frame: Frame) -> Frame:
-        gains = self._estimator.gains
-        return frame if gains == UNCHANGED else frame.with_fields(exposure=gains)
-
-
-@dataclass(frozen=True)
 class SharpnessCounts(StageCounts):
     """Number of frames withheld for blur and for smoke."""
 
@@ -567,11 +454,6 @@ PICTURE_STAGES: dict[str, Callable[[], Stage]] = {
     "sharpness": SharpnessStage,
 }
 """Stages that need only the picture and run before the tool mask."""
-TISSUE_STAGES: dict[str, Callable[[], Stage]] = {
-    "mask and depth": MaskAndDepthStage,
-    "exposure": ExposureStage,
-}
-"""Stages that need the tool mask."""
 
 
 def new_stages(stages: dict[str, Callable[[], Stage]], without: Sequence[str] = ()) -> list[Stage]:

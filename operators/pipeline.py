@@ -28,12 +28,10 @@ from gsplat_core.training.reconstructor import Reconstructor
 from operators.applications.device import scheduler_for
 from operators.checks import (
     PICTURE_STAGES,
-    TISSUE_STAGES,
-    OrdinaryStream,
+    MaskAndDepthStage,
     PictureStagesOp,
     SceneNumberStage,
     StageOp,
-    TissueStagesOp,
     new_stages,
 )
 from operators.choices import SINKS, Policy
@@ -96,13 +94,12 @@ def analysis_operator(
         device: device of the built-in tool network.
     """
     others = [name for name in PICTURE_STAGES if name != SIDE_STAGE]
-    stream = OrdinaryStream()
     picture_stages = new_stages(PICTURE_STAGES, without=[SIDE_STAGE])
     return SideBySideOp(
         fragment,
         name="analysis",
         gate=[OutOfBodyGateOp(fragment, name="out_of_body", policy=out_of_body)],
-        first=[PictureStagesOp(fragment, name="picture", stages=picture_stages, stream=stream)],
+        first=[PictureStagesOp(fragment, name="picture", stages=picture_stages)],
         beside=[
             [
                 new_tool_mask(fragment, tool_mask, device=device),
@@ -112,13 +109,7 @@ def analysis_operator(
         then=[
             *behind_gate,
             *positions,
-            TissueStagesOp(
-                fragment,
-                name="tissue",
-                always=[*new_stages(TISSUE_STAGES, without=["exposure"]), SceneNumberStage()],
-                stages=new_stages(TISSUE_STAGES, without=[name for name in TISSUE_STAGES if name != "exposure"]),
-                stream=stream,
-            ),
+            StageOp(fragment, name="tissue", stages=[MaskAndDepthStage(), SceneNumberStage()]),
             *behind,
         ],
     )

@@ -117,15 +117,12 @@ class Rasterizer:
             return without_surround(_displayed(self._render(scene, ("image",))[0]).numpy(), scene.frame)
 
     def _render(self, scene: DeformedScene, outputs: Iterable[str]) -> tuple[torch.Tensor, Mapping[str, torch.Tensor]]:
-        """Render a scene. Return the image scaled by the frame's exposure, and the outputs as rendered."""
+        """Render a scene. Return the image and all outputs."""
         renderer = self._renderer_for(scene)
         reads_snapshots = RENDERERS[self.renderer].capabilities.reads_snapshots
         renderer.prepare(scene.model if reads_snapshots else scene.model.as_model())
         found = renderer.render(scene.camera, scene.time_s, outputs).outputs()
-        image = found["image"]
-        if scene.frame.exposure == (1.0, 1.0, 1.0):
-            return image, found
-        return image * image.new_tensor(scene.frame.exposure), found
+        return found["image"], found
 
     def _renderer_for(self, scene: DeformedScene) -> Renderer:
         camera = scene.camera
@@ -209,11 +206,7 @@ class RasterizeOp(Operator):
         self._drawn += 1
         if before is None or self._drawn % self.predict_every or not _is_predictable(before, scene):
             return Prediction(scene.frame, None)
-        # Exposure is estimated from the frame's own picture, which a prediction must not use.
-        frame = scene.frame.with_fields(exposure=before.frame.exposure)
-        return Prediction(
-            scene.frame, rasterizer.picture(replace(scene, frame=frame, model=before.model, reconstruction=None))
-        )
+        return Prediction(scene.frame, rasterizer.picture(replace(scene, model=before.model, reconstruction=None)))
 
 
 def _is_predictable(before: DeformedScene, scene: DeformedScene) -> bool:

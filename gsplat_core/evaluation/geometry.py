@@ -301,7 +301,7 @@ def evaluate_geometry(
                 flow.begin(frame, own(frame), picture.depth, _tissue(frame))
             views.add(frame, own(frame), picture.depth)
         if parts is not None and _is_chosen(frame, frame_count, PART_FRAMES):
-            parts.add(frame, _picture_from(model, own(frame), frame))
+            parts.add(frame, _picture_from(model, own(frame)))
     errors = depth.errors
     scale = 1.0 if errors is None else errors.scale
     scaled = views
@@ -343,14 +343,13 @@ def _trajectory(ways: list[tuple[Pose, Pose]]) -> TrajectoryErrors | None:
     return evaluate_trajectory(np.stack([found for found, _ in ways]), np.stack([true for _, true in ways]))
 
 
-def _picture_from(model: Model, camera: Camera, frame: Frame) -> Callable[[Gaussians], NDArray[np.float32]]:
-    """Return a function that renders Gaussians from a camera with a frame's exposure."""
+def _picture_from(model: Model, camera: Camera) -> Callable[[Gaussians], NDArray[np.float32]]:
+    """Return a function that renders Gaussians from a camera."""
 
     def shown(gaussians: Gaussians) -> NDArray[np.float32]:
         with torch.inference_mode():
             image = picture_of(model, gaussians, camera, depth=False).image
-            image = (image * image.new_tensor(frame.exposure)).clamp(0, 1)
-        return np.asarray(image.cpu().numpy())
+        return np.asarray(image.clamp(0, 1).cpu().numpy())
 
     return shown
 

@@ -1,8 +1,7 @@
 """Offline protocols that render a model for the frames of a recording and score the pictures.
 
 * `evaluate_heldout`: frames excluded from training, rendered from a finished model
-* `evaluate_causal`: each frame is predicted before it is trained on, from its time and pose and the previous frame's
-  exposure
+* `evaluate_causal`: each frame is predicted before it is trained on, from its time and pose
 * `evaluate_retention`: earlier frames and revisited places, rendered from the final model
 """
 
@@ -46,7 +45,7 @@ class Picture:
 
 
 class PictureMaker:
-    """Renderer of published models at a frame's time, pose and exposure; reuses one renderer."""
+    """Renderer of published models at a frame's time and pose; reuses one renderer."""
 
     def __init__(
         self, camera: Camera, device: torch.device | str = "cpu", renderer: str = "alpha", *, ray_depth: bool = False
@@ -72,7 +71,7 @@ class PictureMaker:
 
         Args:
             model: published model; the frame's time is clamped to its window.
-            frame: frame that determines time, pose and exposure.
+            frame: frame that determines time and pose.
             camera: replaces the frame's camera; must have the same size.
         """
         if camera is None:
@@ -84,10 +83,7 @@ class PictureMaker:
                 self._prepared = model if isinstance(model, Model) else None
             found = self._renderer.render(camera, frame.time_s, self._outputs).outputs()
             output, along_rays = standard_outputs(found), found.get("ray_depth")
-            picture = output.image
-            if frame.exposure != (1.0, 1.0, 1.0):
-                picture = picture * picture.new_tensor(frame.exposure)
-            picture = picture.clamp(0, 1)
+            picture = output.image.clamp(0, 1)
             rounded = (picture * 255).round().to(torch.uint8)
             return Picture(
                 image=np.array(rounded.cpu().numpy()),
@@ -180,12 +176,12 @@ def published(learner: Learner, frame: Frame) -> Model | Snapshot:
     return learner.publish()
 
 
-def _hidden(frame: Frame, exposure: tuple[float, float, float]) -> Frame:
-    """Return a copy of the frame that contains only number, time, pose and the given exposure, with a black picture.
+def _hidden(frame: Frame) -> Frame:
+    """Return a copy of the frame that contains only number, time and pose, with a black picture.
 
     Prevents the image from influencing a prediction.
     """
-    return Frame(frame.seq, frame.pts_ns, np.zeros_like(frame.image), pose=frame.pose, exposure=exposure)
+    return Frame(frame.seq, frame.pts_ns, np.zeros_like(frame.image), pose=frame.pose)
 
 
 def evaluate_causal(
@@ -213,7 +209,6 @@ def evaluate_causal(
     """
     sums = ScoreSums()
     started = False
-    exposure = (1.0, 1.0, 1.0)
     for frame in frames:
         reason = why_left_out(frame)
         trains = reason in (None, "no tissue")
@@ -221,15 +216,14 @@ def evaluate_causal(
             sums.leave_out(reason if reason is not None and not trains else "before the first prediction")
             if trains:
                 learner.observe(frame)
-                started, exposure = True, frame.exposure
+                started = True
             continue
         if reason is None:
-            unseen = _hidden(frame, exposure)
+            unseen = _hidden(frame)
             _score(frame, picture_of(predict(learner, unseen), unseen), sums, record)
         else:
             sums.leave_out(reason)
         learner.observe(frame, train=trains)
-        exposure = frame.exposure
     return sums.score
 
 

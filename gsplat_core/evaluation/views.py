@@ -141,7 +141,7 @@ def moved_picture(left_camera: Camera, image: NDArray[np.uint8], camera: Camera,
 
 Pose = NDArray[np.float64]
 Shown = Callable[[Camera, Frame], Picture]
-"""Callback that renders a model at a frame's time and exposure from a camera in model space."""
+"""Callback that renders a model at a frame's time from a camera in model space."""
 
 
 class ViewSums:

@@ -149,8 +149,6 @@ class FrameFields(Record):
     depth_error: NotNegative | None = None
     """Relative standard error of the depth; None if unknown, or in recordings of earlier versions."""
     arrived_ns: Nanoseconds | None = None
-    exposure: tuple[Positive, Positive, Positive] | None = None
-    """Gain of red, green and blue; None for 1 each."""
     withheld: Text | None = None
     new_scene: Text | None = None
 
@@ -197,7 +195,6 @@ def fields_of(frame: Frame) -> dict[str, Any]:
         "depth_origin": None if frame.depth_origin is None else frame.depth_origin.name,
         "depth_error": frame.depth_error,
         "arrived_ns": frame.arrived_ns,
-        "exposure": None if frame.exposure == (1.0, 1.0, 1.0) else tuple(map(float, frame.exposure)),
         "withheld": short(frame.withheld),
         "new_scene": short(frame.new_scene),
     }
@@ -228,7 +225,6 @@ def frame_from(seq: int, pts_ns: int, fields: FrameFields, arrays: Mapping[str, 
         "depth_origin": None if fields.depth_origin is None else DEPTH_ORIGINS[fields.depth_origin],
         "depth_error": fields.depth_error,
         "arrived_ns": fields.arrived_ns,
-        "exposure": fields.exposure or (1.0, 1.0, 1.0),
         "withheld": fields.withheld,
         "new_scene": fields.new_scene,
         **{name: arrays[name] for name in ARRAYS if name in arrays},

@@ -75,8 +75,6 @@ class Frame:
     """
     labels: NDArray[np.uint8] | None = None
     """Class of each pixel uint8 [H, W] for the loss `semantics`; 255 = unknown. None for a frame without labels."""
-    exposure: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """Gain of red, green and blue relative to the start of the scene."""
     withheld: str | None = None
     """Reason for withholding the frame from training and scores ("blur", "out of body"); None for a usable frame. A live
     model is trained on some of them all the same (`is_followed`)."""
@@ -138,8 +136,6 @@ class Frame:
             raise InvalidInput(f"frame {self.seq}: pose must be [4, 4] world-to-camera, got {list(self.pose.shape)}")
         if self.depth_error is not None and not (math.isfinite(self.depth_error) and self.depth_error >= 0):
             raise InvalidInput(f"frame {self.seq}: depth_error is {self.depth_error}; it must be at least 0")
-        if not all(math.isfinite(gain) and gain > 0 for gain in self.exposure):
-            raise InvalidInput(f"frame {self.seq}: exposure must be three positive numbers, got {self.exposure}")
 
     @property
     def time_s(self) -> float:

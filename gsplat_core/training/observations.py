@@ -75,7 +75,7 @@ class Observation:
         """Create an observation of a frame.
 
         Args:
-            frame: frame; its own pose overrides the camera's, and its exposure is removed.
+            frame: frame; its own pose overrides the camera's.
             camera: camera of the frame's size.
             device: target device; the copy is queued on its current stream.
 
@@ -94,7 +94,7 @@ class Observation:
             seq=frame.seq,
             time_s=frame.time_s,
             camera=camera if frame.pose is None else camera.with_pose(frame.pose),
-            image=tensor_of(scene_colours(frame.image, frame.exposure), device),
+            image=tensor_of(frame.image, device),
             mask=tensor_of(mask.astype(np.uint8, copy=False), device),
             depth=learned_depth(frame, device),
             depth_error=error_of_depth(frame),
@@ -117,13 +117,6 @@ class RightEye:
     def to_rehearse(self) -> RightEye:
         """Return the eye as it is trained on again later: without the pixels that its rehearsal mask excludes."""
         return RightEye(lambda: self.observation.to_rehearse())
-
-
-def scene_colours(image: NDArray[np.uint8], exposure: tuple[float, float, float]) -> NDArray[np.uint8]:
-    """Remove the exposure from a picture."""
-    if exposure == (1.0, 1.0, 1.0):
-        return image
-    return np.rint(np.clip(image / np.array(exposure, np.float32), 0, 255)).astype(np.uint8)
 
 
 def error_of_depth(frame: Frame) -> float:

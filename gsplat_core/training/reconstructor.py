@@ -352,7 +352,7 @@ class Reconstructor:
         return ObserveReport(seen[-1].seq, steps, HostCopy(loss), self.gaussians)
 
     def picture(self, frame: Frame) -> NDArray[np.float32]:
-        """Return the scene at the time, pose and exposure of a frame, float32 [H, W, 3] in 0..1. Synchronises.
+        """Return the scene at the time and pose of a frame, float32 [H, W, 3] in 0..1. Synchronises.
 
         Raises:
             InvalidInput: before the first frame.
@@ -363,8 +363,7 @@ class Reconstructor:
         camera = self.camera if frame.pose is None else self.camera.with_pose(frame.pose)
         with torch.no_grad():
             shown = self._step.picture(self._step.at(frame.time_s), camera, depth=False).image
-        image = np.asarray(HostCopy(shown).numpy(), np.float32) * np.array(frame.exposure, np.float32)
-        return np.asarray(image.clip(0, 1), np.float32)
+        return np.asarray(HostCopy(shown).numpy().clip(0, 1), np.float32)
 
     def snapshot(self) -> Model:
         """Return an immutable copy of the current model with the next version number.

@@ -26,7 +26,7 @@ from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.growth.initialisation import unprojected
 from gsplat_core.training.growth.unseen import pixels_of
-from gsplat_core.training.observations import Observation, RightEye, scene_colours
+from gsplat_core.training.observations import Observation, RightEye
 from gsplat_core.transfers import tensor_of
 
 LOOKED_AT_PX = 80
@@ -236,7 +236,7 @@ class BothEyes:
         return self._preparer.submit(self._prepare, frame, camera, right, colours).result
 
     def _prepare(self, frame: Frame, camera: Camera, right: Camera, colours: EyeColours) -> PreparedPicture:
-        image = scene_colours(colours.corrected(frame), frame.exposure)
+        image = colours.corrected(frame)
         mask = right_tissue(frame, camera, right, (colours.shift or 0.0) * frame.width_px)
         if frame.loss_mask is not None:
             mask = mask & frame.loss_mask

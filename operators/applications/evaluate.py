@@ -144,7 +144,7 @@ class SeenFromAnywhere:
         self._makers: dict[Camera, PictureMaker] = {}
 
     def __call__(self, model: Model, camera: Camera, frame: Frame) -> Picture:
-        """Render the model from `camera` at the frame's timestamp and exposure."""
+        """Render the model from `camera` at the frame's timestamp."""
         lens = camera.with_pose(np.eye(4))
         maker = self._makers.get(lens)
         if maker is None:

@@ -130,16 +130,14 @@ def test_a_frame_is_predicted_by_the_model_that_has_not_seen_it_at_the_frames_ow
     assert (third.image != outputs[2][0].image).any()
 
 
-def test_a_prediction_is_taken_from_the_pose_of_its_frame_at_the_exposure_of_the_frame_before(
-    frame, model, camera, compute
-):
+def test_a_prediction_is_taken_from_the_pose_of_its_frame(frame, model, camera, compute):
     pose = np.eye(4)
     pose[0, 3] = 8.0
     shown = [model(1), model(2)]
-    still = DeformedScene(frame(0, exposure=(0.5, 0.5, 0.5)), shown[0], camera, True)
-    moved = DeformedScene(frame(1, pose=pose, exposure=(1.5, 1.5, 1.5)), shown[1], camera.with_pose(pose), True)
+    still = DeformedScene(frame(0), shown[0], camera, True)
+    moved = DeformedScene(frame(1, pose=pose), shown[1], camera.with_pose(pose), True)
     (_, (_, predicted)) = _run(RasterizeOp(None, predict_every=1), compute, [still, moved])
-    unseen = DeformedScene(frame(1, pose=pose, exposure=(0.5, 0.5, 0.5)), shown[0], camera.with_pose(pose), True)
+    unseen = DeformedScene(frame(1, pose=pose), shown[0], camera.with_pose(pose), True)
     np.testing.assert_array_equal(predicted.image, compute(RasterizeOp(None), scene=unseen)[0].image)
 
 

@@ -65,18 +65,6 @@ def test_a_frame_is_learned_from_only_after_it_was_predicted_and_nothing_of_it_i
     assert order == [("learn", 0), ("predict", 1), ("learn", 1), ("predict", 2), ("learn", 2)]
 
 
-def test_the_exposure_of_the_frame_before_stands_for_the_unknown_one(frame, picture):
-    seen = []
-
-    def picture_of(level, shown):
-        seen.append(shown.exposure)
-        return picture(level)
-
-    gains = [(1.0, 1.0, 1.0), (1.5, 1.0, 1.0), (2.0, 1.0, 1.0)]
-    evaluate_causal([frame(k, exposure=gain) for k, gain in enumerate(gains)], Holding(), picture_of)
-    assert seen == gains[:2]
-
-
 def test_damaged_and_withheld_frames_are_neither_scored_nor_learned_from(frame, picture, decibels):
     learner = Holding()
     nothing = np.zeros((16, 20), np.uint8)

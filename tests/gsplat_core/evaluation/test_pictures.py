@@ -1,4 +1,4 @@
-"""Scores are of the model's picture at the frame's time, pose and exposure."""
+"""Scores are of the model's picture at the frame's time and pose."""
 
 from __future__ import annotations
 
@@ -38,24 +38,20 @@ def test_the_picture_is_the_models_rounded_to_bytes():
     assert picture.model_version == 3
 
 
-def test_the_frames_pose_and_exposure_are_used():
+def test_the_frames_pose_is_used():
     make = PictureMaker(CAMERA)
     plain = make(model(), waves())
     pose = np.eye(4)
     pose[0, 3] = 4.0
     moved = make(model(), waves(pose=pose))
     assert np.abs(moved.unrounded - plain.unrounded).max() > 0.05
-    dim = make(model(), waves(exposure=(0.5, 1.0, 0.25)))
-    np.testing.assert_allclose(dim.unrounded, plain.unrounded * np.float32([0.5, 1.0, 0.25]), atol=1e-6)
-    bright = make(model(), waves(exposure=(100.0, 1.0, 1.0)))
-    assert bright.unrounded.max() <= 1
 
 
 def test_pictures_stay_as_they_are_when_the_next_one_is_made():
     make = PictureMaker(CAMERA)
     first = make(model(), waves())
     kept = first.image.copy(), first.unrounded.copy(), first.depth.copy()
-    make(model(4), waves(exposure=(0.1, 0.1, 0.1)))
+    make(model(4), waves())
     for before, now in zip(kept, (first.image, first.unrounded, first.depth), strict=True):
         np.testing.assert_array_equal(before, now)
 

@@ -121,7 +121,7 @@ def test_pieces_that_are_no_frame_are_refused(pieces, said):
     "fields",
     [
         '{"damage":3}', '{"arrived_ns":1.5}', '{"arrived_ns":true}', '{"arrived_ns":4611686018427387905}', '{"status":"asleep"}',
-        '{"depth_origin":"guess"}', '{"right_camera":{"fx":1}}', '{"right_camera":4}', '{"exposure":[1,0,1]}', '{"exposure":[1,1]}',
+        '{"depth_origin":"guess"}', '{"right_camera":{"fx":1}}', '{"right_camera":4}', 
         '{"withheld":"' + 1001 * "x" + '"}', '{"new_scene":[]}',
     ],
 )  # fmt: skip

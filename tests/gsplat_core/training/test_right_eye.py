@@ -71,13 +71,6 @@ def test_cameras_of_two_models_are_refused():
         BothEyes("both").observation(stereo_frame(right_camera=dataclasses.replace(RIGHT, model="fisheye")), LEFT)
 
 
-def test_exposure_is_taken_out_of_both_pictures():
-    frame = stereo_frame(exposure=(0.5, 0.5, 0.5))
-    left = BothEyes("both").observation(frame, LEFT)
-    for eye, picture in ((left, frame.image), (left.right, frame.right_image)):
-        assert np.abs(eye.image.numpy().astype(int) - (2 * picture.astype(int)).clip(0, 255)).max() <= 1
-
-
 def test_what_is_left_out_of_rehearsal_is_looked_for_in_the_right_picture_itself():
     right_image = np.full((HEIGHT, WIDTH, 3), 90, np.uint8)
     right_image[20:24, 30:34] = 255

@@ -66,7 +66,7 @@ def as_it_is(frame: Frame) -> Frame:
 
 
 def eventful(frame: Frame) -> Frame:
-    """A cut, a blurred frame, another exposure, a highlight, and at the end another size."""
+    """A cut, a blurred frame, a highlight, and at the end another size."""
     if frame.seq == 4:
         return frame.with_fields(withheld="blur")
     if frame.seq == 6:
@@ -77,7 +77,7 @@ def eventful(frame: Frame) -> Frame:
         return frame.with_fields(image=image, mask=mask, depth=None, right_image=None, right_camera=None)
     loss_mask = np.ones(frame.image.shape[:2], np.uint8)
     loss_mask[:5, frame.seq] = 0
-    return frame.with_fields(exposure=(1.0 + frame.seq / 50, 0.9, 1.0), loss_mask=loss_mask)
+    return frame.with_fields(loss_mask=loss_mask)
 
 
 def of_two_eyes(frame: Frame) -> Frame:

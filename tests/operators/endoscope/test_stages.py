@@ -14,11 +14,8 @@ from hypothesis import strategies as st
 from gsplat_core.scene.frames import Frame, FrameStatus
 from operators.checks import (
     PICTURE_STAGES,
-    TISSUE_STAGES,
     CutCounts,
     CutStage,
-    ExposureCounts,
-    ExposureStage,
     FieldOfViewStage,
     HighlightStage,
     InterlacingStage,
@@ -33,7 +30,7 @@ from operators.checks import (
     new_stages,
 )
 from operators.outcome import OutcomeBuilder
-from tests.gsplat_core.endoscope.clips import FRAME_NS, PLACES, brightened, clip, resized, texture
+from tests.gsplat_core.endoscope.clips import FRAME_NS, PLACES, clip, resized, texture
 
 
 def frames(images, **fields):
@@ -80,7 +77,7 @@ def test_a_late_frame_is_withheld_and_is_not_what_the_next_one_is_compared_with(
 def test_a_damaged_frame_is_left_to_what_handles_damage():
     given = frames(texture(1, 9))
     given[5] = given[5].with_fields(status=FrameStatus.DAMAGED, image=given[4].image)
-    stages = (SequenceStage(), CutStage(), ExposureStage())
+    stages = (SequenceStage(), CutStage())
     for stage in stages:
         assert run(stage, given)[5] is given[5]
         assert stage.counts().found == {}
@@ -111,27 +108,8 @@ def test_withheld_frames_are_no_scene():
     assert [frame.new_scene for frame in run(CutStage(), given)] == [None] * 30
 
 
-def test_the_exposure_is_set_where_it_changed_and_starts_anew_with_a_scene():
-    images = texture(1, 30)
-    given = frames([*images[:10], *(brightened(image, 1.5) for image in images[10:])])
-    given[20] = given[20].with_fields(new_scene="cut")
-    stage = ExposureStage()
-    found = np.array([frame.exposure for frame in run(stage, given)])
-    assert (found[:10] == 1).all() and (found[20:] == 1).all()
-    assert np.abs(np.log(found[10:20] / 1.5)).max() < 0.02
-    assert stage.counts().found["other than the scene's"] == 10 and isinstance(stage.counts(), ExposureCounts)
-
-
-def test_a_withheld_frame_keeps_the_exposure_of_the_one_before():
-    images = texture(1, 30)
-    given = frames([*images[:10], *(brightened(image, 1.5) for image in images[10:])])
-    given[15] = given[15].with_fields(withheld="torn", image=given[15].image // 9)
-    passed = run(ExposureStage(), given)
-    assert passed[15].exposure == passed[14].exposure != (1.0, 1.0, 1.0)
-
-
 def all_stages(without=()):
-    return [*new_stages(PICTURE_STAGES, without), *new_stages(TISSUE_STAGES, without)]
+    return [*new_stages(PICTURE_STAGES, without), MaskAndDepthStage()]
 
 
 def run_all(given, without=()):
@@ -153,7 +131,7 @@ def test_good_video_keeps_everything_but_masks_of_the_loss(recordings_dir, name,
     outcome = OutcomeBuilder()
     operator.contribute(outcome)
     found = {what for part in outcome.parts.values() for what in part.found}
-    assert found <= {"frames with highlights", "strip or text"} and len(outcome.parts) == 9
+    assert found <= {"frames with highlights", "strip or text"} and len(outcome.parts) == 8
 
 
 @pytest.mark.recordings
@@ -193,8 +171,8 @@ def test_a_restart_forgets_everything(compute):
 
 
 def test_stages_can_be_left_out_by_name():
-    names = [type(stage).__name__ for stage in all_stages(without=("highlights", "exposure"))]
-    assert len(names) == 7 and "HighlightStage" not in names and "ExposureStage" not in names
+    names = [type(stage).__name__ for stage in all_stages(without=("highlights", "strip"))]
+    assert len(names) == 6 and "HighlightStage" not in names and "StripStage" not in names
 
 
 @settings(deadline=None, max_examples=25)

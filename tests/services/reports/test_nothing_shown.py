@@ -8,7 +8,7 @@ import pytest
 
 from gsplat_core.scene.cameras import Camera
 from operators.applications.session import RunOutcome, RunSettings
-from operators.checks import PICTURE_STAGES, TISSUE_STAGES
+from operators.checks import PICTURE_STAGES, MaskAndDepthStage
 from operators.display import LiveDisplayResult
 from operators.errors import NothingShown
 from operators.ingest import SourceResult
@@ -128,7 +128,7 @@ def test_every_reason_of_a_gate_has_a_remedy():
     import re
 
     words = set()
-    for make in (*PICTURE_STAGES.values(), *TISSUE_STAGES.values()):
+    for make in (*PICTURE_STAGES.values(), MaskAndDepthStage):
         module = inspect.getsource(inspect.getmodule(make))
         for core in re.findall(r"from gsplat_core\.endoscope\.(\w+) import", module):
             tree = ast.parse(inspect.getsource(__import__(f"gsplat_core.endoscope.{core}", fromlist=["x"])))

@@ -43,7 +43,6 @@ def new_frame(seq: int, height_px: int = HEIGHT_PX, width_px: int = WIDTH_PX, **
         "pose": pose,
         "arrived_ns": 10**15 + seq,
         "status": FrameStatus.LIVE,
-        "exposure": (1.1, 1 / 3, 0.7),
         "withheld": "blur" if seq % 3 == 0 else None,
         "new_scene": "cut" if seq % 4 == 0 else None,
     }
@@ -56,7 +55,7 @@ def same_frame(a: Frame, b: Frame) -> bool:
         (getattr(a, n), getattr(b, n))
         for n in ("image", "right_image", "depth", "depth_confidence", "mask", "loss_mask", "rehearsal_mask", "pose")
     ]
-    facts = ("seq", "pts_ns", "exposure", "withheld", "new_scene", "damage", "depth_origin", "right_camera")
+    facts = ("seq", "pts_ns", "withheld", "new_scene", "damage", "depth_origin", "right_camera")
     return all(x is y is None or x.tobytes() == y.tobytes() for x, y in planes) and all(
         getattr(a, n) == getattr(b, n) for n in facts
     )
@@ -79,7 +78,7 @@ PER_SEGMENT = 6
 def write_frames(writer: SessionWriter, frames: list[Frame]) -> None:
     for frame in frames:
         writer.frame(frame)
-        prepared = frame.with_fields(loss_mask=np.ones_like(frame.mask), exposure=(1.0, 2.0, 3.0))
+        prepared = frame.with_fields(loss_mask=np.ones_like(frame.mask))
         writer.prepared(prepared, frame)
         writer.line(Observed(seq=frame.seq, steps=3, train=True))
         writer.line(Rehearsed(steps=2))
