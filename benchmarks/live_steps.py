@@ -63,7 +63,6 @@ class Shown:
         """Return the tissue PSNR of the picture at the frame's time and camera."""
         camera = self._camera if frame.pose is None else self._camera.with_pose(frame.pose)
         image = self._renderer.render(camera, frame.time_s, ("image",)).result().image
-        image = image * image.new_tensor(frame.exposure)
         shown = without_surround((image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy(), frame)
         return psnr_tissue_db(shown, frame.image, frame.tissue)
 
