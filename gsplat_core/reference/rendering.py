@@ -17,9 +17,8 @@ from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.arguments import Pairs, TileGrid, View
 from gsplat_core.reference import ray_blending
 from gsplat_core.reference.compositing import rasterize_to_pixels
-from gsplat_core.reference.projection import fully_fused_projection, values_of_rows
+from gsplat_core.reference.projection import fully_fused_projection, isect_offset_encode, isect_tiles, values_of_rows
 from gsplat_core.reference.spherical_harmonics import spherical_harmonics
-from gsplat_core.reference.tiles import isect_offset_encode, isect_tiles
 from gsplat_core.rendering.pipeline import Operations
 from gsplat_core.rendering.settings import RenderMode
 from gsplat_core.scene.gaussians import COLOUR, LOG_SCALE, OPACITY, POSITION, RAW_COLUMNS, ROTATION

@@ -12,7 +12,7 @@ from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.arguments import TileGrid
 from gsplat_core.ops.compositing import rasterize_to_pixels
 from gsplat_core.ops.tiles import bin_splats, isect_offset_encode, isect_tiles
-from gsplat_core.reference import tiles as reference
+from gsplat_core.reference import projection as reference
 from gsplat_core.reference.rendering import bin_splats_within
 
 WIDTH, HEIGHT = 150, 100
