@@ -375,7 +375,7 @@ class SharpnessCounts(StageCounts):
 class SharpnessStage(Stage):
     """Withholds frames with blur or smoke, relative to the usual sharpness of the scene.
 
-    Withheld and damaged frames are skipped. The stage must run after `CutStage`.
+    Damaged frames, and frames withheld by an earlier stage, are not examined. The stage must run after `CutStage`.
     """
 
     counts_type = SharpnessCounts

@@ -116,7 +116,9 @@ class QualityResult:
     frames_per_entry: int
     frames_sha256: str
     frames: int
-    """Number of displayed frames, including damaged ones, which are not scored."""
+    """Number of frames compared with a displayed picture, their own or an older one. Includes withheld and damaged frames,
+    which have no score.
+    """
 
 
 LOOK_NS = 500_000_000
@@ -326,7 +328,7 @@ class MetricsOp(Operator):
         self.trained, self.held_out = QualityTracker(), QualityTracker()
         """Scores of frames trained on before display, and of frames never trained on."""
         self.frames = 0
-        """Number of displayed frames so far, scored or not."""
+        """Number of frames compared with a displayed picture so far, scored or not."""
         self.next_frame = NextFrameScores()
         self.settled, self.before, self.before_throughout = ScoredMean(), ScoredMean(), ScoredMean()
         self.worst: tuple[float, int] | None = None

@@ -210,7 +210,11 @@ class RasterizeOp(Operator):
 
 
 def _is_predictable(before: DeformedScene, scene: DeformedScene) -> bool:
-    """Return True if `scene` continues `before` and its frame can be scored."""
+    """Return True if a prediction from `before` can be scored on the frame of `scene`.
+
+    The frame must belong to the same scene as that of `before` and have the same picture size, and must be neither
+    withheld nor damaged.
+    """
     frame, earlier = scene.frame, before.frame
     continues = frame.new_scene is None and frame.scene == earlier.scene and frame.image.shape == earlier.image.shape
     return frame.unusable is None and continues

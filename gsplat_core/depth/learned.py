@@ -99,7 +99,13 @@ def fitted(values: Plane, known: Plane) -> Affine | None:
 
 
 def _by_medians(values: Plane, known: Plane, sign: float) -> Affine:
-    """Return a start value of the affine fit from medians, on which outliers have little influence."""
+    """Return a start value of the affine fit from medians, on which outliers have little influence.
+
+    Args:
+        values: values of the depth network, in any scale.
+        known: reference depth at the same pixels.
+        sign: sign of the fitted factor, 1 or -1.
+    """
     (x, dx), (y, dy) = _middle(values), _middle(known)
     factor = sign * dy / dx
     return Affine(factor, y - factor * x, 0.0)

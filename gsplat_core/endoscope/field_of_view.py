@@ -33,7 +33,9 @@ LEAST_FIELD = 0.15
 ELLIPSE_SHARE = 0.7
 """Share of the outline that must be on the fitted ellipse for the ellipse to replace it."""
 ELLIPSE_DISTANCE = 0.015
-"""Largest distance of a point of the outline that counts as on the ellipse, as a share of the ellipse's diameter."""
+"""Largest distance from the ellipse, towards its centre or away from it, at which a point of the outline counts as on the
+ellipse. As a share of the ellipse's diameter in that direction.
+"""
 LIT_OUTSIDE = 0.25
 """Largest share of lit pixels outside the outline, such as text, logos and compression artefacts."""
 MARGIN_SHARE = 0.01
@@ -95,7 +97,11 @@ class FieldOfView:
         self.changes = 0
 
     def _consider(self, found: Outline | None) -> None:
-        """Accept the result of one window if it is reliable."""
+        """Compare the outline found in one window (None: whole picture) with the current one, and replace that if justified.
+
+        The first result is taken at once. A larger outline is merged with the current one at once (convex hull). Any
+        other result is stored, and replaces the current one after `WINDOWS_TO_CHANGE` consecutive consistent windows.
+        """
         if self._frames == 1:
             self._take(found)
             return

@@ -34,7 +34,8 @@ def sampled(plane: NDArray[np.uint8], step: int) -> NDArray[np.uint8]:
 def reduced(image: NDArray[np.uint8], width_px: int, height_px: int) -> NDArray[np.uint8]:
     """Reduce [H, W] or [H, W, C] to [height_px, width_px] or [height_px, width_px, C], ignoring the aspect ratio.
 
-    Only every k-th row and column is averaged. Noise is suppressed as well as with all pixels of a smaller picture.
+    Only every k-th row and column is averaged, where k is chosen so that the shorter side keeps at least `SAMPLES` of
+    them (all if it has fewer). Noise is suppressed as well as with all pixels of a smaller picture.
     """
     some = sampled(image, max(1, min(image.shape[:2]) // SAMPLES))
     return _resized(some, width_px, height_px, cv2.INTER_AREA)

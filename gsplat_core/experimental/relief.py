@@ -329,8 +329,13 @@ class Followed:
         return self._last
 
     def take(self, step: Array) -> Array:
-        """Update the estimate of the light, and return the step of the relief's change that belongs to a step of the
-        key relief.
+        """Update the estimated change of the light, in log brightness, after a step of the key relief.
+
+        Args:
+            step: step of the key relief's coefficients [cosines].
+
+        Returns:
+            Resulting step of the coefficients [cosines] of the relief's change from the key time to the other time.
         """
         own = self._last.own_step(step)
         self._light += float(own[-1])

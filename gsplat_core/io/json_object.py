@@ -74,7 +74,7 @@ class JsonObject:
             raise BundleCorrupt(f"{self.name}: {error}") from error
 
     def window(self, key: str, wanted: NumberIn, longest: float) -> tuple[float, float]:
-        """Return two ordered numbers at most `longest` apart."""
+        """Return start and end, times in seconds in order and at most `longest` apart."""
         start, end = self._checked(key, ListOf(wanted, 2, 2))
         if not start <= end <= start + longest:
             raise BundleCorrupt(

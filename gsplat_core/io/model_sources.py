@@ -21,9 +21,11 @@ from gsplat_core.scene.gaussians import SH_C0, Gaussians
 
 WIDTH_PX, HEIGHT_PX = 640, 512
 FIELD_OF_VIEW = 0.9
-"""Image width over distance of the default camera for a splat file."""
+"""Height of the area that the default camera of a splat file sees at a distance, divided by that distance."""
 SHOWN_SHARE = 0.9
-"""Share of the Gaussians inside the sphere that the default camera shows completely."""
+"""Share of the Gaussians inside the sphere that sets the default camera's distance. The picture is as high as the sphere
+at the distance of its centre.
+"""
 WINDOW_S = (0.0, 4.0)
 """Time window in seconds of a splat file: one turn of an orbit."""
 LEAST_RADIUS = 0.02

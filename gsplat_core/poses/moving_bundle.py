@@ -41,9 +41,7 @@ PLACES, TURNS = slice(0, 3), slice(3, 6)
 
 @dataclass(frozen=True)
 class TrajectoryPrior:
-    """Gaussian prior of camera coordinates: positions, and rotation vectors relative to the middle
-    camera, in units of the tissue's distance.
-    """
+    """Prior of a camera trajectory, a normal distribution of the cameras' coordinates (`coordinates`)."""
 
     precision: Tensor
     """Precision matrix of each coordinate, [6, C, C]."""
@@ -69,8 +67,10 @@ class TrajectoryPrior:
 
 
 def coordinates(poses: Tensor) -> tuple[Tensor, Tensor]:
-    """Return camera coordinates [C, 6] and their derivatives by twists of the cameras [C, 6, 6], in
-    units of the tissue's distance.
+    """Return camera coordinates [C, 6] and their derivatives by twists of the cameras [C, 6, 6].
+
+    The first three coordinates are the camera's position in the world, in units of the tissue's distance. The other
+    three are the rotation vector of its orientation relative to that of the middle camera, in radians.
     """
     turned = poses[:, :3, :3].transpose(1, 2)
     place = -(turned @ poses[:, :3, 3:])[:, :, 0]

@@ -86,4 +86,4 @@ the poses; shading of the scope's light; prediction of a network.
 RELATIVE_DISTANCE = 60.0
 """Mean distance of depth whose scale is unknown, in arbitrary units."""
 UNKNOWN_ERROR = 0.3
-"""Assumed relative standard error of a model that was trained without depth."""
+"""Assumed relative standard error of the depth of a model that was trained without depth."""

@@ -305,7 +305,17 @@ def _place(step: TrainingStep, motion: EditableMotion, frame: Frame, observation
 
 
 def _correct_all_times(step: TrainingStep, motion: EditableMotion, observation: Observation, possible: Tensor) -> None:
-    """Move each Gaussian at all times towards the depth [H, W] (0 = unknown) of static tissue."""
+    """Move the Gaussians inside the picture towards a frame's depth, whose source assumes static tissue.
+
+    A Gaussian's distance from the camera changes by the same factor at all times. One frame applies `SHARE` of the
+    correction of the log depth. Gaussians where the depth is unknown are not moved.
+
+    Args:
+        step: training step; the means and scales of its Gaussians are changed in place.
+        motion: motion of the field; it gives the depths at the observation's time, and is scaled in place.
+        observation: the frame's observation, of which only camera and time are used.
+        possible: depth towards which the Gaussians are moved, float32 [H, W]; 0 = unknown.
+    """
     seen = _shown_now(step, motion, observation)
     now, there = seen.depth[:, 0], seen.read(possible)
     target = torch.where(seen.inside[:, 0] & (there > 0), there, now)

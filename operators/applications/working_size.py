@@ -106,7 +106,9 @@ ROUNDING = 1e-9
 STARTING_FRAMES, TIMED_FRAMES = 3, 9
 """Number of frames per measurement: frames that initialise the model and are not timed, then timed frames."""
 GIVEN_UP_S = 2.0
-"""Timeout of a frame in seconds. It ends the measurement and counts as the frame's latency."""
+"""Timeout of a frame in seconds, stored as the frame's latency. After the timeout of a timed frame no further frames are
+measured; after that of a starting frame the next one follows.
+"""
 
 
 @dataclass(frozen=True)

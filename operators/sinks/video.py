@@ -205,7 +205,7 @@ def video_sink(fragment: Any, name: str, options: SinkOptions) -> VideoSinkOp:
 
 
 def video_name(output: str) -> str:
-    """Return the name of an output's video."""
+    """Return the file name of an output's video."""
     return f"{output}.mp4"
 
 

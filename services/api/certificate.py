@@ -127,8 +127,8 @@ class ServerCertificate(Collector):
                 self._events.tell("certificate.reload", "server", "failed")
 
     def _stamp_now(self) -> tuple[object, ...]:
-        """Return a fingerprint of the files (device, inode, mtime, size). Symbolic links, as
-        Kubernetes mounts them, are followed."""
+        """Return a fingerprint of the files: device, inode, mtime and size, or the error number of a file that cannot
+        be read. Symbolic links, as Kubernetes mounts them, are followed."""
         found: list[object] = []
         for file in (self._certfile, self._keyfile):
             try:

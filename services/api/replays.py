@@ -156,7 +156,7 @@ ResultFile = Annotated[str, Names(FILES)]
 )
 @requires("viewer", ticket=True)
 async def replay_result(request: Request, caller: CallerOf, job_id: JobId, file: ResultFile) -> Response:
-    """Return a result file of a replay: report, video or model."""
+    """Return a result file of a replay: report, frame log, video or model."""
     path = await asyncio.to_thread(jobs_of(request).file, job_id, file)
     headers = {"Content-Security-Policy": REPORT_POLICY} if file == "report.html" else {}
     shown = file != "model.isplat"

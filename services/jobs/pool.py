@@ -273,7 +273,7 @@ class PoolKeeper:
 
     @property
     def pid(self) -> int | None:
-        """Return the process id of the pool, or None."""
+        """Return the process id of the pool; None while it is not running."""
         process = self._process
         return None if process is None or process.returncode is not None else process.pid
 

@@ -61,8 +61,9 @@ def engine_scale(
 ) -> float:
     """Return the scale of a stream's pictures for reconstruction.
 
-    Without the option `engine_scale`, an engine on a CPU measures once the largest size that keeps up with the stream.
-    A restarted engine reads the stored result, to show its first picture sooner.
+    Without the option `engine_scale`, an engine on a CPU measures the largest size that keeps up with the stream. A
+    restarted engine reads the stored result, to show its first picture sooner. It measures again if the size or frame
+    rate of the pictures has changed. An engine on a GPU uses scale 1.
 
     Args:
         spec: engine part of the stream specification.

@@ -153,7 +153,8 @@ struct HalfWeights {
   __half2 weights[2 * kTiles];
   __half2 in_front, behind;  // transmittance in front of the lane's splats, and behind those of all four lanes
 
-  // Compute the weights with full transmittance in front of the lane's splats.
+  // Compute the weights as if the transmittance in front of the lane's splats were 1, and the actual transmittances
+  // `in_front` and `behind`. `blend` multiplies the weights by `in_front`.
   __device__ HalfWeights(const HalfPixels& pixels, const uint32_t (&basis)[4], const HalfSplats<kTiles>& splats) {
     const __half2 most = __float2half2_rn(kMaxAlpha);
     __half2 through;

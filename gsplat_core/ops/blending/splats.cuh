@@ -129,8 +129,8 @@ struct alignas(16) StagedSplat {
 };
 static_assert(sizeof(StagedSplat<1>) == 32 && sizeof(StagedSplat<4>) == 48 && sizeof(StagedSplat<5>) == 48);
 
-// Read a staged splat from a shared-memory address. Inline assembly, because the compiler would otherwise reload the
-// colours for every pixel.
+// Read a staged splat from a shared-memory address; `cap` only if kCapped. Inline assembly, because the compiler would
+// otherwise reload the colours for every pixel.
 template <int D, bool kCapped>
 __device__ inline StagedSplat<D> staged_at(uint32_t address) {
   constexpr int kFloats = 6 + D + (kCapped ? 1 : 0);

@@ -10,7 +10,8 @@ namespace gsplat::frame {
 namespace {
 
 constexpr unsigned kAllLanes = 0xffffffffu;
-// Threads per block: as many warps as fit into its shared memory.
+// Threads per block: 4 warps up to degree 3, and 2 at degree 4. The WarpGradients of a block must fit into 48 KiB of
+// shared memory; a warp's have 11 KiB at degree 3 and 14 KiB at degree 4.
 template <int kDegree>
 constexpr int kSplatThreads = kDegree < 4 ? 128 : 64;
 
@@ -80,7 +81,8 @@ __device__ inline void wait_for_copies() {
   __syncwarp();
 }
 
-// Start copying the rows with a bit in `selected`. `aligned`: `from` is aligned to 16 bytes.
+// Start copying the rows with a bit in `selected`; other rows may be copied, too. `aligned`: `from` is aligned to 16
+// bytes, so that 16 bytes can be copied at a time.
 template <int kColumns>
 __device__ inline void start_copy(WarpRows<kColumns>& to, const float* from, int rows, unsigned selected, bool aligned,
                                   int lane) {

@@ -38,8 +38,9 @@ constexpr int blocks_of(int item, int width) {
   return item == 2 ? (width == 32 ? 6 : width == 64 ? 4 : 2) : width == 128 ? 1 : 2;
 }
 
-// Compute the deltas of Gaussians in one kernel. kChannels: number of channels if known at compile time and every line
-// has at least two nodes; 0: read from the input.
+// Compute the deltas of Gaussians in one kernel. kLines: multiply the features by the time planes, read from in.lines;
+// otherwise the features are complete. kChannels: number of channels if known at compile time and every line has at
+// least two nodes; 0: read from the input.
 template <class T, int kWidth, bool kLines, int kChannels>
 __global__ void __launch_bounds__(32 * warps_of(int(sizeof(T)), kWidth), blocks_of(int(sizeof(T)), kWidth))
     deltas_kernel(FieldInput in, FieldNetwork net, const void* packed, float* deltas, float* hidden) {

@@ -28,7 +28,7 @@ GSPLAT_INLINE void padded_values(const Inputs& in, int32_t id, float (&values)[D
   for (int d = 0; d < D; ++d) values[d] = d < in.channels ? in.values[int64_t(id) * in.channels + d] : 0;
 }
 
-// State of a tile's pixels, block by block.
+// State of a tile's pixels during blending, in blocks of kLanes pixels. D: at least the number of blended values.
 template <int D>
 struct Forward {
   alignas(64) float through[kPixels];  // transmittance after all splats so far, including those after termination

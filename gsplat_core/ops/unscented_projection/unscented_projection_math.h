@@ -117,7 +117,8 @@ GSPLAT_INLINE GaussianGradient project_backward(const Inputs& in, const Lens& le
   vfloat G[3];  // gradient of the covariance, a symmetric matrix
   projection::covariance2d_gradient(m.covariance, blur, from.conic, compensate, from.compensation, G);
   const auto times_G = [&](vfloat x, vfloat y, vfloat out[2]) { out[0] = G[0] * x + G[1] * y, out[1] = G[1] * x + G[2] * y; };
-  // The offsets from the transformed mean sum up to moved / weight - 6 moved.
+  // m.moved is the offset of the transformed mean from the projection of the centre. The offsets of the six outer points
+  // from the transformed mean sum up to moved / weight - 6 moved.
   vfloat of_moved[2];
   times_G(m.moved[0], m.moved[1], of_moved);
   const float factor = 2 * (in.center_weight - in.weight * (1 / in.weight - 6));

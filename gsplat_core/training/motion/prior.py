@@ -75,7 +75,7 @@ RELATIVE_ERROR = 0.15
 LARGEST_STEP = 1.4
 """Largest change of a Gaussian's depth by one frame, as a factor, once the scene's distance is known."""
 LEAST_PARALLAX_PX = 1.5
-"""Median parallax in pixels from which the scene's distance is estimated."""
+"""Smallest median parallax of the points, in pixels, at which the scene's distance is estimated."""
 LEAST_EXPLAINED = 0.5
 """Share of the motion remaining after camera rotation that a single distance must explain."""
 SMALLEST_SHIFT = 1e-9

@@ -25,7 +25,9 @@ from gsplat_core.training.config import ReconstructorConfig
 MOST_RELAXATION = 2.0
 """Upper bound of the relaxation. The iteration need not converge at or above it."""
 LEAST_WEIGHT_PX = 0.3
-"""Offset added to a splat's weight in pixels, so that barely visible splats take little of the residual."""
+"""Offset in pixels, added to a splat's sum of blending weights before the residual is divided by it. Barely visible splats
+are thus corrected less.
+"""
 
 
 def colour_correction(colours: Tensor, residuals: Tensor, weights: Tensor, relaxation: float) -> Tensor:

@@ -200,7 +200,9 @@ class TrainingStep:
         self._scaled_rates: tuple[dict[str, float], Sequence[float]] = {}, ()
         frame_deltas = self.capabilities.frame_deltas
         self.screen: ScreenGradients | None = None
-        """Gradients of the last step in its picture, if the strategy reads them."""
+        """Gradients of the last step's loss by the Gaussians' centres in the picture; None if the strategy does not
+        read them (`Strategy.screen_gradients`).
+        """
         self._keeps_screen = strategy.screen_gradients
         captures = (
             gaussians.device.type == "cuda"
@@ -288,7 +290,11 @@ class TrainingStep:
 
     @property
     def has_colours_in_time(self) -> bool:
-        """True if the colours of one time can be corrected without those of other times (`colour_correction`)."""
+        """True if the step can correct the colours of one time with little change at other times (`colour_correction`).
+
+        The field must have `Capabilities.add_colours`, and the step must train by alpha blending. On CUDA the colours
+        must not depend on the view.
+        """
         view_dependent = self.gaussians.device.type == "cuda" and self.gaussians.sh_degree > 0
         return self.capabilities.add_colours is not None and self._pictures is None and not view_dependent
 

@@ -43,7 +43,7 @@ FOCAL_RANGE = (0.5, 1.2)
 STEEPEST = 0.75
 """Largest product of the tissue's slope and the tangent of the corner's viewing angle, so that nothing hides behind a hill."""
 USUAL_SLOPE = 0.33
-"""Twice the root-mean-square slope of the usual sheet's hills."""
+"""Twice the root-mean-square slope (height per length, along one direction) of the hills of tissue of relief 1."""
 
 
 @dataclass(frozen=True)
