@@ -10,6 +10,7 @@ import sys
 import threading
 import traceback
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
 from typing import Any, NoReturn, Protocol
 
@@ -107,7 +108,10 @@ def _become(task: Task, life: int) -> NoReturn:
         os.nice(task.niceness)
         from services.jobs.work import work
 
-        work(task)
+        # A new thread has no OpenMP team. This one may have the team of the thread that forked it, whose members do not
+        # exist in the fork, so that a parallel loop would wait for them for ever.
+        with ThreadPoolExecutor(1, thread_name_prefix="attempt") as attempt:
+            attempt.submit(work, task).result()
         code = 0
     except BaseException:  # noqa: BLE001 - the forked process must never continue as the pool
         traceback.print_exc()

@@ -7,6 +7,7 @@ import os
 import resource
 import signal
 import stat
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -145,6 +146,40 @@ def test_attempts_end_when_their_pool_dies(body, tmp_path):
     while is_running(pid) and time.monotonic() < deadline:
         time.sleep(0.01)
     assert not is_running(pid)
+
+
+FORKED_AFTER_OPENMP = """
+import sys, time
+from pathlib import Path
+import torch
+from services.jobs import work
+from services.jobs.results import Task
+from services.jobs.runners import Forks
+
+def body(task):
+    torch.set_num_threads(2)
+    torch.zeros(1 << 20).add_(1)
+
+torch.set_num_threads(2)
+torch.zeros(1 << 20).add_(1)  # makes the OpenMP team of this thread
+work.work = body
+forks = Forks()
+forks.start(Task("a", "recording", sys.argv[1]))
+deadline = time.monotonic() + 60
+found = {}
+while not found and time.monotonic() < deadline:
+    found = forks.ended()
+    time.sleep(0.01)
+forks.close()
+print(found)
+"""
+
+
+def test_an_attempt_computes_after_its_pool_computed_with_threads(tmp_path):
+    environment = {**os.environ, "OMP_NUM_THREADS": "2"}
+    words = [sys.executable, "-c", FORKED_AFTER_OPENMP, str(tmp_path)]
+    said = subprocess.run(words, capture_output=True, text=True, check=True, timeout=120, env=environment)
+    assert said.stdout.strip() == "{'a': 'exit code 0'}"
 
 
 @pytest.fixture
