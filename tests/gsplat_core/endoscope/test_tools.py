@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from gsplat_core.endoscope.tools import HELD_FRAMES, ToolFinder
+from gsplat_core.endoscope.tools import HELD_FRAMES, ToolFinder, view_of
 from gsplat_core.errors import InvalidInput
 
 SIZE = (256, 320)
@@ -198,3 +198,11 @@ def test_a_view_of_a_larger_array_is_taken(rng):
 def test_other_arrays_are_refused(image):
     with pytest.raises(InvalidInput, match=r"image must be RGB uint8 \[H, W, 3\], got"):
         ToolFinder().find(image)
+
+
+@pytest.mark.parametrize("channel", [0, 1, 2])
+def test_the_brightness_of_a_picture_is_its_largest_channel(channel):
+    image = np.full((48, 64, 3), 40, np.uint8)
+    image[..., channel] = 200
+    view = view_of(image)
+    assert (view.brightness == 200).all() and view.levels[200] == np.count_nonzero(view.inside)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import cv2
 import numpy as np
 import pytest
@@ -13,7 +15,7 @@ from gsplat_core.training.budget import Budget
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.growth.initialisation import gaussians_from_frame
 from gsplat_core.training.metrics import psnr_tissue_db
-from gsplat_core.training.places import LEAST_SHARE, MOST_PLACES, Places, Structure, structure_of
+from gsplat_core.training.places import LEAST_SHARE, MOST_PLACES, LeftScenes, Places, Structure, structure_of
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.schedule import LiveTraining
 
@@ -81,6 +83,16 @@ def test_the_last_picture_stands_for_the_scene_where_the_camera_is_the_same():
     assert places.take(frame_of(2)) is not None
     hidden = frame_of(2, mask=np.zeros((HEIGHT, WIDTH), np.uint8))
     assert structure_of(hidden) is None
+
+
+@pytest.mark.parametrize("given", [True, False])
+def test_a_scene_is_left_with_the_picture_of_its_last_frame_or_rendered(given):
+    gaussians = gaussians_from_frame(frame_of(1), CAMERA, 400, sh_degree=0, default_depth_mm=60.0)
+    step = SimpleNamespace(at=lambda time_s: gaussians)
+    scenes = LeftScenes()
+    scenes.leave(step, CAMERA, 1.0, frame_of(2) if given else None)
+    assert not scenes.recognise(frame_of(1 if given else 2))
+    assert scenes.recognise(frame_of(2 if given else 1))
 
 
 @pytest.mark.parametrize("share", [0.28, 0.32])

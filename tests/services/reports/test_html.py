@@ -8,7 +8,7 @@ from html.parser import HTMLParser
 import pytest
 
 from services.reports.figures import keyframe_pictures
-from services.reports.html import render_html, write_html
+from services.reports.html import _quality_over_age, render_html, write_html
 
 
 class Page(HTMLParser):
@@ -129,3 +129,14 @@ def test_scores_are_placed_on_their_rail_in_proportion(text):
     low, high = min(values) - 1, max(values) + 1
     assert len(rows) >= 3 and low < high - 2
     assert places == pytest.approx([100 * (value - low) / (high - low) for value in values], abs=0.2)
+
+
+def test_quality_is_drawn_over_the_mean_age_of_each_group(report):
+    ages = [40.0, 10.0, 30.0, 20.0]
+    measured = [
+        entry.model_copy(update={"age_ms": age, "psnr_tissue_db": 20 + age, "previous_frame_db": 5.0})
+        for entry, age in zip(report.series, ages, strict=True)
+    ]
+    shown, before = _quality_over_age(report.model_copy(update={"series": measured})).lines
+    assert list(shown.x) == list(before.x) == sorted(ages)
+    assert list(shown.y) == [30.0, 40.0, 50.0, 60.0] and list(before.y) == [5.0] * 4
