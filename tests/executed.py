@@ -155,7 +155,7 @@ class Recorder:
         self.failed: list[str] = []
 
     def take(self, file: str, test: int) -> None:
-        places = np.flatnonzero(self.marks)
+        places = np.flatnonzero(self.marks.copy())  # a thread or process that a test left running may still set marks
         self.marks[places] = 0
         self.executed[file].append((places, test))
 

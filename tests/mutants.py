@@ -421,13 +421,11 @@ def _failed(fork: Fork, folder: Path) -> str:
     result = folder / "failed"
     if fork.code == RAISED:
         sys.exit(f"the session failed:\n{fork.output.read_text(encoding='utf-8', errors='replace')[-4000:]}")
-    name = (
-        "time"
-        if fork.timed_out or fork.code == -signal.SIGALRM
-        else result.read_text(encoding="utf-8")
-        if result.exists()
-        else "pytest itself"
-    )
+    name = result.read_text(encoding="utf-8") if result.exists() else ""
+    if fork.timed_out or fork.code == -signal.SIGALRM:
+        name = "time"
+    elif not name and (not result.exists() or fork.code == pytest.ExitCode.INTERNAL_ERROR):
+        name = "pytest itself"  # it died, or a module ended the process while it was imported
     result.unlink(missing_ok=True)
     return name
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import ast
+import mmap
+import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +14,7 @@ import pytest
 import torch
 
 from tests import executed, mutants
+from tests.forks import pytest_fork
 from tests.mutants import changeable, mutant_at
 
 MODULE = """
@@ -187,3 +191,51 @@ def test_tests_that_execute_a_line_run_quickest_first(tmp_path: Path, monkeypatc
     path.write_text(MODULE.replace("return value\n\n\nclass", "return value + 0\n\n\nclass"), encoding="utf-8")
     executed.parsed.cache_clear()
     assert names(8) == ["test_small", "test_large"]  # newer than the record: tests of its function
+
+
+@pytest.mark.parametrize(
+    ("line", "failed"),
+    [
+        ("import sys; sys.exit(2)", "pytest itself"),
+        ("import os; os._exit(0)", "pytest itself"),
+        ("raise ValueError", "test_product.py"),
+        ("VALUE = 1", ""),
+        ("VALUE = 2", "test_product.py::test"),
+    ],
+)
+def test_a_module_that_ends_the_process_when_it_is_imported_is_noticed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, line: str, failed: str
+) -> None:
+    """Otherwise a change that makes each import of a module end would count as not noticed."""
+    (tmp_path / "product.py").write_text(f"{line}\n", encoding="utf-8")
+    (tmp_path / "test_product.py").write_text(
+        "from product import VALUE\n\ndef test():\n    assert VALUE == 1\n", encoding="utf-8"
+    )
+    (tmp_path / "pytest.ini").write_text("[pytest]\npythonpath = .\nmarkers =\n  slow: not run\n", encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    chosen = mutants.Chosen(("test_product.py",), tmp_path / "failed", {})
+    fork = pytest_fork(["test_product.py"], tmp_path, chosen)
+    fork.wait()
+    assert mutants._failed(fork, tmp_path) == failed
+
+
+def test_marks_are_read_while_another_thread_sets_them() -> None:
+    """A thread that a test left running must not end the session, which would leave its files without records."""
+    marks = mmap.mmap(-1, 1_000_000)
+    recorder = executed.Recorder(marks)
+    places = np.random.default_rng(0).integers(len(marks), size=1000)
+
+    def work() -> None:
+        for _ in range(2000):
+            recorder.marks[places] = 1
+            time.sleep(0)  # the other thread continues
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    try:
+        while thread.is_alive():
+            recorder.take("file", 0)
+    finally:
+        thread.join()
+    recorder.take("file", 0)
+    assert set(np.concatenate([found for found, _ in recorder.executed["file"]])) == set(places)
