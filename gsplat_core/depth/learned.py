@@ -301,7 +301,7 @@ class LearnedDepth(Estimator):
         return found if found is not None and found.alike >= ALIKE else None
 
     def _assumed(self, values: NDArray[np.float64]) -> Affine:
-        """Return the alignment that is assumed without any reference depth."""
+        """Return the map with the offset of `with_assumed_zero` and the mean depth `RELATIVE_DISTANCE` (geometric)."""
         zero = with_assumed_zero(values)
         positive = np.clip(zero.of(values), *np.percentile(zero.of(values), ENDS))
         factor = self._kind(np.array(RELATIVE_DISTANCE)) / np.exp(np.log(positive).mean())

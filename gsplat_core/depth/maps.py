@@ -194,7 +194,9 @@ def _median(values: NDArray[np.float32]) -> float:
 
 
 def believed_depth(frame: Frame) -> NDArray[np.float32]:
-    """Return the frame's confident depth [H, W], 0 elsewhere and within the edge margin of its origin."""
+    """Return the frame's confident depth [H, W], 0 elsewhere and within the edge margin of its origin; without
+    confidence all of its depth.
+    """
     return _depth_from(frame, BELIEVED, 1.0)
 
 
@@ -207,8 +209,8 @@ def possible_depth(frame: Frame) -> NDArray[np.float32]:
 
 
 def _depth_from(frame: Frame, least: float | None, margin: float) -> NDArray[np.float32]:
-    """Return the frame's depth [H, W] where its confidence is at least `least` (None: the least one of its origin), without
-    a margin next to unknown depth: the share `margin` of the origin's. 0 elsewhere.
+    """Return the frame's depth [H, W] where its confidence is at least `least` (None: that of its origin), 0 elsewhere and
+    within the share `margin` of the origin's margin next to it. Depth without confidence is returned unchanged.
     """
     origin = frame.depth_origin
     if frame.depth is None or origin is None:

@@ -539,7 +539,9 @@ class ParallaxDepth(Estimator):
         return found
 
     def of_recording(self, frames: Sequence[Frame], cameras: Sequence[Camera]) -> RecordingDepth:
-        """Estimate depth for key frames of a moving camera, assuming static tissue."""
+        """Estimate depth for key frames, assuming static tissue; unchanged frames if the camera does not move or is not a
+        pinhole, or if any frame has depth.
+        """
         moves = any(not np.array_equal(camera.world_to_camera, cameras[0].world_to_camera) for camera in cameras)
         if not moves or cameras[0].model != "pinhole" or any(frame.depth is not None for frame in frames):
             return RecordingDepth(list(frames), {})

@@ -411,7 +411,7 @@ class StereoDepth(Estimator):
         return found if found.doubt is not None else replace(found, error=self._typical_error(found, frame, camera))
 
     def _typical_error(self, found: DepthMap, frame: Frame, camera: Camera) -> float:
-        """Return the median relative standard error of confident depth."""
+        """Return the median relative standard error of confident depth; the one assumed for stereo depth if there is none."""
         step = max(1, frame.width_px // SAMPLED_PX)
         some = replace(found, depth=found.depth[::step, ::step], confidence=found.confidence[::step, ::step])
         known = (some.confidence >= BELIEVED) & (some.depth > 0)

@@ -29,9 +29,9 @@ from gsplat_core.scene.frames import Frame
 PAIRS = 12
 """Number of pairs of frames that are compared, spread over the recording."""
 APART_S = 0.3
-"""Time between the frames of a pair, at least one frame interval."""
+"""Time between the frames of a pair in seconds, but at least one frame interval."""
 LONGEST_APART_S = 1.0
-"""Longest time between the frames of a pair in a stream. After a longer gap, the test starts anew."""
+"""Longest time in seconds between the frames of a pair in a stream. After a longer gap, the test starts anew."""
 RECENT_PAIRS, FEWEST_PAIRS = 5, 3
 """Number of newest pairs of frames of a stream over which the median is taken, and the least number for a result."""
 LONGEST_PX = 320
@@ -154,7 +154,7 @@ class CameraPath:
         return np.asarray(between(first, second, float((time_s - start_s) / (end_s - start_s))).numpy())
 
     def interpolated(self, time_s: float) -> NDArray[np.float64]:
-        """Return the pose at a time from the other times only."""
+        """Return the pose at a time, interpolated without the pose that is known at this time."""
         others = self.times_s != time_s
         return CameraPath(self.times_s[others], self.poses[others], self.trajectory).at(time_s)
 

@@ -100,7 +100,9 @@ LEFT = 0.7
 ADJUSTED = 2
 """Number of frames after a key frame during which the newest key frames are adjusted."""
 FIRST_KEYS = 6
-"""Number of key frames at the start that are added after a displacement of only `FIRST_MOVED_PX`."""
+"""Number of key frames at the start that are added after a displacement of only `FIRST_MOVED_PX`. With at most this many
+key frames, they are adjusted in every frame.
+"""
 FIRST_MOVED_PX = 0.5
 FOLLOWED_KEYS = 3
 """Number of nearest earlier key frames whose points are searched at their predicted positions when a key frame is

@@ -142,11 +142,11 @@ class _Followed(NamedTuple):
     """Poses of all frames, estimated with one weight of the flatness prior."""
 
     poses: Tensor
-    """World-to-camera, [N, 4, 4]."""
+    """World-to-camera poses [N, 4, 4]."""
     points: Tensor
-    """[P, 3]."""
+    """Tissue points [P, 3] in the world."""
     lost: list[int]
-    """Frames with too few known points."""
+    """Indices of frames with too few known points, which keep the pose of the frame before."""
     error: float
     """Robust error, summed over all observations."""
 

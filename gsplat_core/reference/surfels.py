@@ -92,7 +92,9 @@ def fully_fused_projection_2dgs(
 
 
 SCREEN_FACTOR = 2.0
-"""Factor of the squared distance in pixels in the screen-space lower bound of a surfel's size."""
+"""Factor of the squared distance d from `means2d` in pixels, in sigma = min(u² + v², 2 d²) / 2. It keeps a surfel visible
+that is smaller than a pixel.
+"""
 
 
 SURFELS_AT_A_TIME = 2048

@@ -28,7 +28,9 @@ WITHIN_ONE = 0.683
 
 
 def depth_errors(model: Model, observations: Sequence[Observation]) -> tuple[DepthError, ...]:
-    """Return the standard error of the model's depth at times of frames with depth, in temporal order.
+    """Return the model's standard errors, relative to the depth, at times of frames with depth, in temporal order.
+
+    A frame with fewer than `FEWEST_PIXELS` compared pixels has none.
 
     Args:
         model: the trained model.

@@ -31,7 +31,7 @@ from gsplat_core.training.strategies.strategy import Plan
 NOISE_LEVELS = 2.5
 """Standard deviation of noise in compressed video, in grey levels of 255."""
 MOST_FRAMES = 32
-"""Number of frames examined, spread over the recording."""
+"""Largest number of frames that `steadiness` examines, spread over the recording."""
 
 
 def steadiness(observations: Sequence[Observation]) -> float:
@@ -59,7 +59,7 @@ def steadiness(observations: Sequence[Observation]) -> float:
 
 
 SMOOTH_EVERY = 20
-"""Number of training steps between two smoothings. A smoothing processes all columns, unlike a training step."""
+"""Number of training steps between two smoothings, which process the motion at all times, unlike a training step."""
 MOST_AT_ONCE = 0.5
 """Largest share of the way to the neighbours' mean in one smoothing."""
 

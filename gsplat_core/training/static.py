@@ -60,7 +60,7 @@ class TrainingCoordinates:
     centre: NDArray[np.float64]
     """Point [3] nearest to the optical axes, in world units."""
     factor: float
-    """Inverse of the cameras' median distance from the centre, per world unit."""
+    """Training units per world unit: inverse of the cameras' median distance from the centre in world units."""
 
     @classmethod
     def of(cls, cameras: Sequence[Camera]) -> TrainingCoordinates:
@@ -94,7 +94,7 @@ class TrainingCoordinates:
 
 
 def _nearest_to_axes(positions: NDArray[np.float64], axes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the point [3] with the least sum of squared distances to the optical axes."""
+    """Return the point [3] nearest to the optical axes (least squares); the mean position if they are almost parallel."""
     axes = axes / np.linalg.norm(axes, axis=1, keepdims=True)
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     system = across.sum(0)

@@ -78,7 +78,7 @@ class Upkeep:
         self._has_moved = False
 
     def __call__(self, step: TrainingStep, observation: Observation, last_seen: LastSeen | None = None) -> None:
-        """Run the maintenance that is due, which synchronises with the device. `last_seen` is updated with the rows."""
+        """Run the maintenance that is due, which synchronises with the device. Rows of `last_seen` follow the scene's."""
         self._has_moved = self._has_moved or observation.camera != self._first_camera
         if step.steps - self._relaxed_at < RELAX_EVERY:
             return
@@ -130,7 +130,7 @@ class Upkeep:
             last_seen.join(step.gaussians.count, observation.time_s)
 
     def _relax(self, step: TrainingStep, seen: Seen, camera: Camera) -> None:
-        """Relax visible Gaussians towards default sizes, opacities and colours. Others are kept as memory."""
+        """Relax visible Gaussians towards the default size, opacity 0.5 and grey. Limit the sizes of all Gaussians."""
         share = 1 - math.exp((self._relaxed_at - step.steps) / RELAXING_STEPS)
         self._relaxed_at = step.steps
         scene, pixel = step.gaussians, step.distance(camera) / float(camera.K[0, 0])
@@ -173,7 +173,7 @@ class Upkeep:
         return crowded if self._has_moved else crowded | (idle & ~seen.inside)
 
     def _fill_up(self, step: TrainingStep, observation: Observation, shown: Tensor) -> None:
-        """Split visible Gaussians (`shown`, bool [N]) with the largest gradients if tissue has fewer than at the start."""
+        """Split the `shown` Gaussians, bool [N], with the largest gradients if tissue has less than the initial density."""
         wanted = torch.count_nonzero(observation.mask) / self._spacing_px**2
         missing = int(wanted - torch.count_nonzero(shown))
         count = min(missing, round(MOST_SPLIT * step.gaussians.count), self._capacity - step.gaussians.count)

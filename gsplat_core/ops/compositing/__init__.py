@@ -217,7 +217,7 @@ MAX_ALPHA = 0.99
 """Upper limit of a splat's alpha at a pixel, as in gsplat 1.6; 1.5.3 has 0.999."""
 MIN_ALPHA = 1.0 / 255.0
 LEAST_TRANSMITTANCE = 1e-4
-"""A splat after which less light passes is not blended any more."""
+"""Blending of a pixel ends before the splat that would reduce the transmittance to this value or less."""
 PAIRS_AT_A_TIME = 1 << 22
 """Bound of the memory for pairs of pixel and list entry."""
 

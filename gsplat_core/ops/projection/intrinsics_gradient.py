@@ -47,7 +47,7 @@ def intrinsics_gradient(
     local = local + viewmats[..., None, :3, 3]
     depth = torch.where(visible, local[..., 2], torch.ones_like(local[..., 2]))
     local = torch.cat([torch.where(visible[..., None], local[..., :2], 0), depth[..., None]], -1)
-    focal, center = Ks.diagonal(dim1=-2, dim2=-1)[..., None, :2], Ks[..., None, :2, 2]  # [..., C, 1, 2]
+    focal, center = Ks.diagonal(dim1=-2, dim2=-1)[..., None, :2], Ks[..., None, :2, 2]
     jacobian, plain, clamped = _jacobian(local, focal, center, size, camera_model)
     v_focal, v_center = torch.zeros_like(plain), torch.zeros_like(plain)
     v_means2d, v_conics, v_compensations = gradients
@@ -69,9 +69,7 @@ def intrinsics_gradient(
             covars = spread @ turned.transpose(-1, -2)
             a, b, c = covars[..., 0, 0], covars[..., 0, 1], covars[..., 1, 1]
             adjugate = torch.stack([c, -b, -b, a], -1).unflatten(-1, (2, 2))
-            det = (
-                conic[..., 0, 0] * conic[..., 1, 1] - conic[..., 0, 1] ** 2
-            )  # of the inverse of the blurred covariance
+            det = conic[..., 0, 0] * conic[..., 1, 1] - conic[..., 0, 1] ** 2
             above = visible & (compensations > compensation_floor)
             factor = torch.where(above, compensations, 1)[..., None, None]
             change = 0.5 * (adjugate * det[..., None, None] / factor - factor * conic)

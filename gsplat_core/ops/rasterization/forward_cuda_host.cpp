@@ -51,7 +51,7 @@ struct ListScratch {
   }
 };
 
-// Count the visible splats.
+// Count the visible splats before each block of Gaussians (`visible_starts`), and in all (`rows`).
 void scan_visible(const Scene& scene, const Splats& splats, const ListScratch& scratch, NumberFromGpu& rows,
                   cudaStream_t stream) {
   const int64_t blocks = scene.images() * scene.blocks();

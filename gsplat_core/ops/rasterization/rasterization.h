@@ -99,7 +99,7 @@ void count_visible(const Scene& scene, const Splats& splats, uint32_t* counts, c
 // Write the rows of the visible splats. `block_starts` [images * blocks + 1]: number of visible splats in all preceding
 // blocks; the last entry is the total.
 void pack(const Scene& scene, const Splats& splats, const int32_t* block_starts, const PackedSplats& out, cudaStream_t stream);
-// Write the rows of the splats `from` to `to`.
+// Replace splat ids by packed rows: to[i] = row_of[from[i]].
 void renumber(int64_t length, const int32_t* row_of, const int32_t* from, int32_t* to, cudaStream_t stream);
 
 // Arguments of the backward pass from the image's gradient to the splats' gradients.

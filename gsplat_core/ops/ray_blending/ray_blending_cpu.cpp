@@ -22,7 +22,7 @@ using compositing::Tile;
 
 constexpr float kInfinity = __builtin_inff();
 
-// Number of channels of a call to a kernel that is compiled for up to D channels.
+// Copy the channels of splat `id` to `values`; further values are 0.
 template <int D>
 GSPLAT_INLINE void padded_values(const Inputs& in, int32_t id, float (&values)[D > 0 ? D : 1]) {
   for (int d = 0; d < D; ++d) values[d] = d < in.channels ? in.values[int64_t(id) * in.channels + d] : 0;

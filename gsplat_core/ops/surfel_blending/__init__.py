@@ -256,7 +256,9 @@ torch.library.register_autograd("gsplat_core::blend_surfels", _backward, setup_c
 
 
 SCREEN_FACTOR = 2.0
-"""Factor of the squared distance in pixels, which bounds the size of a surfel from below."""
+"""Factor of the squared distance d from `means2d` in pixels, in sigma = min(u² + v², 2 d²) / 2. It keeps a surfel visible
+that is smaller than a pixel.
+"""
 
 
 @torch.no_grad()

@@ -38,11 +38,11 @@ class UnscentedTransformParameters:
     """
 
     alpha: float = 0.1
-    """Spread of the sigma points around the mean."""
+    """Factor of the spread: the sigma points are `alpha` √(3 + `kappa`) standard deviations from the mean."""
     beta: float = 2.0
-    """Prior knowledge of the distribution; 2 is optimal for Gaussians."""
+    """Summand of the central sigma point's weight in the covariance (`center_weight`); 2 is optimal for Gaussians."""
     kappa: float = 0.0
-    """Secondary scaling of the sigma points."""
+    """Summand in the spread of the sigma points, see `alpha`."""
     in_image_margin_factor: float = 0.1
     """Margin around the picture in which sigma points are valid, as a share of its size."""
     require_all_sigma_points_valid: bool = True
@@ -120,7 +120,7 @@ def project_unscented(
     offsets = sigma_offsets(quats, scales) * parameters.spread
     sigma = torch.cat([means[..., None, :], means[..., None, :] + offsets, means[..., None, :] - offsets], -2)
     count = means.shape[-2]
-    world = sigma.flatten(-3, -2)[..., None, :, :]  # [..., 1, 7 N, 3]
+    world = sigma.flatten(-3, -2)[..., None, :, :]
     pixels, seen, inside = _pixels(world, shutter, Ks, lens, limits, parameters.in_image_margin_factor)
     pixels, inside = pixels.unflatten(-2, (count, 7)), inside.unflatten(-1, (count, 7))
     depths = shutter.to_camera(means[..., None, :, :])[..., 2]

@@ -203,7 +203,7 @@ def _blend_tiles(
     values = torch.where(usable[..., None], values, torch.zeros_like(values))
     rays = torch.where(seen[..., None], rays, torch.ones_like(rays))
     centers, whitening = geometry[..., :3], geometry[..., 3:].unflatten(-1, (3, 3))
-    offsets = rays[:, :, None, :3] - centers[:, None]  # [T, P, L, 3]
+    offsets = rays[:, :, None, :3] - centers[:, None]
     origins = torch.einsum("tlij,tplj->tpli", whitening, offsets)
     directions = torch.einsum("tlij,tpj->tpli", whitening, rays[..., 3:])
     squared = (directions * directions).sum(-1, keepdim=True)

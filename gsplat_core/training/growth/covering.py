@@ -400,7 +400,7 @@ EDGE_CELLS = 1.0
 
 
 def has_moved(camera: Camera, before: Camera, distance: float) -> bool:
-    """Return True if content at a distance has moved far enough since `before` for another search."""
+    """Return True if content at `distance` is somewhere displaced by `LOOKS_AFTER` or more between two cameras."""
     sides = np.array([0.0, 0.5, 1.0])
     pixels = np.stack(np.meshgrid(sides * camera.width_px, sides * camera.height_px), -1).reshape(-1, 2)
     if camera.model == before.model == "pinhole":
@@ -423,7 +423,7 @@ def _by_homography(
 ) -> NDArray[np.floating]:
     """Return homogeneous coordinates [3, M] in an earlier camera of the content of `pixels` [M, 2] at a distance.
 
-    Training of a frame waits for it. Moving the points of all cells takes ten times as long.
+    Training waits for the result. Projecting the points of all cells instead takes ten times as long.
     """
     between = before.world_to_camera @ np.linalg.inv(camera.world_to_camera)
     homography = distance * before.K @ between[:3, :3] @ np.linalg.inv(camera.K)

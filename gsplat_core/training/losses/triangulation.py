@@ -29,8 +29,7 @@ LEAST_ANGLE_DEG = 1.5
 """Least angle between the rays of two views at a point."""
 LARGEST_ANGLE_DEG = 15.0
 """Largest angle of views that are chosen; beyond it optical flow finds few matches."""
-MOST_VIEWS = 8
-LEAST_VIEWS = 2
+MOST_VIEWS, LEAST_VIEWS = 8, 2
 """Largest and smallest number of other views in which a point is matched."""
 SIGMA = 0.01
 """Scale of the robust loss relative to a point's depth."""

@@ -191,12 +191,12 @@ LONGEST_GAP_S = 0.15
 UNCERTAINTY = 0.05
 """Variance of a Gaussian's predicted position, relative to the squared length of its last motion."""
 MOST_WIDENED = 0.7
-"""Largest change of a log-scale from one frame to the next."""
+"""Largest increase of a log-scale by `widened`."""
 SUDDEN = 5.0
-"""Ratio to the usual motion above which a motion of more than `SUDDEN_PX` pixels is a jump and is not extrapolated."""
+"""Ratio to the usual median motion of frames above which a motion over `SUDDEN_PX` pixels is a jump, not extrapolated."""
 SUDDEN_PX = 1.0
 USUAL_DECAY = 0.1
-"""Weight of the newest motion in the usual motion."""
+"""Weight of the newest frame in the usual motion, a moving average of the median motion in pixels."""
 
 
 class MotionPrior(Protocol):
@@ -312,7 +312,7 @@ class FlowPrior:
         """
 
     def _usable_motion(self) -> SurfaceMotion | None:
-        """Return the newest motion if it predicts the next frame, else None."""
+        """Return the newest motion; None after a jump or an interval of more than `LONGEST_GAP_S`."""
         return self._motion if 0 < self._interval_s <= LONGEST_GAP_S and not self._is_sudden else None
 
     def _judge(self, moved_px: float) -> None:

@@ -140,7 +140,7 @@ class StrategyKind:
 
 
 def every_of(steps: int) -> int:
-    """Return the number of steps between two refinements: 100 as in gsplat for long trainings, at least 10."""
+    """Return the number of steps between two refinements: a 40th of all, at least 10, at most 100 as in gsplat."""
     return min(100, max(10, steps // 40))
 
 
