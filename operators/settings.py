@@ -186,7 +186,7 @@ class DisplaySection(Section):
 
 
 RENDERER_OPTIONS = ("samples", "supersampling", "order", "progressive", "storage")
-"""Options of the engine that only some renderers have."""
+"""Options that only some renderers have."""
 
 
 def check_display(options: Mapping[str, Any]) -> None:

@@ -235,7 +235,10 @@ class EveryFrame(Training):
         self._held_out = held_out
 
     def learn(self, frame: Frame, learner: Learner, frame_waits: Callable[[], bool]) -> Reconstruction | None:
-        """Train the configured number of steps on the frame, unless it is withheld or held out, and publish the model."""
+        """Train the configured number of steps on the frame, or display it untrained (see the class).
+
+        Returns: None for an unusable frame of a scene without a model.
+        """
         usable = learner.accepts(frame)
         if not learner.enter(frame, usable=usable):
             return None
@@ -275,7 +278,7 @@ class UntilDisplay(Training):
         self.begin()
 
     def begin(self) -> None:
-        """Reset the clock and the growth counter for a new stream."""
+        """Reset the counters of growth and late depth for a new stream."""
         self._since_grown = 0
         """Frames trained on since the last growth step."""
         self._depth_ages = Histogram()
@@ -290,7 +293,7 @@ class UntilDisplay(Training):
         return frame
 
     def learn(self, frame: Frame, learner: Learner, frame_waits: Callable[[], bool]) -> Reconstruction | None:
-        """Train on the frame until its display deadline, and publish the model. None for a frame that cannot be shown."""
+        """Train on a usable frame until its display deadline, and publish the model; None if it cannot be shown."""
         behind, taken_ns = frame_waits(), self._clock.now_ns()
         usable = learner.accepts(frame)
         if not learner.enter(frame, usable=usable):

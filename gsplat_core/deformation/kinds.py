@@ -186,7 +186,7 @@ class FieldKind(Generic[Field]):
     offline_rates: FieldRates | None = None
     """Learning rates for training on a complete recording; None for `rates`."""
     offline_spacing_s: float = 0.05
-    """`NewField.spacing_s` for training on a complete recording."""
+    """Time in seconds between two basis functions of a new field that is trained on a complete recording."""
     training_bytes: Callable[[int, float], int] = lambda gaussians, spacings: OTHER_FIELD_BYTES
     """Estimate of the memory for training, from the number of Gaussians and the duration in units
     of `NewField.spacing_s`.

@@ -240,7 +240,7 @@ class OfflineTraining:
         return self._observations[self._order.pop()]
 
     def _smooth(self) -> None:
-        """Smooth in time and space, in proportion to the number of steps since the last call."""
+        """Smooth the motion in time and among neighbours, as much as is due for `SMOOTH_EVERY` steps."""
         each = self._rate * SMOOTH_EVERY / len(self._observations)
         smooth_in_time, share_motion = self._step.capabilities.smooth_in_time, self._step.capabilities.share_motion
         if self._smoothing and smooth_in_time is not None:

@@ -216,14 +216,15 @@ class PostponedGrowth:
         self._camera_before = None
 
     def prepare(self, step: TrainingStep, frame: Frame, observation: Observation, motion: Following) -> None:
-        """Fill tissue that came into view, before the first training step on the newest frame."""
+        """Fill tissue that came into view because the camera moved or because the motion prior moved the scene away
+        from an edge. Called before the first training step on the newest frame.
+        """
         before, camera = self._camera_before, observation.camera
         if before is None:
             self._camera_before = camera
         elif before != camera and has_moved(camera, before, step.distance(camera)):
             self._camera_before = camera
             fill_new_tissue(step, frame, observation, before, self._config, self._out_of_view)
-        # The flow moved the scene away from a revealed edge, so training has no Gaussians there.
         if motion.has_revealed(REVEALED_SHARE * camera.width_px):
             self._cover(step, frame, observation, motion)
 

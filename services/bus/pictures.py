@@ -24,7 +24,7 @@ drain the queue and use the newest picture. A smaller value would lose pictures 
 because ZeroMQ updates its count of delivered messages with a delay."""
 MAX_PARTS = 1 + MAX_PIECES
 MAX_PART_BYTES = max(np.dtype(array.kind).itemsize * array.values for array in ARRAYS.values()) * MAX_PIXELS
-"""Largest number of parts of a message, and largest size of a part in bytes."""
+"""Largest size in bytes of a part of a message: the pixels of the largest picture."""
 
 
 @dataclass(frozen=True)

@@ -135,12 +135,11 @@ class JobPool:
             self._claims.end(job_id, JobState.CANCELLED, f"cancelled by {who}")
 
     def _settle(self, claimed: Claimed, task: Task, how: str) -> None:
-        """Publish the result of an ended attempt, or record its failure."""
+        """Publish the result of an ended attempt, or record its failure. Requeue the job if the process died."""
         self._busy_s = time.monotonic()
         outcome = task.outcome()
         if outcome is None:
-            # The attempt's process died or was killed. The job is queued again, unless it was cancelled or had too many
-            # attempts.
+            # The job is queued again, unless it was cancelled or had too many attempts.
             if self._claims.give_back(claimed.id, counts=True):
                 log.warning("%s: its process died: %s", claimed.id, how)
         elif outcome[0] is JobState.DONE:
@@ -255,7 +254,7 @@ LEVELS = {"WARNING": logging.WARNING, "ERROR": logging.ERROR, "CRITICAL": loggin
 """Log level of a line of the pool's output, by its first word."""
 LOOK_S = 0.5
 END_S = 10.0
-"""Seconds that a pool may take to requeue its jobs."""
+"""Seconds that a stopped pool may take to requeue its jobs and end, before it is killed."""
 PASSED_ON = (
     "PATH", "PYTHONPATH", "LD_LIBRARY_PATH", "LANG", "LC_ALL", "TMPDIR", "HOME", "OMP_NUM_THREADS", "OMP_WAIT_POLICY",
     "OPENBLAS_NUM_THREADS", "CUDA_VISIBLE_DEVICES", "NVIDIA_VISIBLE_DEVICES", "INTRASPLAT_ISA",

@@ -259,7 +259,7 @@ _POSES_ADVICE = "Save [N, 4, 4] numbers: for each frame the pose from camera to 
 
 
 def read_poses(path: Path, frame_count: int, findings: Findings) -> NDArray[np.float64] | None:
-    """Read and check world-to-camera poses [N, 4, 4]; None after a problem."""
+    """Read camera-to-world poses [N, 4, 4] and return their inverses, world to camera; None after a problem."""
 
     def wrong(header: ArrayHeader) -> str | None:
         if len(header.shape) != 3 or header.shape[1:] != (4, 4):
@@ -281,7 +281,7 @@ def read_poses(path: Path, frame_count: int, findings: Findings) -> NDArray[np.f
 
 
 def write_poses(path: Path, world_to_camera: NDArray[np.float64], *, overwrite: bool = True) -> None:
-    """Write poses [N, 4, 4] to a file.
+    """Write the inverses of world-to-camera poses [N, 4, 4] to a file.
 
     Raises:
         OSError: if it cannot be written.

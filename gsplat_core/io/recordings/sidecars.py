@@ -79,7 +79,7 @@ class Beside:
         return read_poses_bounds(path, self._images.frame_count, *self._size, self._findings) if path else None
 
     def poses_alone(self) -> NDArray[np.float64] | None:
-        """Read `poses.npy`: world-to-camera [N, 4, 4], or None."""
+        """Return the world-to-camera poses [N, 4, 4] of `poses.npy`; None if it is missing or has a problem."""
         path = self._file(POSES_FILE)
         return read_poses(path, self._images.frame_count, self._findings) if path else None
 

@@ -383,7 +383,9 @@ class Following:
         self._waiting.clear()
 
     def observe(self, step: TrainingStep, frame: Frame, observation: Observation, *, first: bool) -> None:
-        """Process a frame before the model is trained on it. `first` is True for the first frame of a scene."""
+        """Give the prior a frame before the model is trained on it. Unless `at_once` is set, only queue the frame for
+        `skip`, and ignore the `first` frame of a scene.
+        """
         if self._at_once:
             self._deliver(step, frame, observation)
         elif not first:

@@ -20,7 +20,7 @@ class Sway:
     periods_s: tuple[float, float, float, float] = (4.1, 5.3, 6.7, 4.7)
     """Periods in seconds of the motion along x, y and z, and of the roll."""
     reaches: tuple[float, float, float, float] = (1.0, 1.0, 1.0, 1.0)
-    """Factors on the usual amplitudes."""
+    """Factors on the usual amplitudes along x, y and z, and of the roll."""
     phases: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
 
     @classmethod

@@ -12,7 +12,7 @@ depends_on = None
 
 
 def upgrade() -> None:
-    """Create the two tables."""
+    """Create the tables `jobs` and `submissions`."""
     op.create_table(
         "jobs",
         sa.Column("number", sa.Integer, nullable=False, autoincrement=True),

@@ -13,12 +13,12 @@ COLUMNS = ("previous_frame_db", "next_frame_db")
 
 
 def upgrade() -> None:
-    """Add the two columns."""
+    """Add these columns to the table `jobs`."""
     for name in COLUMNS:
         op.add_column("jobs", sa.Column(name, sa.Float, nullable=True))
 
 
 def downgrade() -> None:
-    """Remove the two columns."""
+    """Remove these columns from the table `jobs`."""
     for name in reversed(COLUMNS):
         op.drop_column("jobs", name)

@@ -12,7 +12,7 @@ depends_on = None
 
 
 def upgrade() -> None:
-    """Create the table."""
+    """Create the table `recordings`."""
     op.create_table(
         "recordings",
         sa.Column("name", sa.String(64), nullable=False),

@@ -12,7 +12,7 @@ depends_on = None
 
 
 def upgrade() -> None:
-    """Create the three tables."""
+    """Create the tables `models`, `versions` and `activations`."""
     op.create_table(
         "models",
         sa.Column("name", sa.String(64), nullable=False),
