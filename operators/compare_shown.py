@@ -72,7 +72,6 @@ class CompareShownOp(Operator):
         self.result = ShownComparison(same, different, first, before.not_shown)
 
     def contribute(self, outcome: OutcomeBuilder) -> None:
-        """Add the comparison to the outcome of the run."""
         result = self.result
         outcome.add(result)
         if result.different:

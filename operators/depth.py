@@ -333,7 +333,6 @@ class DepthOp(Operator):
         op_output.emit(given, "frame")
 
     def contribute(self, outcome: OutcomeBuilder) -> None:
-        """Add the origins and coverage of the depth maps to the outcome of the run."""
         counts, finder = self._counts, self._finder
         if self.background is not None:
             counts, finder = counts + self.background.counts, self.background.finder

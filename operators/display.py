@@ -201,7 +201,6 @@ class DisplayOp(Operator):
             self.clock.shown(rendered.published_ns, shown_ns)
 
     def contribute(self, outcome: OutcomeBuilder) -> None:
-        """Add the statistics of the display to the outcome of the run."""
         ages, settled, used = self._ages.summary(), self._settled_ages.summary(), self._used_ages.summary()
         outcome.add(LiveDisplayResult(self.pictures, ages, settled, used, dict(self.states), self._first_ms))
 

@@ -121,7 +121,6 @@ class SourceOp(Operator):
             self._end()
 
     def contribute(self, outcome: OutcomeBuilder) -> None:
-        """Add the counts of read frames and the source's states to the outcome of the run."""
         counts = dict(self.source.counts()) if isinstance(self.source, ReportingSource) else {}
         outcome.add(
             SourceResult(

@@ -384,7 +384,7 @@ class MetricsOp(Operator):
             self._digest.add(shown.rendered)
 
     def _take(self, prediction: Prediction | None) -> None:
-        """Score the prediction of a frame. On a slow machine it arrives after its frame was scored."""
+        """Score the prediction of a frame, and keep the score until the frame is scored if it is not scored yet."""
         value = prediction_db(prediction)
         if prediction is None or not math.isfinite(value):
             return
@@ -461,7 +461,6 @@ class MetricsOp(Operator):
         return value
 
     def contribute(self, outcome: OutcomeBuilder) -> None:
-        """Add the scores, their baselines and the digest of the pictures to the outcome of the run."""
         if self.report:
             entries, per_entry = self.log.series(self.frames) if self.log is not None else ((), 1)
             if self.log is not None and self.frames:

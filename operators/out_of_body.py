@@ -96,7 +96,6 @@ class OutOfBodyGateOp(Operator):
         op_output.emit(frame, "frame")
 
     def contribute(self, outcome: OutcomeBuilder) -> None:
-        """Add the numbers of passed and withheld frames to the run's outcome."""
         outcome.add(OutOfBodyFrames(self.policy, self._passed, dict(self._withheld)))
         if self.policy == "off":
             outcome.note("no picture was examined for showing the outside of the body: the gate was off")

@@ -78,7 +78,6 @@ class PoseOp(Operator):
         )
 
     def contribute(self, outcome: OutcomeBuilder) -> None:
-        """Add the statistics of the pose estimation to the outcome of the run."""
         found = self._statistics()
         outcome.add(found)
         if not found.frames:

@@ -97,7 +97,6 @@ class RecordedToolMaskOp(Operator):
         op_output.emit(frame, "frame")
 
     def contribute(self, outcome: OutcomeBuilder) -> None:
-        """Add a note on frames without a tool mask to the run's outcome."""
         if self.without_mask:
             outcome.note(f"{self.without_mask} frames had no tool mask; all of their pixels counted as tissue")
 
@@ -185,7 +184,6 @@ class FoundToolMaskOp(Operator):
         return all_tissue(frame)
 
     def contribute(self, outcome: OutcomeBuilder) -> None:
-        """Add the counts of tool masks to the run's outcome."""
         share = self._tool_shares / self._found if self._found else 0.0
         outcome.add(FoundMasks(self.method, self._found, self._recorded, share, self._disbelieved))
         if self._disbelieved:
@@ -260,7 +258,6 @@ class OnnxToolMaskOp(FoundToolMaskOp):
         super().__init__(fragment, *args, make_finder=lambda: finder, method="onnx", **kwargs)
 
     def contribute(self, outcome: OutcomeBuilder) -> None:
-        """Add the counts of tool masks to the run's outcome."""
         super().contribute(outcome)
         if self.finder.not_finite:
             outcome.note(

@@ -246,7 +246,6 @@ class EveryFrame(Training):
         return learner.observe(frame, train=train)
 
     def contribute(self, outcome: OutcomeBuilder, counts: TrainingCounts) -> None:
-        """Add notes on frames without training to the outcome of the run."""
         if counts.withheld:
             reasons = ", ".join(f"{reason}: {count}" for reason, count in sorted(counts.withheld.items()))
             outcome.note(f"{sum(counts.withheld.values())} frames were withheld and not scored ({reasons})")
@@ -350,7 +349,6 @@ class UntilDisplay(Training):
             self._depth_ages.record(self._clock.now_ns() - frame.arrived_ns)
 
     def contribute(self, outcome: OutcomeBuilder, counts: TrainingCounts) -> None:
-        """Add notes on dropped frames and late depth to the outcome of the run."""
         if counts.renewed:
             outcome.note(f"the model fell behind the pictures and was started anew {counts.renewed} times")
         age_ms = self._depth_ages.summary().p50_ms
@@ -467,7 +465,6 @@ class RecordedCalls(Training):
         self.missing = seq if self.missing is None else self.missing
 
     def contribute(self, outcome: OutcomeBuilder, counts: TrainingCounts) -> None:
-        """Add notes on missing parts of the recording to the outcome of the run."""
         if self.missing is not None:
             outcome.note(
                 f"frame {self.missing} was trained on in the session and is not in its recording, or its depth is not: later pictures may differ"

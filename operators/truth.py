@@ -123,7 +123,6 @@ class TruthOp(Operator):
             mean.add(psnr_tissue_db(picture, image, where))
 
     def contribute(self, outcome: OutcomeBuilder) -> None:
-        """Add the scores against the ground truth to the outcome of the run."""
         own, last_seen, inpainted = self._own.mean, self._last_seen.mean, self._inpainted.mean
         behind = None
         if own is not None and last_seen is not None and inpainted is not None:

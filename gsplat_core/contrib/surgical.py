@@ -106,7 +106,7 @@ def masked_ssim(pred: Tensor, gt: Tensor, mask: Tensor) -> Tensor:
 def binocular_disparity_l1(
     pred_depth: Tensor, gt_depth: Tensor, mask: Tensor | None = None, eps: float = 1e-7
 ) -> Tensor:
-    """Return the mean difference of inverse depths where both are known, that is above `eps`.
+    """Return the mean absolute difference of inverse depths where both magnitudes exceed `eps` and `mask` is not 0.
 
     Raises:
         ValueError: if both shapes differ.

@@ -383,7 +383,7 @@ class BumpTensors(ContinuedField):
         return passed
 
     def _lay_out(self, places: slice, numbers: range, held: Tensor | None) -> None:
-        """Overwrite these tensor columns with new bumps of weight 0, or of weights that sum to `held` [N]."""
+        """Overwrite these tensor columns with new bumps of weight 0, or of weights that give the deltas `held` [N, 13]."""
         used = self.count
         for tensor, inert in self._tensors_and_fill():
             tensor[:used, places] = inert

@@ -100,7 +100,7 @@ class View:
 
 def difference(one: View, other: View) -> float:
     """Return the median difference of the pictures' log levels: 0 for equal pictures, 0.3 and more between scenes, 1 if
-    one picture is dark everywhere.
+    fewer than 2 % of the pixels are bright in both.
     """
     either = one.bright & other.bright
     if either.sum() < either.size // 50:

@@ -151,7 +151,7 @@ def find_outline(brightest: NDArray[np.uint8], darkest: NDArray[np.uint8]) -> Ou
         darkest: smallest level of each pixel in the window, uint8 [H, W].
 
     Returns:
-        The outline, or None without a surround.
+        The outline, or None if there is no clear dark surround or a side is below 16 pixels.
     """
     height, width = brightest.shape
     if min(height, width) < 16:

@@ -266,8 +266,8 @@ def _smooth(grey: NDArray[np.uint8], judged: NDArray[np.bool_]) -> float:
 
 
 def _straight(image: NDArray[np.uint8], lit: NDArray[np.bool_]) -> float:
-    """Return the agreement of edge directions inside the lit area [h, w]. Its own border, often of
-    a round or square view, is excluded.
+    """Return the agreement of edge directions inside the lit area [h, w] without its border, which often belongs to a
+    round or square view; 0 with too few edges.
     """
     size = _size(image, EDGES_SIDE_PX)
     grey = luma(averaged(image, size))

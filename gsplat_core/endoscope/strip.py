@@ -114,7 +114,6 @@ class _Band:
         self._count = 0
 
     def _of(self, plane: NDArray) -> NDArray:
-        """Return a view of the band in a picture."""
         return np.rot90(plane, self._turns)[-self._depth_px :]
 
     def add(self, image: NDArray[np.uint8]) -> None:

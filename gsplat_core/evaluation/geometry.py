@@ -337,7 +337,7 @@ def _known(frame: Frame, true: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 
 def _trajectory(ways: list[tuple[Pose, Pose]]) -> TrajectoryErrors | None:
-    """Compare the model's poses with the recording's. Returns None if the model uses the recording's poses."""
+    """Compare the model's poses with the recording's; None if they are equal, or for fewer than three frames."""
     if len(ways) < 3 or all(found is true or np.array_equal(found, true) for found, true in ways):
         return None
     return evaluate_trajectory(np.stack([found for found, _ in ways]), np.stack([true for _, true in ways]))

@@ -61,7 +61,8 @@ class NovelViewSums:
         self._seen, self._frames = 0.0, 0
 
     def add(self, view: Frame, seen: NDArray[np.bool_], picture: Any, left: Any, shifted: Any) -> None:
-        """Score a rendered picture and the baselines `left` and `shifted` against the view, over the pixels in `seen`.
+        """Score a rendered picture and the baselines against the view over the pixels `seen`. Leave out a view with a
+        smaller share of them than `LEAST_SEEN`.
 
         Args:
             view: frame of the novel view's camera.

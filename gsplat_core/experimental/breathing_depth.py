@@ -281,7 +281,9 @@ def _surface(window: _Window, camera: Camera, time_s: float) -> tuple[NDArray[np
 
 
 def _pulled(window: _Window, index: int, pose: Array, rays: Array, off: Array) -> tuple[Array, Array]:
-    """Return the relative depth change of pulled points against their periodic motion, and its uncertainty."""
+    """Return the relative depth change of points by a pull beside their periodic motion, and its uncertainty. The change
+    is 0 if no common direction is found.
+    """
     tracks = window.tracks
     near = range(max(0, index - PULL_FRAMES), min(len(tracks.times_s), index + PULL_FRAMES))
     seen = [tracks.seen[each] for each in near]

@@ -65,7 +65,7 @@ class LightWindow:
         return True
 
     def solve(self) -> None:
-        """Re-estimate the relief of every look jointly from all looks."""
+        """Re-estimate the reliefs of all pictures of the window jointly."""
         found = find_reliefs(self._grid, [look.shading for look in self.looks], self._changes)
         self._reliefs = [found.key + change for change in found.changes]
 

@@ -203,7 +203,6 @@ def _read(folder: Path, name: str, about: Mapping[str, Any]) -> Tensor:
 
 
 def _write_png(path: Path, picture: NDArray[np.uint8]) -> None:
-    """Write a picture of 1, 3 or 4 channels."""
     done, data = cv2.imencode(".png", _swapped(picture) if picture.shape[-1] >= 3 else picture)
     if not done:
         raise InvalidInput(f"a picture of shape {list(picture.shape)} cannot be written to {path.name}")

@@ -189,7 +189,7 @@ class LiveOdometry:
         self._motion = torch.eye(4, dtype=torch.float64)
 
     def _begin(self, picture: SmallPicture, frame: Frame) -> None:
-        """Start a new map from a picture of an unknown scene."""
+        """Start a new map from a picture of an unknown scene. With too few points, hold the pose instead."""
         self._tracks.begin(picture)
         new = self._tracks.take_up()
         if len(new) < FEWEST_POINTS:

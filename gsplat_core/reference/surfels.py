@@ -98,7 +98,7 @@ that is smaller than a pixel.
 
 
 SURFELS_AT_A_TIME = 2048
-"""Bounds the memory of a tile with very many surfels."""
+"""Largest number of a tile's surfels that are blended together, which bounds memory."""
 
 
 class _TileResult(NamedTuple):

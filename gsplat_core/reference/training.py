@@ -50,7 +50,9 @@ def accumulate_gradient_norms_(
     counts: Tensor,
     largest: Tensor | None = None,
 ) -> None:
-    """Add the lengths of screen gradients to the statistics (Kerbl et al. 2023, section 5.2)."""
+    """Add each visible Gaussian's screen gradient length to `sums` and its views to `counts` (Kerbl et al. 2023, section
+    5.2), and update its `largest` extent.
+    """
     visible = (radii > 0).all(-1)
     lengths = (gradients * gradients.new_tensor(scale)).norm(dim=-1)
     sums += torch.where(visible, lengths, 0).sum(0)

@@ -95,7 +95,7 @@ def _host_array(values: ImageLike) -> NDArray[Any]:
 
 
 def unit_image(image: NDArray[Any]) -> NDArray[np.float32]:
-    """Convert an image to float32 in 0..1."""
+    """Convert an image, uint8 or float in 0..1, to float32 in 0..1. Non-finite values become 0."""
     if image.dtype == np.uint8:
         return np.asarray(cv2.LUT(image, _UNIT_OF_BYTE), dtype=np.float32)
     return np.nan_to_num(image.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)

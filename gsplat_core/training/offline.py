@@ -234,7 +234,7 @@ class OfflineTraining:
         return self._correction * correction_at(share)
 
     def _next(self) -> Observation:
-        """Return the next observation in a random order of all."""
+        """Return the next observation: all in a random order, then all in another order, and so on."""
         if not self._order:
             self._order = self._random.permutation(len(self._observations)).tolist()
         return self._observations[self._order.pop()]

@@ -454,7 +454,7 @@ class Reconstructor:
         self._covering.begin(self.camera if is_captured else None, self.device, self._fixed_rows)
 
     def _first_gaussians(self, frame: Frame, observation: Observation) -> Gaussians:
-        """Create the first Gaussians of a scene, and set its camera and start time from the frame."""
+        """Create the first Gaussians of a scene, or return those of a recognised place. Set camera and start time."""
         self._first_time_s, self.camera = observation.time_s, observation.camera
         recognised = self._left.recognised(frame.seq)
         if recognised is not None:

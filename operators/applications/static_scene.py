@@ -269,7 +269,6 @@ def _train(
 
 
 def _save(trainer: StaticTrainer, folder: Path) -> None:
-    """Write the bundle and the `.ply` file of the current state."""
     gaussians = trainer.gaussians()
     with storage_errors(folder):
         save_bundle(Model(1, gaussians, None, trainer.first_camera, (0.0, 0.0)), folder / MODEL_FOLDER)

@@ -225,7 +225,6 @@ class HoloscanScheduler:
             self._over.set()
 
     def _application(self, graph: Graph) -> Any:
-        """Create the SDK application of the graph."""
         outer, tasks = self, graph.tasks
         edges = cast("list[CarriedEdge]", [edge for _, edge, _ in graph.ends])
 

@@ -165,7 +165,7 @@ class MultiThreadScheduler:
             raise self._interrupt
 
     def _work(self, graph: Graph, task: OperatorTask, prepared: threading.Barrier) -> None:
-        """Main function of an operator's thread."""
+        """Prepare an operator's thread, wait for those of the others, then compute whenever the operator is ready."""
         try:
             task.prepare_thread()
             prepared.wait()

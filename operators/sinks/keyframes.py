@@ -67,7 +67,6 @@ class KeyframesOp(Operator):
             self._worst = scored
 
     def contribute(self, outcome: OutcomeBuilder) -> None:
-        """Add the key frames to the outcome of the run."""
         outcome.add(KeyframesResult(tuple(self.keyframes), self.worst_seq))
 
     @property

@@ -191,7 +191,6 @@ class VideoSinkOp(Operator):
         self.displayed += 1
 
     def contribute(self, outcome: OutcomeBuilder) -> None:
-        """Add the video to the outcome of the run."""
         outcome.add(DisplayResult(self.displayed))
         if self.displayed and self.path.exists():
             outcome.output("video", self.path)
@@ -256,7 +255,6 @@ class OutputVideosOp(Operator):
             video.write(picture if picture.shape[:2] == size else fitted(picture, *size), rendered.frame.time_s)
 
     def contribute(self, outcome: OutcomeBuilder) -> None:
-        """Add the names of the written videos to the outcome of the run."""
         for name in self.names:
             if (path := self.folder / video_name(name)).exists():
                 outcome.output(f"video_{name}", path)

@@ -266,7 +266,7 @@ class ThreadedSource:
         """
 
     def _run(self, stop: threading.Event) -> None:
-        """Main function of the reader's thread."""
+        """Queue the frames of `frames()` in the reader's thread, and keep its exception for `read`."""
         error: BaseException | None = None
         try:
             frames = self.frames()

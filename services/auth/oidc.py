@@ -184,7 +184,7 @@ class OpenIdPersons:
 
 
 def _claim(claims: Mapping[str, Any], path: str) -> Any:
-    """Return a claim by its name or dotted path."""
+    """Return a claim by its name or dotted path; None if it is missing."""
     if path in claims:
         return claims[path]
     found: Any = claims

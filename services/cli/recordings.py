@@ -124,7 +124,6 @@ def _about_focal_length(focal: FocalLength | None, camera: Camera) -> str:
 
 
 def _about_breathing(found: Trajectory, focal_px: float) -> list[str]:
-    """Describe the detected tissue motion."""
     if found.breathing is not None:
         frequencies = " and ".join(f"{hz:.2f}" for hz in found.breathing.frequencies_hz)
         share = found.breathing.uncertain / max(found.path, 1e-9)

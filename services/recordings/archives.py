@@ -185,7 +185,7 @@ def _is_left_out(info: zipfile.ZipInfo) -> bool:
 
 
 def _without_their_common_folder(entries: list[Entry]) -> list[Entry]:
-    """Strip a common top folder, because often the recording's folder itself was packed."""
+    """Strip a common top folder, because often the recording's folder itself was packed; keep one of `_OF_A_LAYOUT`."""
     first = {entry.path.parts[0] for entry in entries}
     if len(first) != 1 or first & _OF_A_LAYOUT or any(len(entry.path.parts) == 1 for entry in entries):
         return entries

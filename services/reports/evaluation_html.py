@@ -128,7 +128,7 @@ def tiles_section(report: EvaluationReport) -> str:
 
 
 def table_section(report: EvaluationReport) -> str:
-    """Return the table of protocols and baselines."""
+    """Return the table of the scores of protocols and baselines; empty without any."""
     found = measured(report)
     known = [value for each in report.baselines if (value := each.psnr_tissue_db) is not None]
     known += [value for each in found if (value := each.score.psnr_tissue_db) is not None]
@@ -197,7 +197,7 @@ def _left_out(report: EvaluationReport) -> str:
 
 
 def ages_section(report: EvaluationReport) -> str:
-    """Return the table of picture ages at display."""
+    """Return the table of picture ages at display; empty without scores of a live run."""
     live = report.live
     if live is None:
         return ""
@@ -230,7 +230,7 @@ def ages_section(report: EvaluationReport) -> str:
 
 
 def depth_section(report: EvaluationReport) -> str:
-    """Return the depth errors on the held-out frames."""
+    """Return the table of depth errors on the held-out frames; empty without them."""
     depth = None if report.heldout is None else report.heldout.depth
     if depth is None:
         return ""
@@ -246,7 +246,7 @@ def depth_section(report: EvaluationReport) -> str:
 
 
 def places_section(report: EvaluationReport) -> str:
-    """Return the table of revisited places."""
+    """Return the table of scores at revisited places; empty without such places."""
     if report.retention is None or not report.retention.places:
         return ""
     heads = "".join(

@@ -27,7 +27,7 @@ def tile(name: str, value: str, unit: str, more: str) -> str:
 
 
 def against(psnr_db: float | None, baseline_db: float | None) -> str:
-    """Return HTML with the gain of a PSNR over the previous-frame baseline, and the baseline, in dB."""
+    """Return HTML with the gain of a PSNR over the previous-frame baseline, and that baseline, in dB, if both are known."""
     if psnr_db is None or baseline_db is None:
         return "no baseline"
     gain = psnr_db - baseline_db
@@ -97,7 +97,7 @@ def _display_path(report: RunReport) -> str:
 
 
 def pictures_section(keyframes: Sequence[KeyframePictures], worst_seq: int | None, report: RunReport) -> str:
-    """Return the picture table: raw picture, reconstruction, error and depth of each key frame."""
+    """Return the table with raw picture, reconstruction, error and depth of each key frame; empty without any."""
     if not keyframes:
         return ""
     cells = ["".join(f'<div class="head">{name}</div>' for name in ("Raw", "Reconstruction", "Error", "Depth"))]
@@ -278,7 +278,7 @@ def _longest_paths(report: RunReport) -> dict[str, str]:
 
 
 def latency_section(report: RunReport) -> str:
-    """Return the latency distribution from the source to each leaf operator."""
+    """Return the latency distribution from the source to each leaf operator; empty without measurements."""
     paths = _longest_paths(report)
     if not paths:
         return ""

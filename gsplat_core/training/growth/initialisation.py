@@ -168,7 +168,9 @@ def facing(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def tissue_colours(frame: Frame) -> NDArray[np.uint8]:
-    """Return the picture with tools in-painted from the surrounding tissue, RGB uint8 [H, W, 3]."""
+    """Return the picture, RGB uint8 [H, W, 3], with tools in-painted from the surrounding tissue; unchanged without
+    tissue.
+    """
     if frame.mask is None or frame.mask.all() or not frame.mask.any():
         return frame.image
     bare_tool = (frame.mask == 0).astype(np.uint8)
@@ -327,7 +329,7 @@ def _without_tools(frame: Frame, image: Tensor) -> Tensor:
 
 
 def _blurred(picture: Tensor, sigma_px: float) -> Tensor:
-    """Blur `picture` [C, H, W] with a Gaussian and reflected borders."""
+    """Blur `picture` [C, H, W] with a Gaussian and reflected borders; a picture too small for it is unchanged."""
     reach = max(1, math.ceil(3 * sigma_px))
     height, width = picture.shape[1:]
     if min(height, width) <= reach:

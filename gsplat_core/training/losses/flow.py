@@ -105,7 +105,7 @@ def _picture(observation: Observation) -> tuple[Tensor, Tensor]:
 
 
 def _compared_size(camera: Camera) -> Camera:
-    """Return the camera at the reduced size at which flow is compared."""
+    """Return the camera at half its size, at which flow is compared; unchanged if its picture is small."""
     if camera.width_px * camera.height_px <= SMALL_PIXELS:
         return camera
     return camera.resized(camera.width_px // 2, camera.height_px // 2)

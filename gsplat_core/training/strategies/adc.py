@@ -129,7 +129,7 @@ class DefaultStrategy(Strategy):
             reset_opa(params, optimizers, state, value=2 * self.prune_opa)
 
     def _update_state(self, params: Params, state: dict[str, Any], info: dict[str, Any], packed: bool = False) -> None:
-        """Add the gradients of one step to the statistics."""
+        """Add the gradients, views and, if used, radii of one step to the statistics."""
         centres, width, height, cameras, radii = (
             self._needed(info, name) for name in (self.key_for_gradient, "width", "height", "n_cameras", "radii")
         )

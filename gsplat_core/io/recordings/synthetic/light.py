@@ -134,7 +134,7 @@ class Air:
         return cls(smoke, exposure_changes, np.clip(1 + 0.55 * soft / soft.std(), 0, None).astype(np.float32))
 
     def exposure_at(self, time_s: float) -> float:
-        """Return the exposure factor at a time; 1 at time 0."""
+        """Return the exposure factor at a time; 1 at time 0, and always for a constant exposure."""
         if not self.exposure_changes:
             return 1.0
         stops = zip(EXPOSURE_STOPS, EXPOSURE_PERIODS_S, strict=True)
