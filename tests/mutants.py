@@ -6,7 +6,7 @@
     python -m tests.mutants --survivors out/mutants.jsonl   # only survivors of an earlier run
 
 A mutant is a module with one changed expression: a comparison reversed or shifted at its boundary,
-an arithmetic operator or number replaced, `and` swapped with `or`, `min` with `max`, a condition
+an arithmetic operator or number replaced (a tiny one by 0), `and` swapped with `or`, `min` with `max`, a condition
 negated, or a call removed. One pytest session collects the tests and runs each mutant in a fork of
 itself. There the code of the changed function is replaced in the loaded functions. Processes that
 tests start, and modules not yet imported, import the mutant in place of the module. A change outside
@@ -68,6 +68,9 @@ COMPARISONS: dict[type[ast.cmpop], tuple[type[ast.cmpop], ...]] = {
 OPERATORS: dict[type[ast.operator], type[ast.operator]] = {
     ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.FloorDiv: ast.Mult, ast.Mod: ast.Mult,
 }  # fmt: skip
+TINY = 1e-5
+"""Smaller numbers are replaced by 0, others multiplied. A floor against division by zero a hundred times as large still has no effect
+on other values, so that no test could notice it; without the floor, a test of its case fails."""
 EXCHANGED = {"min": "max", "max": "min", "any": "all", "all": "any", "minimum": "maximum", "maximum": "minimum"}
 COUNTS = {
     "count", "counts", "frames", "bytes", "number", "seq", "size", "rows", "columns", "attempts", "characters", "points",
@@ -231,7 +234,7 @@ def _changes(node: ast.AST) -> list[tuple[str, Callable[[], None]]]:
     if isinstance(node, ast.If | ast.IfExp) and not _only_types(node.test):
         return [("condition", lambda: setattr(node, "test", ast.UnaryOp(ast.Not(), node.test)))]
     if isinstance(node, ast.Constant) and type(node.value) in (int, float) and node.value not in (0, 1, -1, 2):
-        factor = 100 if isinstance(node.value, float) else 2
+        factor = 2 if isinstance(node.value, int) else 0 if abs(node.value) < TINY else 100
         return [("number", lambda: setattr(node, "value", node.value * factor))]
     if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in EXCHANGED:
         return [("min/max", lambda: setattr(node.func, "id", EXCHANGED[node.func.id]))]

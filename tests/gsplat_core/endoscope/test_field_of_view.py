@@ -234,3 +234,44 @@ def test_a_window_of_thirty_frames_is_judged_by_the_brightest_and_darkest_level_
             shown = window
         for each, expected in zip(found, (shown.max(0), shown.min(0)), strict=True):
             assert np.abs(each.astype(int) - expected).max() <= 1
+
+
+def polygon(corners, radii=(100.0, 90.0), centre=(160.0, 128.0)):
+    angles = np.linspace(0, 2 * np.pi, corners, endpoint=False)
+    return np.stack([centre[0] + radii[0] * np.cos(angles), centre[1] + radii[1] * np.sin(angles)], 1)
+
+
+@pytest.mark.parametrize("radii", [(100.0, 90.0), (90.0, 100.0), (150.0, 140.0)])
+def test_a_round_outline_becomes_the_ellipse_within_its_bounding_box(radii):
+    """The hull of 24 corners is at most 0.9 % of the radius inside of the ellipse."""
+    hull = polygon(24, radii)
+    hull = np.clip(hull, 0, [WIDTH - 1, HEIGHT - 1])  # a larger field is cut off by the picture
+    found = field_of_view._as_ellipse(hull, (HEIGHT, WIDTH))
+    assert len(found) > len(hull)
+    assert (found >= hull.min(0) - 1e-9).all() and (found <= hull.max(0) + 1e-9).all()
+    free = found[(found[:, 1] > 0) & (found[:, 1] < HEIGHT - 1)]
+    off = np.hypot(*((free - (160, 128)) / radii).T) - 1
+    assert np.abs(off).max() < 0.02 and len(free) > 90
+
+
+@pytest.mark.parametrize(
+    "hull",
+    [
+        np.array([[60.0, 60], [260, 60], [260, 200], [60, 200]]),
+        polygon(3),
+        polygon(40, (100.0, 50.0)),  # more than 0.6 times as long as wide is no field
+        polygon(15, (2.0, 2.0)),  # fewer than twenty points
+    ],
+    ids=["rectangle", "triangle", "long", "small"],
+)
+def test_another_outline_stays_as_it_is(hull):
+    assert field_of_view._as_ellipse(hull, (HEIGHT, WIDTH)) is hull
+
+
+@pytest.mark.parametrize(("dented", "is_round"), [(0.2, True), (0.5, False)])
+def test_an_ellipse_needs_seven_tenths_of_the_outline(dented, is_round):
+    """A straight side cuts off a share of the outline."""
+    angles = np.linspace(-np.pi * (1 - dented), np.pi * (1 - dented), 200)
+    hull = np.stack([160 + 100 * np.cos(angles), 128 + 100 * np.sin(angles)], 1)
+    found = field_of_view._as_ellipse(hull, (HEIGHT, WIDTH))
+    assert (found is hull) != is_round

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gsplat_core.endoscope.mask_and_depth import DepthCheck, MaskCheck
+from gsplat_core.endoscope.mask_and_depth import SAMPLES, DepthCheck, MaskCheck, _some
 
 
 def mask(tool_columns, size=40):
@@ -80,3 +80,12 @@ def test_nothing_raises(height, width, dtype, seed):
     found = DepthCheck().checked(depth)
     assert found.depth is None or np.isfinite(found.depth).all()
     MaskCheck().fault(rng.integers(0, 2, (height, width), np.uint8), 0)
+
+
+@pytest.mark.parametrize("shape", [(1024, 4096), (4096, 1024), (40, 60)])
+def test_samples_of_a_large_plane_are_counted_along_its_shorter_side(shape):
+    rows, columns = np.mgrid[: shape[0], : shape[1]]
+    found = _some(rows * 10_000 + columns)
+    assert min(found.shape) == min(SAMPLES, min(shape) // 4)
+    step = shape[0] // found.shape[0]
+    assert found[1, 2] == step * 10_000 + 2 * step

@@ -68,6 +68,14 @@ def test_patches_below_fourteen_of_ten_thousand_pixels_are_speckles(side, is_kep
     assert found[20, 20] == pytest.approx(0.9 if is_kept else 0.2) and found[0, 0] == 0
 
 
+@pytest.mark.parametrize(("step", "is_kept"), [(1, True), (2, False), (-1, True), (-2, False)])
+def test_a_patch_one_and_a_half_labels_from_its_surroundings_is_no_speckle(step, is_kept):
+    labels, confidence = np.full((50, 100), 10.0, np.float32), np.full((50, 100), 0.8, np.float32)
+    labels[20:22, 20:22] += step
+    found = multiview._without_speckles(labels, confidence)
+    assert found[20, 20] == pytest.approx(0.8 if is_kept else 0.2) and found[0, 0] == pytest.approx(0.8)
+
+
 @pytest.mark.parametrize("is_right", [True, False])
 def test_the_first_depth_of_a_stream_waits_for_a_second_that_agrees(monkeypatch, is_right):
     """The scope slides by 1 per frame before waves. A second depth that is deep where the first is high contradicts it."""

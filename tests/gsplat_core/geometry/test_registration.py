@@ -13,6 +13,8 @@ from gsplat_core.errors import InvalidSetting
 from gsplat_core.geometry.mesh import mesh_of_depth
 from gsplat_core.geometry.registration import (
     ClosestPoints,
+    _middles,
+    _step,
     closest_on_triangles,
     distances,
     from_pairs,
@@ -215,3 +217,37 @@ def test_points_nearly_on_a_line_decide_no_rotation():
     bent[2] = line[2] + [1e-8, 0.0, 0.0]
     with pytest.raises(InvalidSetting, match="collinear"):
         from_pairs(bent, bent)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 7])
+def test_samples_of_a_triangle_are_the_centroids_of_its_equal_parts(n):
+    """Coordinates in units of the parts are thirds; their whole numbers name the part."""
+    found = _middles(n) * n
+    assert found.shape == (n * n, 3)
+    np.testing.assert_allclose(found.sum(1), n)
+    whole = np.floor(found)
+    assert len({tuple(row) for row in whole}) == n * n and (whole >= 0).all()
+    upright = whole.sum(1) == n - 1  # the others are turned
+    assert upright.sum() == n * (n + 1) // 2
+    np.testing.assert_allclose(found - whole, np.where(upright, 1 / 3, 2 / 3)[:, None].repeat(3, 1), atol=1e-9)
+
+
+def test_a_step_of_points_at_one_place_is_refused():
+    """The size of the points is 0, by which their lever arms are divided."""
+    normals = np.eye(3).repeat(4, 0)
+    with pytest.raises(InvalidSetting, match="slide on each other"):
+        _step(np.ones((12, 3)), normals, np.full(12, 0.1))
+
+
+@pytest.mark.parametrize(("size", "is_refused"), [(1e-4, True), (1e-2, False)])
+def test_a_step_is_refused_if_one_motion_is_a_thousandth_as_certain_as_another(size, is_refused):
+    """Normals that differ from one direction by `size`: two shifts are known by `size` relative to the third."""
+    points = np.random.default_rng(0).normal(size=(60, 3))
+    normals = np.tile([0.0, 0, 1], (60, 1))
+    normals[::3, 0], normals[1::3, 1] = size, size
+    gaps = normals @ [0.1, -0.2, 0.3]
+    if is_refused:
+        with pytest.raises(InvalidSetting, match="slide on each other"):
+            _step(points, normals, gaps)
+    else:
+        np.testing.assert_allclose(_step(points, normals, gaps)[:3, 3], [-0.1, 0.2, -0.3], atol=1e-6)

@@ -14,7 +14,7 @@ from gsplat_core.scene.depth_origin import DEPTH_ORIGINS, DepthOrigin
 from gsplat_core.scene.depth_source import DepthSource
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.placement import MOST_LATE
+from gsplat_core.training.placement import MOST_LATE, LateDepth
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.schedule import LiveTraining
 
@@ -188,3 +188,18 @@ def distance_on_gpu(made: Reconstructor, k: int) -> float:
     with torch.no_grad():
         output = render(made.snapshot().at(frame_at(k).time_s), CAMERA, depth=True)
     return float(output.depth.median().cpu())
+
+
+@pytest.mark.parametrize("known", [0, 1, 48 * 64])
+def test_late_depth_is_prepared_if_it_is_known_somewhere(known: int) -> None:
+    depth = np.zeros(48 * 64, np.float32)
+    depth[:known] = 50.0
+    frame = Frame(0, 0, np.full((48, 64, 3), 90, np.uint8), depth=depth.reshape(48, 64))
+    late, only = LateDepth.of(frame, "cpu", places=True), LateDepth.for_placement(frame, "cpu")
+    if not known:
+        assert late.possible is late.everywhere is only.possible is None
+        return
+    assert late.possible is not None and late.everywhere is not None and only.possible is not None
+    assert int((late.possible > 0).sum()) == int((only.possible > 0).sum()) == known
+    assert torch.allclose(late.everywhere, torch.tensor(50.0), rtol=1e-4)
+    assert LateDepth.of(frame, "cpu").everywhere is None
