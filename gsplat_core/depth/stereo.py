@@ -40,7 +40,7 @@ from gsplat_core.scene.frames import Frame
 from gsplat_core.transfers import HostCopy, tensor_of
 
 EDGE_ERROR_PX = 1.5
-"""Standard deviation of matched disparities near edges and holes, in pixels."""
+"""Standard deviation in pixels of an additional error of matched disparities near edges and holes."""
 SMOOTHNESS, SMOOTH_GREY = 100.0, 5.0
 """Strength of the edge-aware filter, and the difference of grey values at which the strength falls to 1/e."""
 LEAST_VARIANCE_PX2 = 0.05

@@ -32,9 +32,9 @@ first key frame and the newest `WINDOW` are kept.
 NEIGHBOURS = 5
 """Number of known points around a new point whose median depth initialises it."""
 MOST_SIGHTINGS = 1500
-"""Budget of an adjustment. The number of steps is this value divided by the number of adjusted observations."""
+"""Number of observations whose adjustment takes one step; fewer are adjusted in several, up to `MOST_ROUNDS`."""
 MOST_ROUNDS = 5
-"""Largest number of steps per adjustment, whatever the budget of observations."""
+"""Largest number of steps of an adjustment."""
 
 
 @dataclass

@@ -55,7 +55,8 @@ def next_capacity(capacity: int, length: int) -> int:
 class SingleCall:
     """Native call for arguments of one kind: its options, computed once for all calls with the same signature.
 
-    Also stores how long the tile lists of the last call were, so that the next call need not wait for their length.
+    Also reserves memory for the tile lists by their length in the last call, so that the kernels of the next call are
+    enqueued before its own length is known.
     """
 
     def __init__(self, arguments: Arguments, settings: RenderSettings) -> None:

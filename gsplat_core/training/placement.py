@@ -89,10 +89,9 @@ CORRECTED_PX = 16
 
 
 def smooth_factor(depth: Tensor, shown: Tensor, known: Tensor, pixels: Tensor) -> Tensor:
-    """Return a smooth factor [N] for the depth of Gaussians.
-
-    Neighbours get the same factor, since tissue moves smoothly. Different factors would also reorder Gaussians along
-    the line of sight and change the picture.
+    """Return factors [N] that move Gaussians a share (`SHARE`) of the way from the shown to the target depth, at most by
+    `LARGEST_STEP`. Neighbours get the same factor, because tissue moves smoothly, and different ones would reorder
+    Gaussians along the line of sight.
 
     Args:
         depth: target depth [H, W].

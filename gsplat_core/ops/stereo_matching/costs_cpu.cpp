@@ -26,7 +26,7 @@ GSPLAT_INLINE Row take_row(uint8_t*& scratch, int64_t size) {
   return {{each[0], each[1], each[2]}, {each[3], each[4], each[5]}};
 }
 
-// Compute the ranges of a row of values.
+// Copy a row of values; write the smallest and the largest of each value and its means with both neighbours.
 GSPLAT_INLINE void fill_range(const uint8_t* values, int64_t width, const Range& to) {
   const auto fill = [&](int64_t x, int64_t l, int64_t r) {
     const int here = values[x], before = (here + values[l]) >> 1, after = (here + values[r]) >> 1;
