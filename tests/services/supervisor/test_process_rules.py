@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import signal
 from types import SimpleNamespace
 from typing import Any
@@ -289,3 +290,158 @@ def test_closing_ends_the_process(runtime):
         "theatre", "engine", "stopped", "why", 7,
     )  # fmt: skip
     assert (process.state.state, process.state.reason, process.state.pid) == ("stopped", "why", None)
+
+
+def recorded(identity: Any, digest: str) -> Any:
+    return SimpleNamespace(identity=identity, spec_digest=digest)
+
+
+def test_a_running_process_is_adopted_if_its_settings_are_these(runtime, monkeypatch):
+    process, identity = managed(runtime, start=Starter()), Identity(signal.SIGTERM)
+    monkeypatch.setattr(process._folder, "record", lambda role: recorded(identity, process._spec.digest))
+    process._heartbeat, process._well_s, process._shown = {"state": "ended"}, 5.0, (3, 5.0)
+    process._rate.tell(1, 0.0)
+    process._rate.tell(2, 1.0)
+    assert asyncio.run(process._running()) is identity is process._identity
+    ((event),) = process.events
+    assert (event.kind, event.reason, event.pid) == ("adopted", "it ran already", 7)
+    assert not identity.signals and not process._start.started
+    # What the last process said does not count for this one.
+    assert (process._heartbeat, process._well_s, process._shown, process._rate.hz) == (None, 0.0, (0, 0.0), None)
+
+
+def test_a_running_process_with_other_settings_is_replaced(runtime, monkeypatch):
+    process, identity = managed(runtime, start=Starter()), Identity(signal.SIGTERM)
+    monkeypatch.setattr(process._folder, "record", lambda role: recorded(identity, "others"))
+    assert asyncio.run(process._running()) is None, "the starter cannot start it"
+    assert [event.kind for event in process.events] == ["replaced"] and process.events[0].pid == 7
+    assert signal.SIGTERM in identity.signals and len(process._start.started) == 1
+
+
+def kept(
+    process: ManagedProcess, monkeypatch: pytest.MonkeyPatch, how: list[str | None], *, other: bool = False
+) -> Any:
+    """Supervise a process through some ends; None is a start that failed. Return the waits between them in seconds."""
+    waits: list[float] = []
+    ends, cleaned = iter(how), []
+
+    async def running() -> Any:
+        return None if how[len(waits)] is None else Identity()
+
+    async def watched(identity: Any) -> str:
+        process._identity = identity
+        return str(next(ends))
+
+    async def sleep(seconds: float) -> None:
+        waits.append(seconds)
+        if len(waits) == len(how):
+            raise asyncio.CancelledError
+
+    monkeypatch.setattr(process, "_running", running)
+    monkeypatch.setattr(process, "_watched", watched)
+    monkeypatch.setattr(process._folder, "clean", cleaned.append)
+    monkeypatch.setattr(processes, "asyncio", SimpleNamespace(sleep=sleep))
+    with pytest.raises(asyncio.CancelledError):
+        asyncio.run(process._keep())
+    assert cleaned == [process._role] * len(how)
+    return waits
+
+
+def test_a_process_that_ends_again_and_again_waits_longer_before_each_start(runtime, monkeypatch, clock):
+    process = managed(runtime)
+    waits = kept(process, monkeypatch, ["signal 9"] * 9)
+    assert waits[0] == 0 and waits[1:] == sorted(waits[1:]) and waits[1] > 0
+    assert waits[-1] == waits[-2] == processes.MOST_S
+    assert process.causes and sum(process.causes.values()) == 9
+    assert process._identity is None and process.state.state == "failed" and process.state.reason == "signal 9"
+    assert [event.kind for event in process.events] == ["ended"] * 9
+
+
+def test_a_process_that_worked_well_is_started_at_once(runtime, monkeypatch, clock):
+    process = managed(runtime)
+    process._well_s = clock.s - 3600
+    assert kept(process, monkeypatch, ["signal 9"]) == [0.0]
+    assert process.state.state == "down"
+    assert kept(managed(runtime), monkeypatch, [None])[0] == 0.0
+
+
+def test_after_an_end_that_no_start_can_mend_the_last_words_are_the_reason(runtime, monkeypatch, clock):
+    process = managed(runtime)
+    process._folder.log("engine").write_text("Traceback\nValueError: the last words\n", encoding="utf-8")
+    monkeypatch.setattr(processes, "is_of_no_use", lambda how: True)
+    monkeypatch.setattr(processes, "last_words", lambda log: log.read_text().splitlines()[-1])
+    assert kept(process, monkeypatch, ["exit code 2"]) == [processes.MOST_S]
+    assert process.state.state == "failed" and process.state.reason == "ValueError: the last words"
+    monkeypatch.setattr(processes, "last_words", lambda log: None)
+    assert kept(process, monkeypatch, ["exit code 2"]) == [processes.MOST_S]
+    assert process.state.reason == "exit code 2"
+
+
+def test_a_process_that_another_one_serves_already_is_adopted_without_an_end(runtime, monkeypatch):
+    process, rounds = managed(runtime), []
+
+    async def running() -> Any:
+        rounds.append(None)
+        if len(rounds) == 3:
+            raise asyncio.CancelledError
+        return Identity()
+
+    async def watched(identity: Any) -> str:
+        return "signal 9"
+
+    monkeypatch.setattr(process, "_running", running)
+    monkeypatch.setattr(process, "_watched", watched)
+    monkeypatch.setattr(process._folder, "record", lambda role: recorded(Identity(), "any"))
+    with pytest.raises(asyncio.CancelledError):
+        asyncio.run(process._keep())
+    assert process.events == [] and not process.causes and len(rounds) == 3
+
+
+def test_only_a_process_that_spoke_is_pinged(runtime, monkeypatch):
+    asked, rounds = [], []
+    process = managed(runtime)
+
+    async def ask(endpoint: Any, command: str, **arguments: Any) -> None:
+        asked.append((command, arguments["supervisor"]["pid"]))
+
+    async def sleep(seconds: float) -> None:
+        rounds.append(seconds)
+        if len(rounds) == 2:
+            process._identity = Identity()  # type: ignore[assignment]
+        if len(rounds) == 3:
+            process._heartbeat = {}
+        if len(rounds) == 5:
+            raise asyncio.CancelledError
+
+    monkeypatch.setattr(processes, "ask_async", ask)
+    monkeypatch.setattr(processes, "asyncio", SimpleNamespace(sleep=sleep))
+    with pytest.raises(asyncio.CancelledError):
+        asyncio.run(process._ping())
+    assert asked == [("ping", os.getpid())] * 2
+
+
+def test_heartbeats_of_the_supervised_process_count(runtime, monkeypatch):
+    """Those of an earlier process and texts that are no heartbeats are passed over."""
+    heard = [b'{"pid": 6, "state": "ended"}', b"nonsense", b'{"pid": 7, "state": "live"}']
+    closed = []
+
+    class Socket:
+        async def recv(self) -> bytes:
+            if not heard:
+                raise asyncio.CancelledError
+            return heard.pop(0)
+
+        def close(self) -> None:
+            closed.append(None)
+
+    process = managed(runtime)
+    process._identity = Identity()  # type: ignore[assignment]
+
+    def subscribe(socket: Any, endpoint: Any, waiting: int) -> Socket:
+        socket.close()
+        return Socket()
+
+    monkeypatch.setattr(processes, "subscribe", subscribe)
+    with pytest.raises(asyncio.CancelledError):
+        asyncio.run(process._listen())
+    assert process._heartbeat == {"pid": 7, "state": "live"} and closed == [None]

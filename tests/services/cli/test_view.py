@@ -1,0 +1,156 @@
+"""`intrasplat view` and `intrasplat igtl`: what is refused, where a model is read from, and what is served."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from gsplat_core.errors import BundleError, InvalidSetting
+from gsplat_core.io.bundle import save_bundle
+from gsplat_core.rendering.renderer import RendererOptions
+from services.cli import view as view_module
+from services.cli.exit_codes import OK
+from services.cli.view import bundle_in, igtl_command, view_command
+from tests.gsplat_core.io.exports.test_exports import random_model
+
+HERE = {"plaintext": False, "options": RendererOptions(), "device": "cpu"}
+
+
+class Server:
+    """Stand-in for a server of a model."""
+
+    made: list[tuple[Any, ...]] = []
+    address = "127.0.0.1", 18080
+
+    def __init__(self, *arguments: Any) -> None:
+        self.made.append(arguments)
+        self.ran = self.closed = False
+
+    def __enter__(self) -> Server:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.closed = True
+
+    def run(self, interrupt: Any) -> None:
+        self.ran = not interrupt()
+
+    def close(self) -> None:
+        self.closed = True
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> Path:
+    save_bundle(random_model(field=False), tmp_path / "model")
+    return tmp_path / "model"
+
+
+@pytest.fixture
+def made(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
+    monkeypatch.setattr(Server, "made", [])
+    for name in ("ModelView", "PictureView", "MessageServer"):
+        monkeypatch.setattr(view_module, name, type(name, (Server,), {}))
+    monkeypatch.setattr(view_module, "Pictures", lambda *given: given)
+    return Server.made
+
+
+def test_a_model_is_served_until_an_interrupt(model: Path, made: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
+    assert view_command(model, "127.0.0.1", 8, renderer=None, **HERE) == OK
+    ((shown, host, port),) = made
+    assert (host, port) == ("127.0.0.1", 8) and shown.gaussians.count == random_model(field=False).gaussians.count
+    assert "http://127.0.0.1:18080/" in capsys.readouterr().err
+    assert view_command(model, "localhost", 9, renderer="alpha", **HERE) == OK
+    (_, renderer, _, device), window_s, *address = made[1]
+    assert (renderer, device, address) == ("alpha", "cpu", ["localhost", 9]) and window_s == shown.time_window_s
+
+
+@pytest.mark.parametrize(
+    ("changed", "reason"),
+    [
+        ({"device": "cuda"}, "give --renderer"),
+        ({"options": replace(RendererOptions(), supersampling=2)}, "give --renderer"),
+        ({"renderer": "nothing"}, "nothing"),
+        ({"host": "10.0.0.1"}, "beyond this machine"),
+        ({"host": "0.0.0.0", "renderer": "alpha"}, "beyond this machine"),
+    ],
+)
+def test_a_view_is_refused_before_the_model_is_read(
+    made: list[Any], tmp_path: Path, changed: dict[str, Any], reason: str
+) -> None:
+    given = {"host": "127.0.0.1", "port": 8, "renderer": None, **HERE, **changed}
+    with pytest.raises(InvalidSetting, match=reason):
+        view_command(tmp_path / "none", **given)
+    assert made == []
+
+
+def test_pictures_are_sent_to_clients_and_the_counts_printed(
+    made: list[Any], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    sent = []
+
+    def send(endpoint: Any, messages: Any, server: Any, interrupt: Any) -> dict[str, int]:
+        assert not server.closed
+        sent.append((endpoint, messages, server))
+        return {"pictures": 3}
+
+    monkeypatch.setattr(view_module, "folder_of", lambda runtime, stream: SimpleNamespace(endpoint=lambda kind: f"{runtime.name}/{stream}/{kind}"))  # fmt: skip
+    monkeypatch.setattr(view_module, "StreamMessages", lambda name, spacing_mm: (name, spacing_mm))
+    monkeypatch.setattr(view_module, "send", send)
+    given = {"config": None, "host": "127.0.0.1", "port": 8, "spacing_mm": 0.5, "plaintext": False}
+    long = "a-stream-with-a-long-name"
+    assert igtl_command(long, runtime=tmp_path, kind="shown", name=None, **given) == OK
+    ((endpoint, messages, server),) = sent
+    assert endpoint == f"{tmp_path.name}/{long}/shown" and messages == (long[:13], 0.5) and server.closed
+    out, err = capsys.readouterr()
+    assert json.loads(out) == {"pictures": 3} and "127.0.0.1:18080" in err
+    assert igtl_command(long, runtime=tmp_path, kind="shown", name="own", **given) == OK
+    assert sent[1][1] == ("own", 0.5)
+    with pytest.raises(InvalidSetting, match="there is no picture 'other'"):
+        igtl_command(long, runtime=tmp_path, kind="other", name=None, **given)
+    with pytest.raises(InvalidSetting, match="beyond this machine"):
+        igtl_command(long, runtime=tmp_path, kind="shown", name=None, **{**given, "host": "::"})
+    assert len(made) == 2
+
+
+def test_a_server_is_closed_when_sending_fails(
+    made: list[Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    servers = []
+
+    def send(endpoint: Any, messages: Any, server: Any, interrupt: Any) -> None:
+        servers.append(server)
+        raise OSError("broken")
+
+    monkeypatch.setattr(view_module, "folder_of", lambda runtime, stream: SimpleNamespace(endpoint=str))
+    monkeypatch.setattr(view_module, "send", send)
+    with pytest.raises(OSError, match="broken"):
+        igtl_command("theatre", None, tmp_path, kind="shown", host="127.0.0.1", port=8, name=None, spacing_mm=1.0, plaintext=False)  # fmt: skip
+    assert servers[0].closed
+
+
+def test_a_folder_is_used_in_place_and_a_packed_model_is_unpacked_for_the_time_of_use(
+    model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with bundle_in(model) as folder:
+        assert folder == model
+    folder_with_suffix = model.rename(tmp_path / "model.isplat")
+    with bundle_in(folder_with_suffix) as folder:
+        assert folder == folder_with_suffix
+    packed = tmp_path / "packed.isplat"
+    packed.write_bytes(b"packed")
+    monkeypatch.setattr(view_module, "unpack", lambda file, size, into: (into / "content").write_bytes(file.read(size)))
+    with bundle_in(packed) as folder:
+        assert (folder / "content").read_bytes() == b"packed"
+    assert not folder.exists()
+
+    def unpack(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(view_module, "unpack", unpack)
+    with pytest.raises(BundleError, match="cannot be read: No space left"), bundle_in(packed):
+        pass
