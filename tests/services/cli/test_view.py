@@ -6,7 +6,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 
@@ -24,7 +24,7 @@ HERE = {"plaintext": False, "options": RendererOptions(), "device": "cpu"}
 class Server:
     """Stand-in for a server of a model."""
 
-    made: list[tuple[Any, ...]] = []
+    made: ClassVar[list[tuple[Any, ...]]] = []
     address = "127.0.0.1", 18080
 
     def __init__(self, *arguments: Any) -> None:
