@@ -40,7 +40,7 @@ from gsplat_core.endoscope.out_of_body import (
 )
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.scene.frames import Frame
-from operators.checks import PICTURE_STAGES, MaskAndDepthStage, new_stages
+from operators.checks import MaskAndDepthStage, picture_stages
 from operators.tool_mask import built_in_finder
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
@@ -142,7 +142,7 @@ def changed(pictures: Iterable[tuple[Image, int]], change: Change) -> Iterator[t
 def withheld(pictures: Iterable[tuple[Image, int]]) -> dict[str, object]:
     """Run the gates of a live run over a stream; count the frames that they withhold."""
     gate, finder = BodyGate(), built_in_finder()
-    before, after = new_stages(PICTURE_STAGES), [MaskAndDepthStage()]
+    before, after = picture_stages(), [MaskAndDepthStage()]
     reasons: Counter[str] = Counter()
     count, longest_ns, newest_ns = 0, 0, None
     for seq, (image, pts_ns) in enumerate(pictures):

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from gsplat_core.endoscope.cuts import CutDetector
 from gsplat_core.endoscope.field_of_view import FieldOfView
-from gsplat_core.endoscope.highlights import HighlightFinder
 from gsplat_core.endoscope.interlacing import Deinterlacer, without_combs
 from gsplat_core.endoscope.mask_and_depth import DepthCheck, MaskCheck
 from gsplat_core.endoscope.ordinary import LOOK_EVERY_S, OrdinaryPictures, Turns
@@ -347,27 +346,6 @@ class StripStage(Stage):
 
 
 @dataclass(frozen=True)
-class HighlightCounts(StageCounts):
-    """Number of frames with specular highlights."""
-
-
-class HighlightStage(Stage):
-    """Excludes specular highlights from rehearsal: a frame's own training fits them, later rehearsal does not."""
-
-    counts_type = HighlightCounts
-
-    def reset(self) -> None:
-        self._finder = HighlightFinder()
-
-    def annotate(self, frame: Frame) -> Frame:
-        kept = None if frame.withheld is not None else self._finder.without(frame.image)
-        if kept is None:
-            return frame
-        self.found["frames with highlights"] += 1
-        return frame.with_fields(rehearsal_mask=kept)
-
-
-@dataclass(frozen=True)
 class SharpnessCounts(StageCounts):
     """Number of frames withheld for blur and for smoke."""
 
@@ -450,12 +428,11 @@ PICTURE_STAGES: dict[str, Callable[[], Stage]] = {
     "cuts": CutStage,
     "strip": StripStage,
     "field of view": FieldOfViewStage,
-    "highlights": HighlightStage,
     "sharpness": SharpnessStage,
 }
 """Stages that need only the picture and run before the tool mask."""
 
 
-def new_stages(stages: dict[str, Callable[[], Stage]], without: Sequence[str] = ()) -> list[Stage]:
-    """Create the stages in order, except those named in `without`."""
-    return [make() for name, make in stages.items() if name not in without]
+def picture_stages() -> list[Stage]:
+    """Create the stages of `PICTURE_STAGES` in order."""
+    return [make() for make in PICTURE_STAGES.values()]

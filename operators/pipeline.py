@@ -4,7 +4,7 @@ source ─► analysis ─► reconstruct ─► deform ─► rasterize ─┬�
              │             ▲                              │      │
              └─► depth ┈┈┈┈┘                              └──────┴─► metrics ─► sinks, progress
 
-`analysis` checks the picture, finds tools and highlights, and sets pose and depth. All runs use this graph. They differ in the source, the `Pace` and the
+`analysis` checks the picture, finds tools, and sets pose and depth. All runs use this graph. They differ in the source, the `Pace` and the
 sinks:
 
 - A replay, also of a finished model, has no clock. Every edge blocks and holds one message, and the work per frame is a number of steps. The same source,
@@ -27,12 +27,11 @@ from gsplat_core.scene.frames import Frame
 from gsplat_core.training.reconstructor import Reconstructor
 from operators.applications.device import scheduler_for
 from operators.checks import (
-    PICTURE_STAGES,
     MaskAndDepthStage,
     PictureStagesOp,
     SceneNumberStage,
     StageOp,
-    new_stages,
+    picture_stages,
 )
 from operators.choices import SINKS, Policy
 from operators.compare_shown import CompareShownOp
@@ -66,8 +65,6 @@ from operators.truth import TruthOp
 
 REPORT_RESERVE_BYTES = 8 * 2**20
 """Disk space reserved for the video's index and the report, in bytes."""
-SIDE_STAGE = "highlights"
-"""A stage with no dependencies; runs concurrently with the other picture stages."""
 
 
 def analysis_operator(
@@ -82,7 +79,7 @@ def analysis_operator(
 ) -> SideBySideOp:
     """Return the operator between source and reconstruction, with the input and output `frame`.
 
-    Tools and highlights are detected in parallel to the other checks of the picture.
+    Tools are detected in parallel to the other checks of the picture.
 
     Args:
         fragment: the graph.
@@ -93,19 +90,12 @@ def analysis_operator(
         behind: operators appended at the end.
         device: device of the built-in tool network.
     """
-    others = [name for name in PICTURE_STAGES if name != SIDE_STAGE]
-    picture_stages = new_stages(PICTURE_STAGES, without=[SIDE_STAGE])
     return SideBySideOp(
         fragment,
         name="analysis",
         gate=[OutOfBodyGateOp(fragment, name="out_of_body", policy=out_of_body)],
-        first=[PictureStagesOp(fragment, name="picture", stages=picture_stages)],
-        beside=[
-            [
-                new_tool_mask(fragment, tool_mask, device=device),
-                StageOp(fragment, name=SIDE_STAGE, stages=new_stages(PICTURE_STAGES, without=others)),
-            ]
-        ],
+        first=[PictureStagesOp(fragment, name="picture", stages=picture_stages())],
+        beside=[new_tool_mask(fragment, tool_mask, device=device)],
         then=[
             *behind_gate,
             *positions,

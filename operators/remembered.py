@@ -45,8 +45,7 @@ class RememberedTissue:
     def layer(self, rendered: RenderedFrame, whole: bool = False) -> NDArray[np.uint8] | None:
         """Return the mask of rendered tissue that is not visible in the content's frame.
 
-        Such tissue is behind a tool, under the recorder's on-screen display, or outside of the field of view. Specular
-        highlights count as visible.
+        Such tissue is behind a tool, under the recorder's on-screen display, or outside of the field of view.
 
         Args:
             rendered: the picture with its frame and opacity.

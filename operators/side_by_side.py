@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -18,8 +17,8 @@ class SideBySideOp(Operator):
     """Runs several chains of operators on each frame in parallel, merges their results, and runs a final chain.
 
     Each operator of a chain reads a `Frame` at its input `frame` and emits it with more fields at its output `frame`.
-    The result is the frame of the chain `first`, with the `TAKEN_OVER` fields and loss masks of the other chains. If
-    the gate withholds the frame, the gate's frame is used instead.
+    The result is the frame of the chain `first`, with the tool mask and loss mask of the chain `beside`. If the gate
+    withholds the frame, the gate's frame is used instead.
 
     The operators belong to no graph. This operator starts and stops them and forwards their contributions to the
     outcome.
@@ -33,7 +32,7 @@ class SideBySideOp(Operator):
     Params:
         gate: chain that may withhold a frame from downstream; the other chains see its picture.
         first: chain whose frame is passed on.
-        beside: chains that run in parallel to `first`; only their `TAKEN_OVER` fields and loss masks are used.
+        beside: chain that runs in parallel to `first`; only its tool mask and loss mask are used.
         then: final chain, run on the merged frame.
     """
 
@@ -43,19 +42,18 @@ class SideBySideOp(Operator):
         *args: Any,
         gate: Sequence[Operator],
         first: Sequence[Operator],
-        beside: Sequence[Sequence[Operator]] = (),
+        beside: Sequence[Operator] = (),
         then: Sequence[Operator] = (),
         **kwargs: Any,
     ) -> None:
-        self.gate, self.first, self.then = tuple(gate), tuple(first), tuple(then)
-        self.beside = tuple(tuple(part) for part in beside)
+        self.gate, self.first, self.beside, self.then = tuple(gate), tuple(first), tuple(beside), tuple(then)
         self._pool: ThreadPoolExecutor | None = None
         super().__init__(fragment, *args, **kwargs)
 
     @property
     def parts(self) -> tuple[Operator, ...]:
         """Return the operators of all chains."""
-        return (*self.gate, *self.first, *chain.from_iterable(self.beside), *self.then)
+        return (*self.gate, *self.first, *self.beside, *self.then)
 
     def setup(self, spec: OperatorSpec) -> None:
         spec.input("frame", type=Frame)
@@ -66,7 +64,7 @@ class SideBySideOp(Operator):
             operator.initialize()
 
     def start(self) -> None:
-        self._pool = ThreadPoolExecutor(1 + len(self.beside), thread_name_prefix=self.name)
+        self._pool = ThreadPoolExecutor(2, thread_name_prefix=self.name)
         for operator in self.parts:
             operator.start()
 
@@ -79,8 +77,8 @@ class SideBySideOp(Operator):
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
         assert self._pool is not None
         frame: Frame = op_input.receive("frame")
-        # Submit the slowest chains first.
-        others = [self._pool.submit(through, part, frame) for part in (*self.beside, self.gate)]
+        # Submit the slowest chain first.
+        others = [self._pool.submit(through, part, frame) for part in (self.beside, self.gate)]
         try:
             decided = through(self.first, frame)
         finally:
@@ -88,10 +86,9 @@ class SideBySideOp(Operator):
             # frame.
             for other in others:
                 other.exception()
-        *found, gated = [other.result() for other in others]
+        found, gated = [other.result() for other in others]
         if gated.withheld is None:
-            for each in found:
-                decided = with_findings(decided, each)
+            decided = with_findings(decided, found)
         else:
             decided = gated.with_fields(seq=decided.seq, pts_ns=decided.pts_ns)
         op_output.emit(through(self.then, decided), "frame")
@@ -103,18 +100,14 @@ class SideBySideOp(Operator):
                 operator.contribute(outcome)
 
 
-TAKEN_OVER = ("mask", "rehearsal_mask")
-"""Fields of a frame that are taken from another chain of operators if the first chain leaves them empty."""
-
-
 def with_findings(decided: Frame, found: Frame) -> Frame:
     """Merge the frames of two chains.
 
     Args:
         decided: frame whose fields take precedence.
-        found: frame that supplies missing fields of `TAKEN_OVER`. The loss masks are intersected.
+        found: frame that supplies the tool mask if `decided` has none. The loss masks are intersected.
     """
-    added = {name: getattr(found, name) for name in TAKEN_OVER if getattr(decided, name) is None}
+    added = {"mask": found.mask} if decided.mask is None else {}
     if found.loss_mask is not None:
         own = decided.loss_mask
         added["loss_mask"] = found.loss_mask if own is None else np.minimum(own, found.loss_mask)

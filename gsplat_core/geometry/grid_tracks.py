@@ -94,7 +94,7 @@ def seen_by(frame: Frame, camera: Camera) -> TexturedPicture:
     small = small_camera(frame, camera)
     size = small.width_px, small.height_px
     tissue = np.ones((height, width), np.uint8)
-    for mask in (frame.mask, frame.loss_mask, frame.rehearsal_mask, without_highlights(frame.image)):
+    for mask in (frame.mask, frame.loss_mask, without_highlights(frame.image)):
         if mask is not None:
             tissue &= (mask != 0).astype(np.uint8)
     green = cv2.resize(frame.image[..., 1], size, interpolation=cv2.INTER_AREA)

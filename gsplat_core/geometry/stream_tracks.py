@@ -82,9 +82,7 @@ class SmallPictures:
         small = frame.image if share == 1 else np.asarray(cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA))
         usable = np.zeros(small.shape[:2], np.uint8)
         usable[BORDER_PX:-BORDER_PX, BORDER_PX:-BORDER_PX] = 255
-        masks = [frame.mask, frame.loss_mask, frame.rehearsal_mask]
-        if frame.rehearsal_mask is None:
-            masks[2] = self._highlights.without(np.asarray(small, np.uint8))
+        masks = (frame.mask, frame.loss_mask, self._highlights.without(np.asarray(small, np.uint8)))
         kept = [cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST) != 0 for mask in masks if mask is not None]
         if kept:
             # Exclude corners whose patch overlaps a tool, which moves differently.

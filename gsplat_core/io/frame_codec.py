@@ -74,7 +74,6 @@ ARRAYS: Mapping[str, ArrayFormat] = {
     "pose": ArrayFormat(8, "<f8", 0),
     "depth_confidence": ArrayFormat(16, "<f4", 1),
     "loss_mask": ArrayFormat(32, "<u1", 1),
-    "rehearsal_mask": ArrayFormat(64, "<u1", 1),
 }
 """Array fields of `Frame`, in the order of a message."""
 MAGIC, VERSION = b"ISPF", 1

@@ -68,11 +68,6 @@ class Frame:
 
     Used outside the field of view and for a recorder's overlay. None excludes nothing.
     """
-    rehearsal_mask: NDArray[np.uint8] | None = None
-    """Mask uint8 [H, W] for training again on past frames; 0 excludes a pixel from that loss but not from display.
-
-    Used for highlights, which move with the light instead of the tissue. None excludes nothing.
-    """
     labels: NDArray[np.uint8] | None = None
     """Class of each pixel uint8 [H, W] for the loss `semantics`; 255 = unknown. None for a frame without labels."""
     withheld: str | None = None
@@ -125,10 +120,7 @@ class Frame:
             raise InvalidInput(
                 f"frame {self.seq}: its right camera is {right.width_px}x{right.height_px}, the image {size[1]}x{size[0]}"
             )
-        planes = {
-            name: getattr(self, name)
-            for name in ("depth", "depth_confidence", "mask", "loss_mask", "rehearsal_mask", "labels")
-        }
+        planes = {name: getattr(self, name) for name in ("depth", "depth_confidence", "mask", "loss_mask", "labels")}
         for name, plane in planes.items():
             if plane is not None and plane.shape != size:
                 raise InvalidInput(f"frame {self.seq}: {name} is {list(plane.shape)}, the image is {list(size)}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice
 
@@ -36,8 +36,6 @@ class Observation:
     """Depth float32 [H, W] in millimetres; 0 = unknown."""
     depth_error: float = 0.0
     """Typical relative standard error of the depth."""
-    rehearsal_mask: Tensor | None = None
-    """Mask uint8 [H, W]; 0 = ignored when the frame is trained on again later."""
     right_eye: RightEye | None = None
     """Right eye's picture taken at the same time, if the right eye is trained on (`BothEyes`)."""
     labels: Tensor | None = None
@@ -53,13 +51,6 @@ class Observation:
         several GPU steps.
         """
         return None if self.right_eye is None else self.right_eye.observation
-
-    def to_rehearse(self) -> Observation:
-        """Return the observation as it is trained on again later: without the pixels that `rehearsal_mask` excludes."""
-        right = None if self.right_eye is None else self.right_eye.to_rehearse()
-        if self.rehearsal_mask is None:
-            return self if right is None else replace(self, right_eye=right)
-        return replace(self, mask=self.mask & self.rehearsal_mask, rehearsal_mask=None, right_eye=right)
 
     def by_turns(self, turn: int) -> Observation:
         """Return the right eye's observation, if there is one, at odd turns, else this observation."""
@@ -98,7 +89,6 @@ class Observation:
             mask=tensor_of(mask.astype(np.uint8, copy=False), device),
             depth=learned_depth(frame, device),
             depth_error=error_of_depth(frame),
-            rehearsal_mask=None if frame.rehearsal_mask is None else tensor_of(frame.rehearsal_mask, device),
             ranges=frame.ranges,
             labels=None if frame.labels is None else tensor_of(frame.labels, device),
         )
@@ -113,10 +103,6 @@ class RightEye:
     @cached_property
     def observation(self) -> Observation:
         return self._make()
-
-    def to_rehearse(self) -> RightEye:
-        """Return the eye as it is trained on again later: without the pixels that its rehearsal mask excludes."""
-        return RightEye(lambda: self.observation.to_rehearse())
 
 
 def error_of_depth(frame: Frame) -> float:
@@ -154,15 +140,11 @@ class ObservationWindow:
 
     def __init__(self, capacity: int, seed: int) -> None:
         self._frames: deque[Observation] = deque(maxlen=capacity)
-        """Frames of the window, with the rehearsal masks applied."""
-        self._whole_newest: Observation | None = None
-        """Newest frame with its full mask, for the steps before its display."""
         self._random = np.random.default_rng(seed)
 
     def add(self, observation: Observation) -> None:
         """Add an observation as the newest; a full window drops the oldest."""
-        self._whole_newest = observation
-        self._frames.append(observation.to_rehearse())
+        self._frames.append(observation)
 
     @property
     def newest(self) -> Observation:
@@ -188,9 +170,6 @@ class ObservationWindow:
         for index in reversed(range(len(self._frames))):
             if self._frames[index].seq == observation.seq:
                 self._frames[index] = observation
-                newest = self._whole_newest
-                if newest is not None and newest.seq == observation.seq:
-                    self._whole_newest = replace(newest, depth=observation.depth)
                 return
         raise InvalidInput(f"frame {observation.seq} is not in the window of {len(self._frames)} frames")
 
@@ -210,15 +189,12 @@ class ObservationWindow:
         return self._frames[-1 if newest else int(self._random.integers(0, len(self._frames)))]
 
     def schedule(self, steps: int) -> list[Observation]:
-        """Return observations for the next steps, ending with the newest frame, which is displayed
-        next and therefore trained on without its `rehearsal_mask`.
-        """
+        """Return observations for the next steps, ending with the newest frame, which is displayed next."""
         if steps < 0:
             raise InvalidInput(f"steps is {steps}; it must be at least 0")
         if steps == 0:
             return []
-        newest = self._whole_newest
-        assert newest is not None
+        newest = self._frames[-1]
         older = len(self._frames) - 1
         if older == 0:
             return [newest] * steps

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from gsplat_core.choices import Eyes
 from gsplat_core.depth.maps import believed_depth
-from gsplat_core.endoscope.highlights import HighlightFinder
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
@@ -180,8 +179,6 @@ class PreparedPicture(NamedTuple):
     """Right picture in the left picture's colours, RGB [H, W, 3]."""
     mask: NDArray[np.uint8]
     """Mask [H, W]; 1 = tissue."""
-    steady: NDArray[np.uint8] | None
-    """Mask [H, W] for rehearsal; 0 = ignored. None for no restriction."""
 
 
 class BothEyes:
@@ -191,7 +188,6 @@ class BothEyes:
 
     def __init__(self, eyes: Eyes, device: torch.device | str = "cpu") -> None:
         self._with_right, self._device = eyes == "both", device
-        self._highlights = HighlightFinder()
         self._preparer: ThreadPoolExecutor | None = None
         """Thread that prepares right pictures in order, for GPU training only."""
         if self._with_right and torch.device(device).type == "cuda":
@@ -240,20 +236,17 @@ class BothEyes:
         mask = right_tissue(frame, camera, right, (colours.shift or 0.0) * frame.width_px)
         if frame.loss_mask is not None:
             mask = mask & frame.loss_mask
-        steady = None if frame.rehearsal_mask is None else self._highlights.without(image)
-        return PreparedPicture(image, mask, steady)
+        return PreparedPicture(image, mask)
 
     def _on_device(self, picture: PreparedPicture, left: Observation, right: Camera) -> Observation:
-        image, mask, steady = picture
         return Observation(
             seq=left.seq,
             time_s=left.time_s,
             camera=right.with_pose(right.world_to_camera @ left.camera.world_to_camera),
-            image=tensor_of(image, self._device),
-            mask=tensor_of(mask, self._device),
+            image=tensor_of(picture.image, self._device),
+            mask=tensor_of(picture.mask, self._device),
             depth=None,
             of_right=True,
-            rehearsal_mask=None if steady is None else tensor_of(steady, self._device),
         )
 
 

@@ -348,7 +348,7 @@ def _remove(made: Sequence[Path]) -> None:
 
 def _bytes(frame: Frame, arrived: Frame | None = None) -> int:
     """Return the size of the frame's pictures in bytes, without those shared with `arrived`."""
-    planes = ("image", "right_image", "depth", "depth_confidence", "mask", "loss_mask", "rehearsal_mask")
+    planes = ("image", "right_image", "depth", "depth_confidence", "mask", "loss_mask")
     mine = {id(plane): plane.nbytes for name in planes if (plane := getattr(frame, name)) is not None}
     others = () if arrived is None else (id(getattr(arrived, name)) for name in planes)
     for key in others:

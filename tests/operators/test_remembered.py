@@ -93,13 +93,6 @@ def test_all_of_a_picture_can_be_remembered_but_not_what_it_does_not_cover(rng):
     assert RememberedTissue().layer(other).all(), "nothing of another size is in it"
 
 
-def test_highlights_are_seen():
-    frame = make_frame(0, mask=np.ones(make_frame().image.shape[:2], np.uint8))
-    dazzled = frame.with_fields(rehearsal_mask=np.zeros_like(frame.mask))
-    assert RememberedTissue().layer(make_rendered(0, frame=dazzled)) is None
-    assert marked(make_rendered(0, frame=dazzled)) is not None
-
-
 def test_the_marking_survives_video_coding(tmp_path):
     """Code the picture as the recorder does: 4:2:0, lossy."""
     size = (256, 320)

@@ -46,7 +46,7 @@ def test_parts_are_initialised_before_a_source_starts_and_once_for_all_restarts(
             calls.append(self.name)
 
     parts = [Watched(None, None, name=name) for name in ("first", "second")]
-    operator = SideBySideOp(None, name="all", gate=[], first=[parts[0]], beside=[[parts[1]]])
+    operator = SideBySideOp(None, name="all", gate=[], first=[parts[0]], beside=[parts[1]])
     operator.initialize()
     assert sorted(calls) == ["first", "second"] and not any(part.running for part in parts)
     for _ in range(2):
@@ -68,7 +68,7 @@ def make():
             name: [Changes(None, change, name=f"{name}{k}") for k, change in enumerate(changes)]
             for name, changes in (("gate", gate), ("first", first), ("second", second), ("then", then))
         }
-        operator = SideBySideOp(None, name="all", beside=[chains.pop("second")], **chains)
+        operator = SideBySideOp(None, name="all", beside=chains.pop("second"), **chains)
         operator.start()
         made.append(operator)
         return operator

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, TypeAdapter, ValidationError
+from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError
 
 from gsplat_core.errors import InvalidInput, RecordingInvalid
 from gsplat_core.io.files import PartialFile
@@ -33,8 +33,19 @@ from gsplat_core.io.recordings.findings import printable
 from gsplat_core.io.recordings.plain_files import UnreadableFile, open_plain
 
 Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
-TrackName = Literal["image", "right_image", "mask", "loss_mask", "rehearsal_mask", "depth", "depth_confidence", "shown"]
-Tracks = dict[TrackName, Count]
+TrackName = Literal["image", "right_image", "mask", "loss_mask", "depth", "depth_confidence", "shown"]
+REMOVED_TRACK = "rehearsal_mask"
+"""Track that earlier versions recorded. It is ignored."""
+
+
+def _without_removed(names: Any) -> Any:
+    """Return the tracks of a log line, an object or a list, without `REMOVED_TRACK`."""
+    if isinstance(names, dict):
+        return {name: time for name, time in names.items() if name != REMOVED_TRACK}
+    return tuple(name for name in names if name != REMOVED_TRACK) if isinstance(names, list | tuple) else names
+
+
+Tracks = Annotated[dict[TrackName, Count], BeforeValidator(_without_removed)]
 """Timestamps of a log line's pictures, in milliseconds within the track's file, by track."""
 
 
@@ -78,7 +89,7 @@ class PreparedLine(FrameFields, _PictureLine):
     """
 
     event: Literal["prepared"] = "prepared"
-    same: tuple[TrackName, ...]
+    same: Annotated[tuple[TrackName, ...], BeforeValidator(_without_removed)]
 
 
 class ShownLine(Record):

@@ -35,7 +35,6 @@ CODINGS: Mapping[str, Coding] = {
     "right_image": "colour",
     "mask": "grey",
     "loss_mask": "grey",
-    "rehearsal_mask": "grey",
     "depth": "float",
     "depth_confidence": "float",
     "shown": "vp9",

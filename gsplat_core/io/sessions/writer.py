@@ -142,7 +142,7 @@ def earlier_sessions(recordings: Path, present: Path, now_ns: int) -> list[KeptP
 
 
 _DEPTHS: tuple[TrackName, ...] = ("depth", "depth_confidence")
-_PLANES: tuple[TrackName, ...] = ("image", "right_image", "mask", "loss_mask", "rehearsal_mask", *_DEPTHS)
+_PLANES: tuple[TrackName, ...] = ("image", "right_image", "mask", "loss_mask", *_DEPTHS)
 
 
 SYNC_S = 1.0

@@ -100,16 +100,6 @@ def test_the_schedule_has_its_length_its_share_and_ends_with_the_newest(
     assert newest == (steps if frames == 1 else max(1, round(steps * share)))
 
 
-def test_highlights_are_left_out_of_older_frames_only(make_frame, camera):
-    filled = window(make_frame, camera, 0)
-    for seq in range(3):
-        frame = make_frame(seq)
-        mask = np.zeros(frame.image.shape[:2], np.uint8)
-        filled.add(Observation.of(frame.with_fields(rehearsal_mask=mask), camera))
-    trained = {(seen.seq, bool(seen.mask.any())) for seen in filled.schedule(40)}
-    assert trained == {(0, False), (1, False), (2, True)}
-
-
 def test_the_newest_frames_turns_are_spread(make_frame, camera, monkeypatch):
     monkeypatch.setattr(observations, "NEWEST_SHARE", 0.5)
     turns = [seen.seq == 4 for seen in window(make_frame, camera, 5).schedule(8)]

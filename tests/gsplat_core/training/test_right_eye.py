@@ -71,17 +71,6 @@ def test_cameras_of_two_models_are_refused():
         BothEyes("both").observation(stereo_frame(right_camera=dataclasses.replace(RIGHT, model="fisheye")), LEFT)
 
 
-def test_what_is_left_out_of_rehearsal_is_looked_for_in_the_right_picture_itself():
-    right_image = np.full((HEIGHT, WIDTH, 3), 90, np.uint8)
-    right_image[20:24, 30:34] = 255
-    everything = np.ones((HEIGHT, WIDTH), np.uint8)
-    frame = stereo_frame(right_image=right_image, rehearsal_mask=everything)
-    right = BothEyes("both").observation(frame, LEFT).right
-    assert right is not None and not right.rehearsal_mask[20:24, 30:34].any() and right.rehearsal_mask[:10].all()
-    rehearsed = BothEyes("both").observation(frame, LEFT).to_rehearse().right
-    assert not rehearsed.mask[20:24, 30:34].any() and rehearsed.rehearsal_mask is None
-
-
 def tool_mask():
     mask = np.ones((HEIGHT, WIDTH), np.uint8)
     mask[16:32, 28:40] = 0

@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 
 from operators.checks import (
-    PICTURE_STAGES,
     OrdinaryFrames,
     PictureStagesOp,
     Stage,
     StageOp,
     left_out,
-    new_stages,
+    picture_stages,
 )
 from operators.outcome import OutcomeBuilder
 from operators.side_by_side import through
@@ -43,8 +42,8 @@ def with_faults(pictures):
 @pytest.mark.parametrize("name", ["cutting", "heart", "colon"])
 def test_every_fault_is_found_that_looking_at_every_frame_finds(recordings_dir, name):
     given = frames(with_faults(clip(recordings_dir, name)))
-    everything = StageOp(None, stages=new_stages(PICTURE_STAGES))
-    seldom = PictureStagesOp(None, stages=new_stages(PICTURE_STAGES))
+    everything = StageOp(None, stages=picture_stages())
+    seldom = PictureStagesOp(None, stages=picture_stages())
     found = []
     for operator in (everything, seldom):
         operator.start()

@@ -13,11 +13,9 @@ from hypothesis import strategies as st
 
 from gsplat_core.scene.frames import Frame, FrameStatus
 from operators.checks import (
-    PICTURE_STAGES,
     CutCounts,
     CutStage,
     FieldOfViewStage,
-    HighlightStage,
     InterlacingStage,
     MaskAndDepthCounts,
     MaskAndDepthStage,
@@ -27,7 +25,7 @@ from operators.checks import (
     StageOp,
     StripStage,
     left_out,
-    new_stages,
+    picture_stages,
 )
 from operators.outcome import OutcomeBuilder
 from tests.gsplat_core.endoscope.clips import FRAME_NS, PLACES, clip, resized, texture
@@ -108,13 +106,13 @@ def test_withheld_frames_are_no_scene():
     assert [frame.new_scene for frame in run(CutStage(), given)] == [None] * 30
 
 
-def all_stages(without=()):
-    return [*new_stages(PICTURE_STAGES, without), MaskAndDepthStage()]
+def all_stages():
+    return [*picture_stages(), MaskAndDepthStage()]
 
 
-def run_all(given, without=()):
+def run_all(given):
     passed = given
-    for stage in all_stages(without):
+    for stage in all_stages():
         passed = run(stage, passed)
     return passed
 
@@ -126,12 +124,12 @@ def test_good_video_keeps_everything_but_masks_of_the_loss(recordings_dir, name,
     operator.start()
     for frame in frames(clip(recordings_dir, name)):
         (passed,) = compute(operator, frame=frame)
-        assert dataclasses.replace(passed, loss_mask=None, rehearsal_mask=None) == frame
+        assert dataclasses.replace(passed, loss_mask=None) == frame
         assert passed.image is frame.image
     outcome = OutcomeBuilder()
     operator.contribute(outcome)
     found = {what for part in outcome.parts.values() for what in part.found}
-    assert found <= {"frames with highlights", "strip or text"} and len(outcome.parts) == 8
+    assert found <= {"strip or text"} and len(outcome.parts) == 7
 
 
 @pytest.mark.recordings
@@ -168,11 +166,6 @@ def test_a_restart_forgets_everything(compute):
             (passed,) = compute(operator, frame=frame)
             assert passed is frame
     assert {stage.counts().frames for stage in operator.stages} == {12}
-
-
-def test_stages_can_be_left_out_by_name():
-    names = [type(stage).__name__ for stage in all_stages(without=("highlights", "strip"))]
-    assert len(names) == 6 and "HighlightStage" not in names and "StripStage" not in names
 
 
 @settings(deadline=None, max_examples=25)
@@ -227,16 +220,6 @@ def test_pixels_that_do_not_count_are_added_to_the_mask_of_the_loss(recordings_d
     passed = run(made, frames(images, loss_mask=before))
     assert not passed[-1].loss_mask[:9].any() and passed[-1].loss_mask.sum() < before.sum()
     assert made.counts().found[what] > 0
-
-
-@pytest.mark.recordings
-def test_highlights_are_left_out_of_what_lasts_and_not_of_what_is_shown(recordings_dir):
-    stage = HighlightStage()
-    passed = run(stage, frames(clip(recordings_dir, "heart")))
-    assert stage.counts().found["frames with highlights"] > 0
-    assert all(frame.loss_mask is None for frame in passed)
-    marked = [frame.rehearsal_mask for frame in passed if frame.rehearsal_mask is not None]
-    assert all(0.5 < mask.mean() < 1 for mask in marked)
 
 
 def test_blur_is_withheld_and_each_scene_has_its_own_sharpness():

@@ -71,7 +71,7 @@ def test_a_slow_disk_loses_frames_says_so_and_makes_nobody_wait(tmp_path, gate):
     frames = [new_frame(seq) for seq in range(50)]
     size = sum(
         frames[0].__dict__[name].nbytes
-        for name in ("image", "right_image", "depth", "depth_confidence", "mask", "loss_mask", "rehearsal_mask")
+        for name in ("image", "right_image", "depth", "depth_confidence", "mask", "loss_mask")
     )
     recorder = recorder_in(tmp_path, queue_bytes=10 * size)
     begin = time.monotonic()
@@ -89,9 +89,7 @@ def test_a_slow_disk_loses_frames_says_so_and_makes_nobody_wait(tmp_path, gate):
 
 def test_shown_pictures_are_lost_before_frames(tmp_path, gate):
     frames = [
-        new_frame(
-            seq, right_image=None, depth=None, depth_confidence=None, mask=None, loss_mask=None, rehearsal_mask=None
-        )
+        new_frame(seq, right_image=None, depth=None, depth_confidence=None, mask=None, loss_mask=None)
         for seq in range(8)
     ]
     recorder = recorder_in(tmp_path, queue_bytes=8 * frames[0].image.nbytes)

@@ -39,7 +39,6 @@ def new_frame(seq: int, height_px: int = HEIGHT_PX, width_px: int = WIDTH_PX, **
         "right_camera": Camera.from_focal(20.0, width_px, height_px).right_eye(4.4),
         "mask": rng.integers(0, 2, size, np.uint8),
         "loss_mask": rng.integers(0, 2, size, np.uint8),
-        "rehearsal_mask": rng.integers(0, 2, size, np.uint8),
         "pose": pose,
         "arrived_ns": 10**15 + seq,
         "status": FrameStatus.LIVE,
@@ -53,7 +52,7 @@ def same_frame(a: Frame, b: Frame) -> bool:
     """Return True if two frames are bit-identical except for `arrived_ns` and `live`, which a replay does not have."""
     planes = [
         (getattr(a, n), getattr(b, n))
-        for n in ("image", "right_image", "depth", "depth_confidence", "mask", "loss_mask", "rehearsal_mask", "pose")
+        for n in ("image", "right_image", "depth", "depth_confidence", "mask", "loss_mask", "pose")
     ]
     facts = ("seq", "pts_ns", "withheld", "new_scene", "damage", "depth_origin", "right_camera")
     return all(x is y is None or x.tobytes() == y.tobytes() for x, y in planes) and all(

@@ -25,7 +25,6 @@ FILES = [
         "right_image_24x16.mkv",
         "mask_24x16.mkv",
         "loss_mask_24x16.mkv",
-        "rehearsal_mask_24x16.mkv",
         "depth_24x16.mkv",
         "depth_confidence_24x16.mkv",
         "prepared_loss_mask_24x16.mkv",

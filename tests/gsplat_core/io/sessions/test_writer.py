@@ -43,7 +43,7 @@ def test_what_training_was_given_comes_back_to_the_bit(session, frames):
                     assert frame is not None
                     wanted = frames[line.seq].with_fields(loss_mask=np.ones_like(frames[line.seq].mask))
                     assert same_frame(frame, wanted)
-                    assert line.same == ("image", "right_image", "mask", "rehearsal_mask", "depth", "depth_confidence")
+                    assert line.same == ("image", "right_image", "mask", "depth", "depth_confidence")
                     seen += 1
     assert seen == len(frames)
 
@@ -202,6 +202,20 @@ def test_a_line_of_a_later_version_is_left_out(session, tmp_path, frames):
     log.write_bytes(b"".join([lines[0], b'{"event":"thought","of":"tomorrow"}\n', *lines[1:]]))
     assert len(frames_of(folder)) == len(frames)
     assert sum(isinstance(line, Observed) for _, line in SessionReader(folder).lines()) == len(frames)
+
+
+def test_a_track_that_is_no_longer_used_is_ignored(session, tmp_path, frames):
+    folder = tmp_path / "session"
+    shutil.copytree(session, folder)
+    log = folder / "segments/000000/log.jsonl"
+    text = log.read_text()
+    for old, new in (('"mask":', '"rehearsal_mask":0,"mask":'), ('"same":[', '"same":["rehearsal_mask",')):
+        assert old in text
+        text = text.replace(old, new)
+    log.write_text(text)
+    assert all(same_frame(a, b) for a, b in zip(frames_of(folder), frames, strict=True))
+    prepared = [line for line in SessionReader(folder).segments[0].lines() if isinstance(line, PreparedLine)]
+    assert prepared and all("rehearsal_mask" not in line.same for line in prepared)
 
 
 def test_a_log_is_plain_json(session):
