@@ -105,9 +105,11 @@ def closest_on_triangles(points: Array, corners: Array) -> Array:
     ab, ac, ap = b - a, c - a, points - a
     dot = lambda u, v: np.einsum("ij,ij->i", u, v)
     aa, ab_ac, cc, ap_ab, ap_ac = dot(ab, ab), dot(ab, ac), dot(ac, ac), dot(ap, ab), dot(ap, ac)
-    determinant = np.maximum(aa * cc - ab_ac**2, 1e-300)
+    determinant = aa * cc - ab_ac**2
+    has_area = determinant > 0  # the closest point of other triangles is on an edge
+    determinant = np.where(has_area, determinant, 1.0)
     v, w = (cc * ap_ab - ab_ac * ap_ac) / determinant, (aa * ap_ac - ab_ac * ap_ab) / determinant
-    inside = (v >= 0) & (w >= 0) & (v + w <= 1)
+    inside = has_area & (v >= 0) & (w >= 0) & (v + w <= 1)
     return np.where(inside[:, None], a + v[:, None] * ab + w[:, None] * ac, on_edge)
 
 

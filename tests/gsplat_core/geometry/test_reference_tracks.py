@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from gsplat_core.geometry.reference_tracks import MOST_MISSES, ReferenceTracks, local_contrast
+from gsplat_core.geometry.reference_tracks import MOST_MISSES, ReferenceTracks, _Reference, _usable, local_contrast
 from gsplat_core.geometry.tracks import Observations
 from tests.gsplat_core.geometry.test_tracks import wide_texture
 
@@ -286,3 +286,43 @@ def test_a_place_that_jumps_aside_has_no_points(move_px, found):
     inside = first.point[((first.pixels > [85, 60]) & (first.pixels < [115, 90])).all(1)]
     share = np.isin(inside, second.point).mean()
     assert len(inside) >= 5 and (share == 1 if found else share < 0.3)
+
+
+def reference() -> _Reference:
+    grey = np.ascontiguousarray(view(0)[:, :, 0])
+    usable = np.ones(grey.shape, np.uint8)
+    return _Reference(local_contrast(grey, usable != 0), _usable(usable), 0)
+
+
+@pytest.mark.parametrize(
+    "moved",
+    [
+        lambda x, y: (5 + 0 * x, 0 * x - 3),
+        lambda x, y: (20 * x, -15 * y),
+        lambda x, y: (30 * x * x, 40 * x * y),
+        lambda x, y: (8 * y * y, 12 * y - 20 * x * x),
+    ],
+)
+def test_a_quadratic_map_is_found_from_some_of_the_corners(moved):
+    """Coordinates are shares of the longer side from its middle; the map is found within a tenth of a pixel."""
+    one = reference()
+    kept = np.arange(len(one.corners)) % 3 != 0
+
+    def there(at: np.ndarray) -> np.ndarray:
+        return at + np.stack(moved(*np.moveaxis(at / WIDTH - 0.5, -1, 0)), -1)
+
+    found = one._smooth(kept, there(one.corners.astype(np.float64)).astype(np.float32))
+    expected = there(one._grid.astype(np.float64))
+    middle = slice(20, -20)
+    assert np.abs(found - expected)[middle, middle].max() < 0.1
+
+
+def test_corners_are_four_pixels_apart_or_a_fortieth_of_the_side():
+    for scale, apart in ((1, 5), (2, 10)):
+        grey = cv2.resize(np.ascontiguousarray(view(0)[:, :, 0]), None, fx=scale, fy=scale)
+        at = _Reference(grey, np.ones(grey.shape, np.uint8), 0).corners
+        gaps = np.linalg.norm(at[:, None] - at[None], axis=2) + 99 * np.eye(len(at))
+        assert apart <= gaps.min() < apart + 1.5
+    small = np.ascontiguousarray(grey[:60, :80])
+    at = _Reference(small, np.ones(small.shape, np.uint8), 0).corners
+    assert 4 <= (np.linalg.norm(at[:, None] - at[None], axis=2) + 99 * np.eye(len(at))).min() < 6

@@ -10,6 +10,7 @@ import pytest
 
 from gsplat_core import Camera
 from gsplat_core.errors import InvalidSetting
+from gsplat_core.geometry import registration
 from gsplat_core.geometry.mesh import mesh_of_depth
 from gsplat_core.geometry.registration import (
     ClosestPoints,
@@ -251,3 +252,33 @@ def test_a_step_is_refused_if_one_motion_is_a_thousandth_as_certain_as_another(s
             _step(points, normals, gaps)
     else:
         np.testing.assert_allclose(_step(points, normals, gaps)[:3, 3], [-0.1, 0.2, -0.3], atol=1e-6)
+
+
+def test_the_closest_point_of_a_triangle_without_an_area_is_on_its_edges():
+    """Of a point and of a line as triangles. Both have a determinant of 0."""
+    corners = np.array([[[1.0, 2, 3]] * 3, [[0, 0, 0], [2, 0, 0], [1, 0, 0]]])
+    found = closest_on_triangles(np.array([[1.0, 2, 5], [1.5, 1, 0]]), corners)
+    np.testing.assert_allclose(found, [[1, 2, 3], [1.5, 0, 0]])
+
+
+@pytest.mark.parametrize(("more", "is_refused"), [(0, False), (1, True)])
+def test_a_mesh_may_have_as_many_triangles_as_are_supported(monkeypatch, more, is_refused):
+    vertices, triangles = tissue()
+    monkeypatch.setattr(registration, "MOST_TRIANGLES", len(triangles) - more)
+    if is_refused:
+        with pytest.raises(InvalidSetting, match=f"has {len(triangles)} triangles; at most {len(triangles) - 1}"):
+            ClosestPoints(vertices, triangles)
+    else:
+        assert ClosestPoints(vertices, triangles).closest(vertices[:3]).distances.max() < 1e-9
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_three_pairs_are_enough(count):
+    moved = np.array([[0.0, 0, 0], [10, 0, 0], [0, 10, 0]])[:count]
+    if count == 2:
+        with pytest.raises(InvalidSetting, match="three or more pairs"):
+            from_pairs(moved, moved + 1)
+    else:
+        np.testing.assert_allclose(
+            from_pairs(moved, moved + 1), np.eye(4) + np.array([[0, 0, 0, 1]] * 3 + [[0] * 4]), atol=1e-9
+        )

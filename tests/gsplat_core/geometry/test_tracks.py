@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import pytest
 
-from gsplat_core.geometry.tracks import FeatureTracks, followed
+from gsplat_core.geometry import tracks as tracks_module
+from gsplat_core.geometry.tracks import SURVIVORS, FeatureTracks, followed
 
 HEIGHT, WIDTH = 96, 128
 
@@ -135,3 +137,34 @@ def test_a_point_whose_way_back_misses_is_lost():
     assert misses[:2].max() < 0.05 and misses[2] > 0.7
     nothing, none = followed(first, second, points[:0], window_px=21, levels=3)
     assert len(nothing) == len(none) == 0
+
+
+def found_at(monkeypatch, places, misses=None):
+    """Return the points of a 128x96 picture that tracking keeps of positions in the next picture."""
+    places = np.array(places, np.float32)
+    misses = np.zeros(len(places)) if misses is None else np.array(misses)
+    monkeypatch.setattr(tracks_module, "followed", lambda *_, **__: (places, misses))
+    tracks = FeatureTracks()
+    tracks._points, tracks._numbers = np.full((len(places), 2), 40, np.float32), np.arange(len(places))
+    grey = np.zeros((HEIGHT, WIDTH), np.uint8)
+    return tracks._moved(grey, grey, np.full(grey.shape, 255, np.uint8))[1].tolist()
+
+
+def test_points_are_kept_up_to_half_a_pixel_outside_of_the_centres_of_the_border(monkeypatch):
+    places = [
+        [-0.4, 50], [-0.6, 50], [50, -0.4], [50, -0.6], [WIDTH - 0.6, 50], [WIDTH - 0.4, 50], [50, HEIGHT - 0.6],
+        [50, HEIGHT - 0.4], [np.nan, 50],
+    ]  # fmt: skip
+    assert found_at(monkeypatch, places, [0] * 8 + [np.inf]) == [0, 2, 4, 6]
+
+
+@pytest.mark.parametrize(("more", "left_out"), [(0, False), (-1, True)])
+def test_a_picture_in_which_just_enough_points_survive_counts(monkeypatch, more, left_out):
+    count = 100
+    kept = int(SURVIVORS * count) + more
+    tracks = FeatureTracks()
+    tracks._before = np.zeros((HEIGHT, WIDTH), np.uint8)
+    tracks._points, tracks._numbers, tracks._next = np.full((count, 2), 40, np.float32), np.arange(count), count
+    monkeypatch.setattr(tracks, "_moved", lambda *_: (tracks._points[:kept], tracks._numbers[:kept]))
+    tracks.follow(np.zeros((HEIGHT, WIDTH, 3), np.uint8), None)
+    assert (len(last(tracks)[0]) == 0) == left_out and len(tracks._points) == (count if left_out else kept)
