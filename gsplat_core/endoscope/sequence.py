@@ -43,7 +43,7 @@ FROZEN_S = 0.25
 FROZEN_FRAMES = 8
 """Consecutive equal pictures from which the stream is frozen, independent of timestamps."""
 TORN_SHARE = 0.08
-"""Share of rows, up to the lower edge, equal to the previous picture from which a picture is torn."""
+"""Smallest share of rows at the lower edge of a torn picture that repeat the previous picture."""
 CHANGED_SHARE = 0.01
 """Share of changed pixels in a row of the picture from which the row counts as changed."""
 LEAST_CHANGED, ABRUPT_SHARE = 0.03, 0.5

@@ -54,7 +54,7 @@ SMOKE_HAZE = 15.0
 CLEAR_ABOVE = 0.87
 """Relative contrast or saturation above which a frame after smoke is clear again."""
 RECENT_S = 1.5
-"""Window in seconds of the usual sharpness (median). Blur is withheld for at most half of it.
+"""Window in seconds of the usual sharpness (median). Lasting blur is withheld for at most half of it.
 Smoke that lasts longer becomes the usual state.
 """
 RECENT_FRAMES = 5

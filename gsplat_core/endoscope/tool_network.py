@@ -28,13 +28,13 @@ CORNER, DARK_CORNER = 1 / 16, 0.75
 the time may be printed over the rest.
 """
 LOGARITHMS = np.log(np.arange(256, dtype=np.float32) / 255 + np.float32(0.06))
-"""Logarithm of a byte in 0..1, with an offset because ratios are noise where it is dark. As in training."""
+"""Logarithm of each byte value / 255 plus 0.06, which keeps noise small where it is dark. As in training."""
 SURROUND = 16
 """Largest channel below which a pixel counts as surround of the field of view. As in training."""
 CERTAIN = 2.0
 """Largest magnitude of a logit; logits beyond it are clipped before the smoothing along edges."""
 EDGE_RADIUS_PX, EDGE_CONTRAST = 3, 0.01
-"""Radius of the guided filter and its squared contrast, of logarithms of colours, above which edges are kept."""
+"""Radius of the guided filter in pixels, and variance of `LOGARITHMS` in its window above which it keeps edges."""
 
 SMALLEST_INNER_REGION = 0.02
 """Smallest area of a region that does not reach the border of the view, as a share of the picture. Tools enter from the border; clips,

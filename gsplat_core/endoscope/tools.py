@@ -25,7 +25,7 @@ Bytes = NDArray[np.uint8]
 SMALLEST_REGION = 0.003
 """Smallest area of a region, as a share of the field of view; smaller ones are glare or noise."""
 SMALLEST_INNER_REGION = 0.01
-"""Smallest area of a region that does not reach the border."""
+"""Smallest area of a region that does not reach the border, as a share of the field of view."""
 MOST_GLARE = 0.3
 """Share of a tool region without contact to the border that may be as bright as the brightest pixels, as highlights
 are.
@@ -33,9 +33,9 @@ are.
 SHARP_EDGE = 0.36
 """Smallest change of redness across a region's outline, within three pixels. Pale tissue and glare change gradually."""
 CORE = 0.35
-"""Share of a region that must be below the threshold by at least `CLEARLY_BELOW`."""
+"""Share of a tool's region that must be clearly grey (`CLEARLY_BELOW`)."""
 CLEARLY_BELOW = 0.08
-"""Distance below the threshold that counts as clearly grey."""
+"""Distance of a pixel's redness below the threshold for tools from which the pixel counts as clearly grey."""
 KNOWN = 0.5
 """Share of a region that was tool in the previous frame, from which thresholds are reduced."""
 KNOWN_DISCOUNT = 0.75

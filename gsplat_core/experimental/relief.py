@@ -199,7 +199,7 @@ GLINT_LOOKS = 4.0
 GLINT_CELL_SHARE = 1 / 64
 """Size of one highlight as a share of a cell."""
 FEWEST_GLINTS = 0.3
-"""Lower bound added to the variance of a cell's expected number of highlights."""
+"""Value added to the variance of a cell's number of highlights, so that it is not near 0."""
 BRIGHTNESS_LOOKS = 5
 """Number of evenly spaced pictures whose brightness is used."""
 ROUNDS = 16

@@ -42,7 +42,7 @@ x)) / SHOULDER. It differs between cameras.
 BESIDE_TOOLS = 0.07
 """Margin around tools excluded because of shadows, as a share of the longer side."""
 LEAST_KNOWN = 0.3
-"""Share of a cell's pixels that must be tissue that is neither under- nor overexposed."""
+"""Smallest share of usable pixels (tissue that is neither under- nor overexposed) of a known cell."""
 LEAST_DETAIL = 0.01
 """Lower bound of `Shading.detail`, the least noise of any picture."""
 LEAST_RED = 0.1

@@ -47,7 +47,7 @@ class SurfacePoint:
     depth: float
     """z in camera coordinates."""
     depth_error: float
-    """Standard error of z. The point is exactly on the pixel's ray."""
+    """Standard error of `depth`, in its unit. The point is exactly on the pixel's ray."""
     source_error: float
     """Part of `depth_error` that comes from the depth source."""
     opacity: float

@@ -29,7 +29,7 @@ at the distance of its centre.
 WINDOW_S = (0.0, 4.0)
 """Time window in seconds of a splat file: one turn of an orbit."""
 LEAST_RADIUS = 0.02
-"""Smallest displayable scene radius, because of the near plane of the rasterizer."""
+"""Smallest displayable scene radius, in the file's unit, because of the near plane of the rasterizer."""
 MOST_PLACED = 1_000_000
 """Largest number of Gaussians from which the default camera is computed; of more, every k-th is used."""
 MOST_COORDINATE = 1e9

@@ -272,7 +272,7 @@ class _DeviceOrder:
         self._device = device
         self._written: torch.cuda.Event | None = None
         self._read: dict[int, torch.cuda.Event] = {}
-        """Completion event of the last read on each stream."""
+        """Completion event of the last read on each CUDA stream, by handle, since the last write."""
 
     def before_writing(self) -> None:
         read, self._read = self._read, {}

@@ -183,7 +183,7 @@ class LiveOdometry:
         return 1 - (self._error_px / max(self._still_px, 1e-9)) ** 2
 
     def _hold_pose(self) -> None:
-        """Keep the previous pose and reset the motion prediction."""
+        """Count a frame that keeps the previous pose, and predict no motion for the next one."""
         self._waiting += 1
         self.not_placed += 1
         self._motion = torch.eye(4, dtype=torch.float64)

@@ -51,7 +51,7 @@ NEIGHBOURS = 5
 """Number of known points around a new point whose median depth initialises it."""
 POSE_ROUNDS, ROUNDS = 10, 25
 FLAT_PX = 33.0
-"""Weight of the prior that all points have similar depths (`flat_px` of `adjust`)."""
+"""Prior for similar depths of all points: a deviation of 100 % from the median costs as much as this error in pixels."""
 GROWTH = 1.3
 """Growth factor of the number of key frames from one bundle adjustment to the next."""
 

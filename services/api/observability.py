@@ -73,7 +73,7 @@ def log_to_stderr(settings: LogSettings) -> None:
 
 
 def _log_uncaught(kind: type[BaseException], error: BaseException | None, trace: TracebackType | None) -> None:
-    """Log an uncaught exception in the format of the log."""
+    """Log an uncaught exception, except SystemExit, in the format of the log."""
     if error is not None and not issubclass(kind, SystemExit):
         logging.getLogger("intrasplat").critical("an error that nothing has caught", exc_info=(kind, error, trace))
 

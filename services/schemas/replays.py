@@ -65,7 +65,7 @@ class ReplayRequest(BaseModel):
 
     @property
     def names(self) -> list[str]:
-        """Return the recordings."""
+        """Return the names of the recordings, also of a single one."""
         return self.recordings if self.recording is None else [self.recording]
 
 

@@ -19,7 +19,7 @@ constexpr int kBlockBits = 6;  // of a code
 constexpr int kMostLanes = 16;
 constexpr int kTargetFloats = kSums * kWindow * kWindow;
 
-// Picture to compare with.
+// Picture whose difference from the displayed one is the residual.
 struct Picture {
   const uint8_t* image;  // [height, width, 3]
   const uint8_t* mask;   // [height, width], 0 for pixels without a residual

@@ -36,7 +36,7 @@ struct Kernels {
   void (*diffuse)(const Diffusion& d, int64_t begin, int64_t end);
 };
 
-// The same on CUDA; all pointers are device memory.
+// `Kernels` on CUDA, for all Gaussians; all pointers are device memory.
 void accumulate_on_device(const Statistics& s, cudaStream_t stream);
 void diffuse_on_device(const Diffusion& d, int64_t count, cudaStream_t stream);
 

@@ -11,10 +11,10 @@ namespace {
 using projection::ellipse_gradient;
 using projection::EllipseGradient;
 
-// Sum of a Gaussian's gradient rows.
+// Sum of a Gaussian's gradient rows over the tiles that it touches.
 struct SplatRow {
   float moments[6];  // sums over pixels of s, s dx, s dy, s dx^2, s dx dy, s dy^2, where s = alpha dL/dalpha
-  float colors[4];   // red, green, blue, z
+  float colors[4];   // dL/d(red, green, blue, z); for colour corrections weighted residuals and the sum of weights
 };
 
 // Gradient of a Gaussian's raw parameters.

@@ -107,7 +107,7 @@ void visit_nodes(const FieldPlanes& planes, const FieldLines& lines, const Field
     time_nodes<kLane><<<time_blocks, kThreads, 0, branch.stream>>>(lines, line_gradient, time, planes.channels, time_slots, sink);
 }
 
-// Return whether all planes and rows are aligned for 16-byte accesses.
+// Return bits that are a multiple of 16 if rows and channels are aligned for 16-byte accesses.
 uintptr_t alignment(const FieldPlanes& planes, const FieldRows& rows, const float* line_gradient) {
   return uintptr_t(planes.channels) * 4 | uintptr_t(rows.space) | uintptr_t(rows.dense_sums) | uintptr_t(line_gradient);
 }

@@ -119,7 +119,7 @@ __global__ void __launch_bounds__(kThreads) differences(DeviceImageLoss in, cons
   if (threadIdx.x < kSums) block_sums[int64_t(blockIdx.x) * kSums + threadIdx.x] = sums[threadIdx.x];
 }
 
-// Compute the three means and their weighted sum, with one block.
+// Compute the means of colour, SSIM and depth terms and their weighted sum, with one block; a mean of no pixels is 0.
 __global__ void __launch_bounds__(kThreads) finish(DeviceImageLoss in, const int64_t* counts, const double* block_sums,
                                                    int64_t blocks, const double* ssim_sums, int64_t ssim_blocks) {
   double sums[kSums] = {};

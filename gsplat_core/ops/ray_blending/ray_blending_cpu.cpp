@@ -142,7 +142,7 @@ struct Backward {
   alignas(64) float v_values[D > 0 ? D : 1][kPixels];
 };
 
-// Add the terms of one splat at its blocks of pixels to `sum`.
+// Add one splat's gradient terms at the pixels of `blocks` (one bit each) to `sum`: shape, ray, then values.
 template <int D>
 GSPLAT_INLINE void splat_backward(const Inputs& in, const SplatRecord* records, int32_t id, int64_t position, uint64_t blocks,
                                   vfloat block_x, vfloat block_y, Backward<D>& w, vfloat* sum) {

@@ -101,7 +101,7 @@ GSPLAT_INLINE float along_axis(const float* changes, const uint8_t* bits, uint8_
   return sum;
 }
 
-// Write the gradients of a pixel.
+// Write the gradients of the sum of all terms by a pixel's depth, alpha and normal, times `scale`.
 GSPLAT_INLINE void write_normal_gradient(const NormalLoss& in, float scale, int x, int y) {
   const int64_t at = int64_t(y) * in.width + x;
   const float by_depth = along_axis(in.changes, in.bits, kWideX, at, 1, x, in.width) +

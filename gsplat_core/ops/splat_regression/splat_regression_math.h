@@ -41,7 +41,8 @@ GSPLAT_HOST_DEVICE double invert(int dims, const float* matrix, double* inverse)
   return determinant > 1e-30 && determinant < 1e30 ? determinant : 0;
 }
 
-// Prepare splat `i`. `log2` is the device's function for doubles.
+// Return splat `i` as evaluated: inverse matrix and normalisation. One with a non-finite value or a singular matrix is 0
+// everywhere. `log2`: the device's function for doubles.
 template <class Log2>
 GSPLAT_HOST_DEVICE Splat prepared(const Inputs& in, int64_t i, const Log2& log2) {
   constexpr double kHalfLog2TwoPi = 1.3257480647361595;

@@ -45,7 +45,7 @@ struct Kernels {
   // Processes rows [row_begin, row_end) of one strip. Results do not depend on the partition into bands.
   void (*band)(const SsimTask& task, int64_t strip, int64_t row_begin, int64_t row_end, float* scratch);
 };
-// Fill in the taps, and run all strips and rows on torch's threads.
+// Compute the window's weights (`taps`), then all strips and rows on torch's threads.
 void run_ssim(SsimTask& task);
 
 // Arguments of SSIM on CUDA; all pointers are device memory. Pixels of `image` and `gradient` are `stride` floats

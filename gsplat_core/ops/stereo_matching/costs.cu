@@ -37,7 +37,7 @@ __device__ inline Range range_of(int before, int here, int after) {
   return {uint8_t(min(here, min(one, other))), uint8_t(max(here, max(one, other)))};
 }
 
-// Compute the features of both images' pixels. looks: [2, height, width], of the left and of the right image.
+// Compute slope, brightness and their ranges at both images' pixels. looks: [2, height, width], left image first.
 __global__ void __launch_bounds__(kThreads) look_at(Pair pair, Look* looks) {
   const int64_t pixels = int64_t(pair.height) * pair.width, i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i >= 2 * pixels) return;

@@ -39,7 +39,7 @@ GSPLAT_INLINE void fill_range(const uint8_t* values, int64_t width, const Range&
   if (width > 1) fill(width - 1, width - 2, width - 1);
 }
 
-// Compute the features of a row of `picture`. slopes: [width].
+// Compute slope and brightness of row `y` with their ranges (`fill_range`). slopes: scratch of `width` values.
 GSPLAT_INLINE void fill_row(const Pair& pair, const uint8_t* picture, int64_t y, const Row& to, uint8_t* slopes) {
   const int64_t width = pair.width;
   const uint8_t* const here = picture + y * width;
@@ -78,7 +78,7 @@ GSPLAT_INLINE Bytes difference(const Range& left, int64_t x, const Range& right,
   return less(from_left, more(beyond(b, here(left.high)), beyond(here(left.low), b)));
 }
 
-// Compute the differences of a row's pixels [width, count].
+// Compute the matching costs [width, count] of a row's pixels: differences of slope and (bounded) of brightness.
 template <int kWide>
 GSPLAT_INLINE void pixel_costs(const Row& left, const Row& right, int64_t width, int count, uint8_t* costs) {
   using Bytes = typename Vector<kWide>::Bytes;

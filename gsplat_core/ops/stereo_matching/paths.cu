@@ -11,7 +11,7 @@ constexpr int kAhead = 8;  // pixels whose costs are prefetched
 // Threads per block. Paths are few and long, so small blocks spread them over all multiprocessors.
 constexpr int kPathThreads = 64;
 
-// Start of a path, and the distance between its pixels.
+// Index of a path's first pixel, and the step to the index of the next.
 struct Path {
   int64_t begin, step;
   int length;

@@ -33,7 +33,7 @@ constexpr int kJumpRadius = 5, kJumpMost = 2 * 16, kHoleRadius = 2;
 constexpr int kMostLowest = 1 << 14;
 constexpr int32_t kUnknown = INT32_MIN;
 
-// Directions of the paths.
+// Number of paths at a pixel: both directions along its row and its column.
 constexpr int kPaths = 4;
 
 struct Pair {

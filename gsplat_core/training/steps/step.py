@@ -88,7 +88,7 @@ class PictureTraining:
     """Training of a scene by the pictures of a differentiable renderer, with the renderer's values for the scene."""
 
     def __init__(self, name: str, distance: float, device: torch.device) -> None:
-        """Create the training, with the renderer's first values.
+        """Start training with the values of the renderer for a scene at a distance.
 
         Args:
             name: name in `RENDERERS` of a renderer with gradients.
@@ -101,7 +101,7 @@ class PictureTraining:
         self.restart(distance)
 
     def restart(self, distance: float) -> None:
-        """Reset the renderer's values for another scene."""
+        """Reset the renderer's values for another scene, at this typical distance from the camera."""
         first = self.renderer.first_values(distance)
         self._logs = {name: torch.full((1,), math.log(value), device=self._device) for name, value in first.items()}
         self._adam = FusedAdam(self._logs, rows=False)

@@ -89,7 +89,7 @@ class Strategy:
 
 
 GEOMETRY = ("means", "scales", "quats", "opacities")
-"""Names of the tensors that move and size a Gaussian."""
+"""Names of the tensors that strategies require: position, size, rotation and opacity."""
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 const UNITS = { mm: "mm", relative: "× median depth, no scale known", confidence: "confidence" };
 
-/** Draw the legend of an image header on a canvas. */
+/** Draw the legend of an image header on a canvas, if there is one and it differs from the drawn one. */
 export function drawLegend(canvas, legend) {
   const said = JSON.stringify(legend);
   if (!legend || canvas.dataset.said === said) return;

@@ -33,7 +33,7 @@ async function report(act) {
   await quietly(act);
 }
 
-/** Run a background action without clearing an earlier error message. */
+/** Run an action and show its error. Unlike `report`, it does not clear an earlier error message. */
 async function quietly(act) {
   try {
     await act();
@@ -87,7 +87,7 @@ function shown(header) {
   at("psnr-now").value = quality(header);
 }
 
-/** Clear the state if no image arrives, because an outdated state must not look current. */
+/** Show "no picture" and its duration if no image has arrived for SILENT_MS, so that an outdated state does not look current. */
 setInterval(() => {
   if (watched && heard_ms && performance.now() - heard_ms > SILENT_MS && at("state").dataset.state !== "no connection") {
     say("no picture", performance.now() - heard_ms);
@@ -106,7 +106,7 @@ function chooseAmong(streams) {
   explain(streams.find((stream) => stream.name === choice.value));
 }
 
-/** Show why a stream displays nothing new, such as frames withheld by a check, with the option to change. */
+/** Show the state of a stream and the server's reason for it, for example that a check withholds frames; hide it without a reason. */
 function explain(stream) {
   const reason = stream?.reason && stream.state !== "stopped" ? `${stream.state}: ${stream.reason}` : "";
   if (at("stream-reason").textContent !== reason) at("stream-reason").textContent = reason; // screen readers announce a change

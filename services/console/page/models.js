@@ -47,7 +47,7 @@ export function modelsPage(report) {
     return row(model.name, version.version, digest(version.digest), state, [size(version.size_bytes), contents(version.description)], uploaded, actions);
   }
 
-  /** Return the number of Gaussians and the kind of a checked model. */
+  /** Return a text of the number of Gaussians and the kind of a model; empty before the model is checked. */
   function contents({ gaussians, field, renderer }) {
     if (gaussians === undefined) return "";
     const kind = field ? `moving (${field})` : "static";

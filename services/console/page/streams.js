@@ -68,7 +68,7 @@ export function processFacts(process) {
   return said.join(", ");
 }
 
-/** Return the PSNR of an image header, followed by the PSNR of the trivial predictors if the server sends them. */
+/** Return the PSNR of an image header, then that of the trivial predictors if the server sends them; "" without a PSNR. */
 export function quality(report) {
   const decibels = (value) => (Number.isFinite(value) ? value.toFixed(1) : "");
   const own = decibels(report.psnr_db);

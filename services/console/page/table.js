@@ -28,13 +28,13 @@ export function button(text, act, report, name = "") {
   return made;
 }
 
-/** Return the button, or its successor with the same name after the table was redrawn. */
+/** Return the button or, if it was removed by redrawing the table, the first button with the same name, if any. */
 function sameButton(made) {
   const name = made.getAttribute("aria-label");
   return made.isConnected ? made : [...document.querySelectorAll("button[aria-label]")].find((each) => each.getAttribute("aria-label") === name);
 }
 
-/** Replace the rows of a table, unless one of its buttons is in use. */
+/** Replace the rows of a table. If one of its buttons has the focus, the new button at its position gets it. */
 export function replaceRows(body, rows) {
   if (body.contains(document.activeElement)) {
     const at = [...body.querySelectorAll("button")].indexOf(document.activeElement);
