@@ -96,9 +96,7 @@ class StripDetector:
         if before is None or not found.any():
             self.mask = None
             return
-        kept = (~found).view(np.uint8)
-        if self._step > 1:
-            kept = enlarged(kept, self._shape[1], self._shape[0])
+        kept = enlarged((~found).view(np.uint8), self._shape[1], self._shape[0])
         if self.mask is None or not np.array_equal(self.mask, kept):
             self.mask = kept
 

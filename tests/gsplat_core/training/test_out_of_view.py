@@ -14,6 +14,7 @@ from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians, RowMoves
 from gsplat_core.training.budget import Budget
 from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.growth import covering
 from gsplat_core.training.growth.covering import OutOfView
 from gsplat_core.training.growth.unseen import Archive, LastSeen, pixels_of
 from gsplat_core.training.metrics import psnr_tissue_db
@@ -239,3 +240,130 @@ def test_nothing_is_brought_back_where_nothing_was_archived_or_is_wanted(monkeyp
     expected = torch.zeros(20, 30, dtype=torch.bool)
     expected[5:16, 7:18] = True  # five pixels around
     assert most == 10 and torch.equal(near, expected)
+
+
+class Scene:
+    """Rows of a scene, without training."""
+
+    def __init__(self, gaussians, alpha=0.0):
+        self.gaussians, self.alpha, self.pictures = gaussians, alpha, []
+
+    def at(self, time_s):
+        return self.gaussians
+
+    def remove(self, leaving):
+        moves = RowMoves.without(leaving)
+        self.gaussians = self.gaussians.select(moves.order)
+        return moves
+
+    def append(self, added):
+        self.gaussians = self.gaussians.append(added)
+
+    def picture(self, gaussians, camera, depth):
+        self.pictures.append(camera)
+        return SimpleNamespace(alpha=torch.full((HEIGHT, WIDTH), self.alpha))
+
+    @property
+    def columns(self):
+        return sorted(self.gaussians.means[:, 0].tolist())
+
+
+def seen_from(column, time_s):
+    frame = frame_at(0, column, time_s=time_s)
+    return Observation.of(frame, CAMERA.with_pose(frame.pose))
+
+
+def wandered(capacity, count=20, alpha=0.0):
+    """A scene of `count` Gaussians 0.5 apart, seen at 0 s and left at 1 s."""
+    scene = moved(count)
+    scene.means[:, 0] = torch.arange(count) * 0.5 - 5
+    step, out = Scene(scene, alpha), OutOfView(capacity, torch.device("cpu"))
+    out.follow(step, seen_from(0, 0.0))
+    out.follow(step, seen_from(8 * WIDTH, 1.0))
+    return step, out
+
+
+@pytest.mark.parametrize(("capacity", "archived"), [(400, 0), (20, 2), (30, 0)])
+def test_as_many_gaussians_leave_as_a_tenth_of_the_capacity_lacks(capacity, archived):
+    step, out = wandered(capacity)
+    assert len(out.archive) == archived and step.gaussians.count == 20 - archived
+    assert set(step.columns) <= {round(-5 + 0.5 * k, 3) for k in range(20)}
+
+
+@pytest.mark.parametrize(("alpha", "is_back"), [(0.0, True), (1.0, False)])
+def test_archived_gaussians_are_back_where_nothing_covers_the_picture(alpha, is_back):
+    step, out = wandered(20, alpha=alpha)
+    all_columns = [round(-5 + 0.5 * k, 3) for k in range(20)]
+    assert len(out.archive) == 2 and step.pictures == [], "no Gaussian of the archive is in that picture"
+    step.gaussians = step.gaussians.select(slice(0, 12))  # capacity is there
+    left = step.columns
+    out.follow(step, seen_from(0, 1.1))
+    assert len(step.pictures) == 1 and len(out.archive) == (0 if is_back else 2)
+    assert len(step.columns) == 12 + 2 * is_back and set(left) <= set(step.columns)
+    assert set(step.columns) <= set(all_columns)
+    out.follow(step, seen_from(0, 1.2))
+    assert len(step.pictures) == 1, "an archive is searched once for a camera"
+    if is_back:
+        assert out.last_seen.times().tolist() == pytest.approx([1.1] * 14)
+
+
+def test_what_has_no_room_stays_in_the_archive():
+    step, out = wandered(20)
+    out._capacity = 19
+    out.follow(step, seen_from(0, 1.1))
+    assert step.gaussians.count == 19 and len(out.archive) == 1
+    out.restart()
+    assert len(out.archive) == 0 and len(out.last_seen.times()) == 0
+
+
+@pytest.mark.parametrize("room", [0, 3, 500])
+def test_new_tissue_is_filled_up_to_the_capacity(monkeypatch, room):
+    """From the archive first, if there is one."""
+    calls = []
+    observation, frame = seen_from(0, 2.0), frame_at(0, 0, time_s=2.0)
+    wanted = torch.arange(7)
+
+    class New:
+        is_any = True
+
+        def __init__(self, *given):
+            calls.append("new")
+
+        def __bool__(self):
+            return self.is_any
+
+        def pixels(self, now):
+            return "pixels"
+
+        def unfilled(self, now, mask):
+            return wanted, "depth"
+
+    def beside(places, of, known_mm, seen, config, most):
+        calls.append((known_mm, most))
+        return moved(min(most, len(places))) if most else None
+
+    out = SimpleNamespace(
+        has_in_view=lambda camera: True,
+        bring_back=lambda step, seen, pixels: calls.append(("back", pixels)),
+        last_seen=SimpleNamespace(see=lambda now, seen: calls.append("seen")),
+        make_room=lambda step, seen, count, unseen_s: calls.append(("room", count, unseen_s)),
+    )
+    monkeypatch.setattr(covering, "NewTissue", New)
+    monkeypatch.setattr(covering, "gaussians_beside", beside)
+    step = Scene(moved(10))
+    step.distance = lambda camera: 60.0
+    config = ReconstructorConfig(gaussians=10, max_gaussians=10 + room)
+    arguments = step, frame, observation, observation.camera, config
+    covering.fill_new_tissue(*arguments, out)
+    assert calls == ["new", ("back", "pixels"), "seen", ("room", 7, 0.0), ("depth", room)]
+    assert step.gaussians.count == 10 + min(room, 7)
+    calls.clear()
+    out.has_in_view, wanted = lambda camera: False, torch.zeros(0)
+    depth = np.full((HEIGHT, WIDTH), 60.0, np.float32)
+    covering.fill_new_tissue(step, frame.with_fields(depth=depth), *arguments[2:], out)
+    (_, (known_mm, _)) = calls
+    np.testing.assert_array_equal(known_mm, depth)
+    calls.clear()
+    New.is_any = False
+    covering.fill_new_tissue(*arguments, None)
+    assert calls == ["new"]
