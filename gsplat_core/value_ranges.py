@@ -71,7 +71,7 @@ ValueRange = IntegerIn | NumberIn | ListOf
 
 
 def shortened(value: object, most: int = 80) -> str:
-    """Return the `repr` of a possibly huge value, truncated to `most` characters."""
+    """Return the `repr` of a value, truncated to `most` characters, or only kind and length of a huge value."""
     if isinstance(value, int) and not isinstance(value, bool) and value.bit_length() > 256:
         return f"an integer of {value.bit_length()} bits"
     if isinstance(value, list | tuple | dict | str) and len(value) > 64:

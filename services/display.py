@@ -182,7 +182,7 @@ class DisplayHub:
         return channel.add(quality)
 
     def viewers(self, kind: PictureKind) -> int:
-        """Return the number of viewers."""
+        """Return the number of viewers of a kind of picture."""
         channel = self._channels.get(kind)
         return 0 if channel is None else len(channel.viewers)
 

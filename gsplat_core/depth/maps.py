@@ -186,7 +186,7 @@ def measured_confidence(depth: NDArray[np.floating]) -> NDArray[np.float32]:
 
 
 def _median(values: NDArray[np.float32]) -> float:
-    """Return the median of the non-zero values, or 0 if there are none."""
+    """Return the median of the positive values, of a sample of pixels if it has any, or 0 without any."""
     for some in (values[STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE], values):
         if np.any(some):
             return float(np.median(some[some > 0]))

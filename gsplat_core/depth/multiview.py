@@ -303,7 +303,7 @@ def _terms(
 
 
 def _normalised(pixels: NDArray[np.float32], camera: Camera) -> Array:
-    """Convert OpenCV pixel coordinates to rays."""
+    """Convert OpenCV pixel coordinates to rays (x / z, y / z) in camera coordinates."""
     return np.asarray((pixels.astype(np.float64) + 0.5 - camera.K[:2, 2]) / np.diag(camera.K)[:2])
 
 

@@ -122,7 +122,7 @@ def _blurred(sums: Array, sigma: float) -> Array:
 
 
 def _planes(sums: Array) -> Array:
-    """Return the locally fitted plane at each cell centre [h, w]."""
+    """Return the value of the locally fitted plane at each cell centre [h, w]."""
     row, column = np.mgrid[0 : sums.shape[0], 0 : sums.shape[1]] + 0.5
     return np.asarray(at_middles(tuple(np.moveaxis(sums, 2, 0)), column, row, 1.0, LEVEL), np.float64)
 

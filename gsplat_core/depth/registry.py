@@ -112,7 +112,7 @@ def of_recording(choice: str) -> str | None:
 
 
 def depth_inputs(choice: str) -> tuple[Path, ...]:
-    """Return the files that a depth source reads."""
+    """Return the files that the setting `choice` of the depth source makes it read; often none."""
     name, _, address = choice.partition(":")
     path = address.partition("?")[0]
     return (Path(path),) if name in WITH_ADDRESS and path else ()
@@ -133,7 +133,7 @@ class Sentences:
         self._frames: Counter[str] = Counter()
 
     def add(self, sentence: str | None) -> None:
-        """Count a message about one frame; None is ignored."""
+        """Count a message about one frame by its kind, the text before a colon; None is ignored."""
         if sentence is not None:
             kind = sentence.partition(":")[0]
             self._first.setdefault(kind, sentence)

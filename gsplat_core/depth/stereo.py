@@ -429,7 +429,7 @@ class StereoDepth(Estimator):
         return _depth_error(variance_px2(found.confidence, frame.width_px, beside**2), found.depth, frame, camera)
 
     def _look(self, left: NDArray[np.uint8], right: NDArray[np.uint8], frame: Frame, parallel_px: float) -> PairLook:
-        """Check the pair and update its rows and disparity range."""
+        """Check the pair. Unless it is doubtful, update its row offsets and extend the disparity range."""
         look = look_at(left, right, frame.loss_mask)
         why = look.doubt or _why_implausible(look, parallel_px, calibrated=frame.right_camera is not None)
         if why is not None:

@@ -44,7 +44,7 @@ class View:
     """Reduced picture with the features that are compared."""
 
     def __init__(self, image: NDArray[np.uint8]) -> None:
-        """Prepare an RGB uint8 picture [H, W, 3] of any size."""
+        """Reduce an RGB uint8 picture [H, W, 3] of any size and divide each channel by its median."""
         small = reduced(image, WIDTH_PX, HEIGHT_PX)
         self.bright: NDArray[np.bool_] = lowest_and_highest(small)[1] >= DARK
         # Make channels contiguous, because medians are then fast.

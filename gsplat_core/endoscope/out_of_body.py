@@ -168,7 +168,7 @@ class BodyGate:
         """Evidence of the outside in recent pictures."""
 
     def reset(self) -> None:
-        """Reset for another stream."""
+        """Open the gate and forget all pictures, for another stream."""
         self._open()
 
     @property

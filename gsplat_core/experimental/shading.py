@@ -273,7 +273,7 @@ class Follower:
         self._method: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
 
     def change_to(self, look: Look) -> Change:
-        """Compute the change from the key picture to another one."""
+        """Compute the change of brightness and position of the key picture's tissue in another picture, per cell."""
         key = self._key
         first, second = key.texture.texture, look.texture.texture
         self._there = self._method.calc(first, second, self._there)

@@ -69,7 +69,7 @@ class Shutter:
         return self.turn is not None
 
     def times(self, pixels: Tensor, width: int, height: int) -> Tensor:
-        """Return the read-out times [...] of pixel positions [..., 2]."""
+        """Return the read-out times of pixel positions [..., 2], from 0 (first row or column read) to 1 (last)."""
         horizontal = self.kind in (RollingShutterType.ROLLING_LEFT_TO_RIGHT, RollingShutterType.ROLLING_RIGHT_TO_LEFT)
         length = width if horizontal else height
         time = (pixels[..., 0 if horizontal else 1] - 0.5) / max(length - 1, 1)

@@ -175,7 +175,7 @@ class _Instances:
 
 
 def _part_sizes(length: int) -> list[int]:
-    """Return sizes of consecutive parts of a list."""
+    """Return sizes of consecutive parts of a list: from `FIRST_SPLATS` doubling to `SPLATS_AT_A_TIME`; [0] if empty."""
     sizes, size = [], FIRST_SPLATS
     while length > 0:
         sizes.append(min(size, length))

@@ -170,7 +170,7 @@ class TileListCapacity:
 
     @staticmethod
     def initial(gaussians: int, width_px: int, height_px: int) -> TileListCapacity:
-        """Return the initial capacity: four tiles per Gaussian, and twice the mean in a tile."""
+        """Return the initial capacity, for four instances per Gaussian and at most twice their mean in a tile."""
         tiles = math.ceil(width_px / TILE_SIZE) * math.ceil(height_px / TILE_SIZE)
         return TileListCapacity.for_frame(4 * gaussians, math.ceil(8 * gaussians / tiles))
 

@@ -122,7 +122,7 @@ def basis_field_add_colours_(
 
 
 def _scalars(name: str, values: float | Sequence[float] | Tensor, like: Tensor, count: int) -> Tensor:
-    """Return float32 values on the device of `like`; numbers are passed as launch arguments."""
+    """Return `count` float32 values on the device of `like`, without waiting for a GPU. Raises InvalidInput."""
     if not isinstance(values, Tensor):
         numbers = [float(v) for v in values] if isinstance(values, Sequence) else [float(values)]
         if len(numbers) != count:

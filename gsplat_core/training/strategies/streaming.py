@@ -87,7 +87,7 @@ DENSIFY_FRAMES = 12
 
 
 def densification_rounds(steps: int) -> list[int]:
-    """Return the step numbers of the rounds."""
+    """Return the step numbers of the densification rounds, evenly spaced up to the share `DENSIFY_UNTIL` of `steps`."""
     return [round(steps * DENSIFY_UNTIL * (k + 1) / DENSIFY_ROUNDS) for k in range(DENSIFY_ROUNDS)]
 
 
