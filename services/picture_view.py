@@ -54,9 +54,9 @@ class Viewpoint:
     elevation: float
     """Upward rotation around the pivot, in degrees."""
     distance: float
-    """Distance from the pivot."""
+    """Distance of the camera from the pivot, over that of the scene's middle from the model's camera."""
     right: float
-    """Shift of the pivot to the right, in the axes of the model's camera."""
+    """Shift of the pivot to the right in the axes of the model's camera, in the unit of `distance`."""
     down: float
     time: float
     """Time in seconds of the model's window."""

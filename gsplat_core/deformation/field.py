@@ -152,7 +152,7 @@ class Capabilities:
     motion: EditableMotion | None = None
     """Direct changes of the deformation, for corrections by depth and optical flow."""
     captured_motion: CapturedMotion | None = None
-    """`motion` in a CUDA graph."""
+    """Form of `motion` that a CUDA graph can capture."""
     continuation: Continuable | None = None
     """Extrapolation after the newest frame."""
     frame_deltas: FrameDeltas | None = None

@@ -62,11 +62,11 @@ class TrajectoryErrors:
     """RMS position error divided by the length of the true path."""
 
     rigid_share: float
-    """Error after alignment by rotation and translation, for estimates with metric scale."""
+    """Position error as a share of the true path, after a rigid alignment; for estimates with metric scale."""
     similarity_share: float
-    """Error after alignment by a similarity transform, for the shape of the path alone."""
+    """Position error as a share of the true path, after a similarity alignment; for the shape of the path alone."""
     still_share: float
-    """Baseline: error of a static scope at the mean of the true positions."""
+    """Baseline: `rigid_share` of a static scope at the mean of the true positions."""
     rigid_rmse: float
     """`rigid_share` in the unit of the true path."""
     rotation_deg: float
@@ -147,10 +147,10 @@ class PartShares:
     """
 
     motion: float
-    """Share of positions and orientations."""
+    """Share of the squared error that the changes of positions and orientations remove."""
     colour: float
     size: float
-    """Share of sizes and opacities."""
+    """Share of the squared error that the changes of sizes and opacities remove."""
     explained: float
     """Sum of the three shares. The rest is the error of the complete model."""
     reference_s: float

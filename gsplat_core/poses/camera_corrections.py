@@ -34,7 +34,7 @@ class CameraCorrections(torch.nn.Module):
     """
 
     sigmas: Tensor
-    """Expected errors [6] of a twist."""
+    """Expected errors [6] of a twist: of the translation in the scene's unit, of the rotation in radians."""
     free: Tensor
     """Factors [count, 1]: 0 for fixed cameras, else 1."""
 

@@ -116,14 +116,14 @@ class DepthShareFacts(Part):
 
     rmse_share: float
     scaled_rmse_share: float
-    """Error after scaling the model's depth by `scale`: relative, assesses shape only."""
+    """`rmse_share` after scaling the model's depth by `scale`, which assesses its shape only."""
     plane_rmse_share: float
-    """Baseline: each frame's best-fit plane."""
+    """`rmse_share` of a baseline: each frame's best-fit plane."""
     level_rmse_share: float
-    """Baseline: a level plane at each frame's median true depth."""
+    """`rmse_share` of a baseline: a level plane at each frame's median true depth."""
     median_share: float
     rmse: float
-    """Error in the unit of the recording's depth, mm if calibrated."""
+    """Root mean square error in the unit of the recording's depth, mm if calibrated."""
     scale: float
     median_depth: float
     covered: float
@@ -196,7 +196,7 @@ class TrajectoryFacts(Part):
 
     rigid_share: float
     similarity_share: float
-    """Error after the best scale: relative."""
+    """Position error after the best alignment and scale, as a share of the length of the true path."""
     still_share: float
     rigid_rmse: float
     rotation_deg: float

@@ -35,7 +35,7 @@ class DefaultStrategy(Strategy):
     prune_opa: float = 0.005
     """Opacity below which a Gaussian is removed."""
     grow_grad2d: float = 0.0002
-    """Mean gradient above which a Gaussian is multiplied. 0.0008 suits `absgrad`."""
+    """Mean gradient by the centre, in half pictures, above which a Gaussian is multiplied. 0.0008 suits `absgrad`."""
     grow_scale3d: float = 0.01
     """Largest scale, relative to the scene, of a Gaussian that is duplicated instead of split."""
     grow_scale2d: float = 0.05
