@@ -168,7 +168,7 @@ def _shown(frame: Frame) -> Structure:
     for mask in (frame.mask, frame.loss_mask):
         if mask is not None:
             some = cv2.resize(mask, samples, interpolation=cv2.INTER_NEAREST) > 0
-            known &= averaged(some.view(np.uint8) * np.uint8(255), size, SAMPLES) > 127
+            known &= averaged(some.view(np.uint8) * np.uint8(255), size, SAMPLES) >= 128  # half of the samples
     return Structure.of(averaged(frame.image, size, SAMPLES).astype(np.float32) / np.float32(255), known)
 
 

@@ -190,3 +190,11 @@ def test_the_expected_picture_has_values_from_0_to_1_and_weighs_tissue_alone(mon
     motion.after = object()
     prior._take(frame, flow, torch.device("cpu"))
     assert prior._expected is None, "the scope moves"
+
+
+def test_an_expectation_without_a_usable_motion_predicts_nothing(monkeypatch):
+    """After a cut, say, where the expectation is that of the scene before."""
+    prior = prior_of(1 / 30)
+    prior._expected = object()
+    monkeypatch.setattr(LearnedPrior, "_usable_motion", lambda self: None)
+    assert prior.velocity(SimpleNamespace()) is None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsplat_core.depth.maps import believed_depth, measured_confidence, possible_depth
+from gsplat_core.depth.maps import STRIDE, _median, believed_depth, measured_confidence, possible_depth
 from gsplat_core.depth.registry import DepthFinder
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
@@ -135,3 +135,14 @@ def test_depth_without_a_confidence_is_believed_and_no_depth_is_unknown() -> Non
     assert np.array_equal(possible_depth(frame), slope()) and np.array_equal(believed_depth(frame), slope())
     frame = frame.with_fields(depth=None, depth_origin=None)
     assert not possible_depth(frame).any() and not believed_depth(frame).any()
+
+
+def test_a_median_is_that_of_samples_or_of_all_values_if_no_sample_is_known():
+    depth = np.zeros((3 * STRIDE, 5 * STRIDE), np.float32)
+    assert _median(depth) == 0
+    depth[0, :3] = 3, 4, 9
+    assert _median(depth) == 4
+    depth[STRIDE // 2, STRIDE // 2] = 50
+    assert _median(depth) == 50
+    depth[STRIDE // 2, -STRIDE // 2] = 60
+    assert _median(depth) == 55

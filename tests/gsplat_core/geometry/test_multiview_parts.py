@@ -9,7 +9,7 @@ import pytest
 
 from gsplat_core.depth import multiview
 from gsplat_core.depth.maps import DepthMap
-from gsplat_core.depth.multiview import ParallaxDepth, chosen_views
+from gsplat_core.depth.multiview import ParallaxDepth, chosen_views, view_of
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_origin import PARALLAX
 from gsplat_core.scene.frames import Frame
@@ -110,3 +110,17 @@ def test_depth_without_confidence_is_doubted_and_a_doubt_stays(monkeypatch, doub
         pose[0, 3] = -float(seq)
         found = estimator.estimate(Frame(seq, seq, image, pose=pose), Camera.from_focal(60.0, 64, 48, pose))
     assert found is not None and found.doubt == (doubt or multiview.DEFORMS)
+
+
+@pytest.mark.parametrize(("size", "small"), [((80, 60), (80, 60)), ((200, 100), (100, 50)), ((100, 200), (50, 100))])
+def test_a_view_is_reduced_to_its_longest_side_and_without_what_is_no_tissue(size, small):
+    width, height = size
+    mask, inside = np.ones((2, height, width), np.uint8)
+    mask[: height // 2], inside[:, : width // 2] = 0, 0
+    frame = Frame(0, 0, np.full((height, width, 3), 90, np.uint8), mask=mask, loss_mask=inside)
+    view = view_of(frame, Camera.from_focal(50.0, width, height), 100)
+    assert view.grey.shape == view.tissue.shape == small[::-1]
+    assert (view.camera.width_px, view.camera.height_px) == small
+    expected = np.zeros(small[::-1], np.uint8)
+    expected[small[1] // 2 :, small[0] // 2 :] = 1
+    np.testing.assert_array_equal(view.tissue, expected)

@@ -302,3 +302,14 @@ def test_a_place_is_compared_where_three_tenths_of_the_picture_are_known(share, 
 
 def test_eight_places_are_kept_and_no_more():
     assert len(left(*range(7))) == 7 and len(left(*range(8))) == len(left(*range(9))) == 8
+
+
+@pytest.mark.parametrize(("samples", "is_known"), [(7, False), (8, True), (9, True)])
+def test_a_compared_pixel_is_known_if_half_of_its_samples_are(samples, is_known):
+    mask = np.ones((4 * HEIGHT, 4 * WIDTH), np.uint8)
+    block = np.zeros(16, np.uint8)  # the samples of one compared pixel
+    block[:samples] = 1
+    mask[4:8, 8:12] = block.reshape(4, 4)
+    frame = Frame(0, 0, tissue(1, 4 * WIDTH, 4 * HEIGHT), mask=mask)
+    known = structure_of(frame).known
+    assert known[1, 2] == is_known and known.sum() == known.size - (not is_known)

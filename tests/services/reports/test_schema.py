@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import builtins
+import io
 import json
+import platform
 
 import pytest
 from pydantic import ValidationError
 
-from services.reports.schema import BinEntry, FrameEntry, RunReport
+from services.reports.schema import BinEntry, FrameEntry, RunReport, processor_name
 
 PROMISED = {
     "recording": {"frames", "width_px", "height_px", "fps"},
@@ -78,3 +81,27 @@ def test_an_unknown_field_is_refused(report):
 def test_the_json_schema_can_be_given_out():
     schema = RunReport.model_json_schema()
     assert "frames_sha256" in schema["required"]
+
+
+@pytest.mark.parametrize(
+    ("lines", "processor", "name"),
+    [
+        ("flags: a\nmodel name\t: A Processor: 3 GHz \nmodel name : B\n", "other", "A Processor: 3 GHz"),
+        ("flags: a\n", "other", "other"),
+        ("", "", "a machine"),
+        (None, "other", "other"),
+        (None, "", "a machine"),
+    ],
+)
+def test_the_processor_has_its_own_name_if_the_system_knows_it(monkeypatch, lines, processor, name):
+    def opened(path, **_):
+        if lines is None:
+            raise FileNotFoundError(path)
+        return io.StringIO(lines)
+
+    monkeypatch.setattr(builtins, "open", opened)
+    monkeypatch.setattr(platform, "processor", lambda: processor)
+    monkeypatch.setattr(platform, "machine", lambda: "a machine")
+    found = processor_name()
+    monkeypatch.undo()
+    assert found == name
