@@ -231,7 +231,7 @@ def _bound(function: Any, options: tuple[tuple[str, Any], ...]) -> Any:
 
 
 def _with_options(value: Any, options: Mapping[str, Any] | None) -> Any:
-    """Return a function with other default values of its options; the same wrapper object at every call."""
+    """Return a function with other defaults of its options, the same wrapper object at every call; `value` for None."""
     return value if options is None else _bound(value, tuple(options.items()))
 
 

@@ -368,7 +368,7 @@ MOST_OWN_MOTION = 0.06
 this share and decreases linearly between the two.
 """
 DEFORMS = "the tissue moves too much relative to the scope for depth by parallax"
-"""Rejection reason if no pixel has confident depth."""
+"""Reason for rejecting a map without any confident depth, which moving tissue usually causes."""
 FILLED = 0.2
 """Confidence of extrapolated depth."""
 

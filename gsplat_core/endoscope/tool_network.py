@@ -51,9 +51,9 @@ class _Network:
     logits: Callable[[NDArray[np.float32]], NDArray[np.float32]]
     """Function of `features` [1, inputs, h, w] that returns logits of tool [h / 2, w / 2]."""
     input_px: tuple[int, int]
-    """Width and height."""
+    """Width and height of the network's input in pixels."""
     inputs: int
-    """Number of planes."""
+    """Number of planes of the network's input."""
 
 
 def _loaded(path: Path, device: str, input_px: tuple[int, int], inputs: int) -> _Network:

@@ -244,9 +244,9 @@ class Geometry:
     tracking: Tracking | None
     flow: FlowErrors | None
     trajectory: TrajectoryErrors | None
-    """None also if the model uses the poses of the recording."""
+    """Errors of the model's poses; None without true poses, or if the model uses those of the recording."""
     parts: PartShares | None
-    """None if the model is static."""
+    """Shares of the picture error that motion, colour and size over time remove; None if the model is static."""
     ray_depth: DepthShare | None = None
     """Errors of the depth along the rays; None if the renderer does not have it."""
     ray_normals: NormalErrors | None = None

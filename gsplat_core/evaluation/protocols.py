@@ -106,7 +106,7 @@ class HeldOut:
     unrounded_db: float | None
     """Mean tissue PSNR in dB of the pictures before they are rounded; None if no frame was scored."""
     depth: DepthErrors | None
-    """None if the recording has no depth."""
+    """Depth errors against the recording's depth; None if it has none."""
 
 
 def evaluate_heldout(

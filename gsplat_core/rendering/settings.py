@@ -53,7 +53,7 @@ class Arguments(NamedTuple):
     scales: Tensor | None
     opacities: Tensor
     colors: Tensor | None
-    """None if `render_mode` has no colours."""
+    """Colours or SH coefficients of `rasterization`; None if `render_mode` has no colours."""
     viewmats: Tensor
     Ks: Tensor
     backgrounds: Tensor | None

@@ -165,9 +165,9 @@ class TrackingFacts(Part):
 
     model: TrackFacts
     scaled: TrackFacts
-    """Errors after the sequence's depth scale factor: relative."""
+    """Errors after scaling the model by the sequence's depth scale factor."""
     still: TrackFacts
-    """Baseline: no motion."""
+    """Errors of a baseline without motion."""
     points: Count
     compared: Count
 
@@ -185,9 +185,9 @@ class FlowFacts(Part):
 
     model: EndPointFacts
     scaled: EndPointFacts
-    """Errors after the sequence's depth scale factor: relative."""
+    """Errors after scaling the model by the sequence's depth scale factor."""
     still: EndPointFacts
-    """Baseline: no motion."""
+    """Errors of a baseline without motion."""
     frames: Count
 
 

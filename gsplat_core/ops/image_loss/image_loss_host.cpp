@@ -52,7 +52,7 @@ struct Weights {
   bool squared;
 };
 
-// Return values of a call.
+// Return values of image_loss: loss, its terms [3], and its gradients by image and depth.
 struct Results {
   Tensor loss, terms, v_image, v_depth;
 };
