@@ -25,7 +25,7 @@ from gsplat_core.io.recordings.packets import length_bytes, packet_check
 from gsplat_core.io.recordings.plain_files import MAX_PIXELS
 
 PROBED = frozenset({"hevc", "vp8"})
-_BEHIND = bytes(random.Random(1).randrange(4, 256) for _ in range(256))  # contains no start code
+_BEHIND = bytes(random.Random(1).randrange(4, 256) for _ in range(256))  # bytes of at least 4 contain no start code
 _H265_PICTURES = range(32)
 
 

@@ -81,7 +81,7 @@ __device__ inline Blend blend(const Pixel& pixel, float power, const AlphaLimit&
   return b;
 }
 
-// Add a pixel's contribution to the moments, and advance the pixel to in front of the splat.
+// Add a pixel's s = alpha dL/dalpha times 1, dx, dy, dx^2, dx dy and dy^2 to `v`; advance the pixel to in front of the splat.
 template <bool kAbs, int D>
 __device__ inline void add_moments(const Record<D>& r, const Falloff& f, const Blend& b, float g, const AlphaLimit& limit,
                                    Pixel& pixel, float* v) {

@@ -60,7 +60,7 @@ __global__ void __launch_bounds__(kThreads)
   if (known && there >= 0 && there < pair.width) atomicMin(right + pixel - x + there, key);
 }
 
-// Return true if the matching pixel of the right image prefers another disparity.
+// Return true if the matching pixel of the right image prefers another disparity; false if it has none.
 __device__ inline bool differs(const Pair& pair, const uint32_t* row, int x, int disparity) {
   const int there = x - disparity;
   if (there < 0 || there >= pair.width || row[there] == kNone) return false;

@@ -62,7 +62,7 @@ struct Request {
   constexpr int64_t subpixels() const { return int64_t(columns()) * rows(); }
 };
 
-// Projected splat, with the work that it has left to do.
+// Projected splat, with the number of fragments or points to draw for it.
 struct alignas(16) Splat {
   float u, v, z;   // centre in pixels, camera z
   float conic[3];  // log2(e) / 2 times the coefficients of x^2, 2 xy and y^2
