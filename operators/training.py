@@ -396,7 +396,7 @@ class RecordedCalls(Training):
         self._due = next(self._lines, None)
 
     def end(self) -> None:
-        """Close the recorded schedule."""
+        """Release the recorded schedule and the kept frames."""
         self._observed.clear()
         self._lines, self._depths = iter(()), iter(())
 

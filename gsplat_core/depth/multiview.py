@@ -190,7 +190,7 @@ POINTS = 400
 APART_PX = 5
 """Smallest distance between corners in pixels."""
 RETURNS_PX = 0.5
-"""Largest accepted forward-backward error in pixels."""
+"""Largest accepted error of a point tracked forward and back, in pixels."""
 FEWEST_POINTS = 24
 """Fewest tracked corners from which a view is used."""
 TRACK_ERROR_PX = 0.5

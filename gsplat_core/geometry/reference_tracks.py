@@ -38,7 +38,7 @@ HALO_PX = 5
 """Side of the square by which unusable areas are grown, in pixels."""
 LEVELS = 2
 RETURN_PX = 0.3
-"""Largest accepted forward-backward error in pixels."""
+"""Largest accepted error of a point tracked forward and back, in pixels."""
 OFF_PX, OFF_MEDIANS = 1.0, 3.0
 """Distance from the smooth map from which a match is wrong: in pixels, and as a multiple of the median distance."""
 LEAST_FOUND = 24

@@ -63,7 +63,7 @@ PATCH_PX = 21
 """Side of the square patch that is tracked, in pixels."""
 LEVELS = 3
 RETURN_PX = 0.7
-"""Largest accepted forward-backward error in pixels."""
+"""Largest accepted error of a point tracked forward and back, in pixels."""
 BORDER_PX = 8
 SURVIVORS = 0.2
 """Smallest share of the points that must be found in the next picture; otherwise that picture is skipped."""

@@ -38,7 +38,7 @@ LONGEST_PX = 320
 """Longer side of the compared pictures in pixels."""
 MOST_CORNERS, CORNERS_APART_PX, PATCH_PX, LEVELS = 300, 6, 21, 3
 RETURN_PX = 0.7
-"""Largest accepted forward-backward error in pixels."""
+"""Largest accepted error of a point tracked forward and back, in pixels."""
 LEAST_MOTION = 0.005
 """Median motion of the corners, as a share of the longer side, below which the scope counts as static."""
 MOVING_SHARE = 0.75

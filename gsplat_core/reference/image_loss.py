@@ -66,7 +66,7 @@ def _mean_where(values: Tensor, keep: Tensor) -> Tensor:
 
 
 def _tissue(mask: Tensor | None, like: Tensor) -> Tensor:
-    """Broadcast the mask to booleans [H, W, C]."""
+    """Broadcast the mask to booleans [H, W, C], all True for None. Raises InvalidInput for another size."""
     if mask is None:
         return torch.ones_like(like, dtype=torch.bool)
     if mask.shape != like.shape[:2]:

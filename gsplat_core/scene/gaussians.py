@@ -168,7 +168,7 @@ class Gaussians:
         return self.map(lambda tensor: tensor.to(device=device, dtype=dtype))
 
     def requires_grad_(self, requires_grad: bool = True) -> Gaussians:
-        """Enable gradients of the tensors; returns self."""
+        """Enable or disable gradients of all tensors; returns self."""
         for tensor in self.tensors().values():
             tensor.requires_grad_(requires_grad)
         return self
