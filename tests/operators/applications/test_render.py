@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 import torch
 
-from gsplat_core.errors import InvalidSetting
+from gsplat_core.errors import InvalidSetting, RecordingError
 from gsplat_core.io.bundle import save_bundle
 from gsplat_core.rendering.renderer import RendererOptions
+from operators.applications import render
 from operators.applications.render import render_model, render_picture, write_video
 from operators.errors import DeviceMissing, OutputError, OutputFolderInUse
 
@@ -150,3 +153,41 @@ def test_an_error_before_the_first_picture_leaves_no_video(tmp_path, was_there):
     with pytest.raises(OutputError, match="no space is left"):
         write_video(pictures_until_an_error(0), out, (64, 48), 30.0, overwrite=True)
     assert out.exists() == was_there
+
+
+def test_the_depth_of_a_very_large_scene_is_the_median_of_what_is_before_the_camera(model, monkeypatch):
+    """Of every third Gaussian, if three times as many as are pictured are there."""
+    scene = replace(model(), field=None)
+    count = scene.gaussians.count
+    means = scene.gaussians.means.clone()
+    means[:, 2] = torch.arange(count) - count / 2
+    scene = replace(scene, gaussians=replace(scene.gaussians, means=means))
+    monkeypatch.setattr(render, "MOST_PICTURED", -(-count // 3))
+    pose = np.eye(4)
+    pose[2, 3] = 7.0
+    camera = scene.camera.with_pose(pose)
+    depths = means[::3, 2].numpy() + 7
+    assert render.typical_depth(scene, camera) == pytest.approx(np.median(depths[depths > 0]))
+    pose[2, 3] = -1e6
+    with pytest.raises(InvalidSetting, match="sees no part of the scene"):
+        render.typical_depth(scene, scene.camera.with_pose(pose))
+
+
+@pytest.mark.parametrize(
+    ("digest", "own", "is_refused"), [("a", "a", True), ("a", "b", False), ("a", None, False), (None, "a", False)]
+)
+def test_the_recording_that_a_model_was_trained_on_is_not_replaced(tmp_path, monkeypatch, digest, own, is_refused):
+    def opened(path):
+        if digest is None:
+            raise RecordingError("no recording")
+        return SimpleNamespace(digest=digest)
+
+    monkeypatch.setattr(render, "open_recording", opened)
+    made_from = SimpleNamespace(training_digest=own)
+    render._check_not_trained_on(made_from, tmp_path / "v.mp4")  # there is no such file yet
+    (tmp_path / "v.mp4").write_bytes(b"video")
+    if is_refused:
+        with pytest.raises(OutputError, match="the model was trained on"):
+            render._check_not_trained_on(made_from, tmp_path / "v.mp4")
+    else:
+        render._check_not_trained_on(made_from, tmp_path / "v.mp4")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from types import SimpleNamespace
 
 import pytest
 
@@ -15,6 +16,7 @@ from operators.graph import (
     PeriodicCondition,
     StopReason,
 )
+from operators.graph.operator import InputContext
 
 
 @pytest.mark.parametrize(("policy", "received"), [("drop_oldest", [2, 5, 8]), ("drop_new", [0, 3, 6])])
@@ -232,3 +234,13 @@ def test_operators_find_each_other(kit, runner):
     app = kit.Wired(wire)
     runner(app)
     assert found == [*app.ops, None]
+
+
+def test_the_messages_that_wait_at_an_input_are_counted():
+    ports = {"frame": SimpleNamespace(batched=False), "alone": SimpleNamespace(batched=False)}
+    operator = SimpleNamespace(spec=SimpleNamespace(inputs=ports))
+    waiting = [1, 2, 3]
+    inputs = InputContext(operator, {"frame": [waiting]}, [])
+    assert (inputs.queued("frame"), inputs.queued("alone")) == (3, 0)
+    waiting.clear()
+    assert inputs.queued("frame") == 0
