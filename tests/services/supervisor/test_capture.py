@@ -13,9 +13,12 @@ import av
 import numpy as np
 import pytest
 
-from operators.errors import SourceUnavailable
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import Frame
+from operators.errors import SourceError, SourceUnavailable
 from operators.sources import registry
-from operators.sources.source import SourceState
+from operators.sources.source import SourceDescription, SourceState
+from services.errors import CommandRefused
 from services.supervisor import capture as capture_module
 from services.supervisor.capture import Capture
 from services.supervisor.launcher import FAILED
@@ -153,3 +156,116 @@ def test_a_camera_whose_driver_is_stuck_ends_the_process(monkeypatch):
     with pytest.raises(Ended):
         Capture(SourceSpec(address="v4l2:/dev/video0"))._publish(StuckCamera(), worker, None, None)
     assert worker.said[0][0] == "stalled"
+
+
+class Scripted:
+    """Source that gives frames, states and errors in turn."""
+
+    description = SourceDescription("a camera", 8, 6, 30.0, Camera.from_focal(50.0, 8, 6))
+
+    def __init__(self, *steps):
+        self.steps, self.state, self.closed, self.opened = list(steps), SourceState.LIVE, 0, 0
+
+    def open(self):
+        self.opened += 1
+
+    def read(self, timeout_s):
+        step = self.steps.pop(0)
+        if isinstance(step, Exception):
+            raise step
+        if isinstance(step, SourceState):
+            self.state = step
+            return None
+        return step
+
+    def close(self):
+        self.closed += 1
+
+
+class Counting(FakePublisher):
+    """Stops the worker after some frames."""
+
+    def __init__(self, worker, most):
+        super().__init__(worker)
+        self.most, self.runs = most, []
+
+    def publish_frame(self, header, frame):
+        self.frames += 1
+        self.runs.append(header["run"])
+        if self.frames == self.most:
+            self.worker.stop.set()
+
+
+class Waiting(FakeWorker):
+    def __init__(self):
+        super().__init__()
+        self.waits = []
+
+    def wait(self, seconds):
+        self.waits.append(seconds)
+
+
+def published(monkeypatch, *sources, most):
+    """Publish the frames of sources that are opened in turn; an error stands for a source that cannot be opened."""
+    left, worker, capture = list(sources), Waiting(), Capture(SourceSpec(address="synthetic:"))
+
+    def open_source(address, options):
+        source = left.pop(0)
+        if isinstance(source, Exception):
+            raise source
+        return source
+
+    monkeypatch.setattr(capture_module, "open_source", open_source)
+    publisher = Counting(worker, most)
+    before = capture._run
+    capture.publish(worker, publisher)
+    return worker, publisher, capture, before
+
+
+FRAME = Frame(0, 0, np.zeros((6, 8, 3), np.uint8))
+
+
+def test_a_source_is_opened_again_after_errors_and_waits_longer_each_time(monkeypatch):
+    first, second = Scripted(FRAME, FRAME, SourceError("the cable")), Scripted(FRAME)
+    none = SourceUnavailable("nobody answers")
+    worker, publisher, capture, before = published(monkeypatch, none, none, first, none, second, most=3)
+    assert [state for state, _ in worker.said] == ["opening", "opening", "live", "live", "lost", "opening", "live"]
+    assert worker.said[0][1] == "nobody answers" and worker.said[4][1] == "the cable"
+    assert worker.said[2][1] == "a camera gives frames"
+    assert 0 < worker.waits[0] < worker.waits[1] and worker.waits[2] == worker.waits[0], "frames end the back-off"
+    assert worker.waits[3] == worker.waits[1]
+    assert publisher.runs == [before + 1, before + 1, before + 2]
+    assert (first.opened, first.closed, second.opened, second.closed) == (1, 1, 1, 1)
+    assert capture.frames == 3 and capture.figures()["frames"] == 3 and capture.figures()["last_frame_ns"] > 0
+    with pytest.raises(CommandRefused, match="not open"):
+        capture.describe({})
+
+
+def test_a_source_without_frames_reports_its_state_and_waits_only_at_its_end(monkeypatch):
+    source = Scripted(SourceState.STALLED, SourceState.RECONNECTING, SourceState.ENDED, FRAME)
+    worker, _, _, _ = published(monkeypatch, source, most=1)
+    assert [state for state, _ in worker.said] == ["stalled", "reconnecting", "ended", "live"]
+    assert worker.said[0][1] == "the source is stalled" and worker.waits == [capture_module.LOOK_S]
+
+
+def test_an_open_source_is_described_and_counts_for_itself(monkeypatch):
+    seen = []
+
+    class Reporting(Scripted):
+        state_sentence = "a sentence"
+
+        def counts(self):
+            return {"dropped": 3}
+
+        def read(self, timeout_s):
+            seen.append((capture.describe({}), capture.figures()))
+            return super().read(timeout_s)
+
+    worker, capture = Waiting(), Capture(SourceSpec(address="synthetic:"))
+    source = Reporting(SourceState.STALLED, FRAME)
+    monkeypatch.setattr(capture_module, "open_source", lambda address, options: source)
+    assert capture.figures() == {"frames": 0, "last_frame_ns": None, "counts": {}}
+    capture.publish(worker, Counting(worker, 1))
+    described, figures = seen[0]
+    assert described == {"description": source.description.as_json()}
+    assert figures["counts"] == {"dropped": 3} and worker.said[0] == ("stalled", "a sentence")

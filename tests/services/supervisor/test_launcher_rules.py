@@ -10,7 +10,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -212,3 +212,207 @@ def test_a_forked_process_has_its_environment_log_and_session_and_ends_with_the_
     assert sorted(int(line.split()[0]) for line in lines[:3]) == sorted((signal.SIGTERM, signal.SIGINT, signal.SIGHUP))
     assert lines[3:5] == [f"yes ['{argument}'] True", "error"]
     assert "INTRASPLAT_FORKED" not in os.environ
+
+
+class Ended:
+    """Identity of a process that ends by some signals."""
+
+    def __init__(self, *deadly: int) -> None:
+        self.deadly, self.signals = deadly, []
+
+    def signal(self, number: int) -> None:
+        self.signals.append(number)
+
+    async def ended(self, within_s: float | None = None) -> bool:
+        return bool(set(self.signals) & set(self.deadly))
+
+
+@pytest.mark.parametrize(
+    ("stop", "deadly", "signals"),
+    [(True, (signal.SIGTERM,), [signal.SIGTERM]), (True, (), [signal.SIGTERM, signal.SIGKILL]), (False, (), [])],
+)
+def test_a_launcher_is_ended_only_on_request(tmp_path, monkeypatch, stop, deadly, signals):
+    by, identity, waited = launchers.ByLauncher(RuntimeFolder(tmp_path)), Ended(*deadly), []
+    monkeypatch.setattr(launchers, "recorded_launcher", lambda folder: identity)
+    monkeypatch.setattr(launchers, "status_of_child", waited.append)
+    by._own_pid = 100
+    by.ready.set()
+    for name in (launchers.SOCKET, launchers.RECORD):
+        (by._folder.path / name).write_text("left")
+    asyncio.run(by.close(stop=stop))
+    assert identity.signals == signals and waited == [100] and not by.ready.is_set()
+    assert (by._folder.path / launchers.SOCKET).exists() == (by._folder.path / launchers.RECORD).exists() == (not stop)
+
+
+def test_a_launcher_that_is_still_loading_is_ended_by_its_process_id(tmp_path, monkeypatch):
+    by, identity = launchers.ByLauncher(RuntimeFolder(tmp_path)), Ended(signal.SIGTERM)
+    monkeypatch.setattr(launchers, "recorded_launcher", lambda folder: None)
+    monkeypatch.setattr(launchers, "status_of_child", lambda pid: None)
+    monkeypatch.setattr(launchers.ProcessIdentity, "of", staticmethod(lambda pid: identity if pid == 100 else None))
+    asyncio.run(by.close(stop=True))
+    assert identity.signals == []
+    by._own_pid = 100
+    asyncio.run(by.close(stop=True))
+    assert identity.signals == [signal.SIGTERM]
+
+
+@pytest.mark.parametrize(
+    ("answer", "error"),
+    [(b'{"ok": true, "pid": 7}', None), (b'{"ok": false, "error": "no memory"}', "refuses 'start': no memory"), (b"{}", "refuses"), (None, "has not answered 'start' within")],
+)  # fmt: skip
+def test_the_answer_of_a_launcher(tmp_path, monkeypatch, answer, error):
+    by = launchers.ByLauncher(RuntimeFolder(tmp_path))
+    requests = []
+
+    async def ask():
+        closed = asyncio.Event()
+
+        async def serve(reader, writer):
+            requests.append(await reader.read(1000))
+            if answer is None:
+                await reader.read()  # until the client gives up
+            else:
+                writer.write(answer)
+            writer.close()
+            await writer.wait_closed()
+            closed.set()
+
+        server = await asyncio.start_unix_server(serve, os.fspath(by._folder.path / launchers.SOCKET))
+        try:
+            return await by._ask("start", module="m")
+        finally:
+            await closed.wait()
+            server.close()
+
+    if answer is None:
+        monkeypatch.setattr(launchers, "ANSWER_S", 0.05)
+    if error is None:
+        assert asyncio.run(ask())["pid"] == 7
+    else:
+        with pytest.raises(launchers.NoAnswer, match=error):
+            asyncio.run(ask())
+    assert requests == [packed_json({"command": "start", "module": "m"})]
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_a_process_that_the_launcher_does_not_start_is_started_directly(tmp_path, monkeypatch, fails):
+    by, asked = launchers.ByLauncher(RuntimeFolder(tmp_path)), []
+    by._direct = direct = Started()
+    by.ready.set()
+
+    async def ask(command, **arguments):
+        asked.append((command, arguments))
+        if fails:
+            raise launchers.NoAnswer("busy")
+        return {"pid": "7"}
+
+    monkeypatch.setattr(by, "_ask", ask)
+    engine = "services.supervisor.engine"
+    pid = asyncio.run(by.start(engine, ["--a"], tmp_path / "log", {"b": "c"}))
+    assert pid == (100 if fails else 7) and len(direct.modules) == fails
+    expected = {"module": engine, "arguments": ["--a"], "log": str(tmp_path / "log"), "environment": {"b": "c"}}
+    assert asked == [("start", expected)]
+    assert asyncio.run(by.start(engine, [], tmp_path / "log", {}, fresh=True)) == 100 + fails
+    assert asyncio.run(by.start("another.module", [], tmp_path / "log", {})) == 101 + fails
+    assert len(asked) == 1
+
+
+@pytest.mark.parametrize(
+    ("is_ready", "answer", "how"),
+    [(True, {"status": "signal 9"}, "signal 9"), (True, {}, None), (True, None, None), (False, {"status": "no"}, None)],
+)
+def test_how_a_forked_process_ended_is_asked_of_the_launcher(tmp_path, monkeypatch, is_ready, answer, how):
+    by = launchers.ByLauncher(RuntimeFolder(tmp_path))
+
+    async def ask(command, **arguments):
+        assert (command, arguments) == ("status", {"pid": 7})
+        if answer is None:
+            raise OSError("gone")
+        return answer
+
+    monkeypatch.setattr(by, "_ask", ask)
+    monkeypatch.setattr(launchers, "status_of_child", lambda pid: "exit code 3" if pid == 8 else None)
+    if is_ready:
+        by.ready.set()
+    assert asyncio.run(by.how_ended(7)) == how
+    assert asyncio.run(by.how_ended(8)) == "exit code 3"
+
+
+def test_a_request_to_start_forks_and_closes_what_the_child_does_not_use(launcher, tmp_path, monkeypatch):
+    request = {"module": "services.supervisor.engine", "arguments": ["--a", 5], "environment": {"B": 6}, "log": str(tmp_path / "log")}  # fmt: skip
+    monkeypatch.setattr(os, "fork", lambda: 77)
+    answer = asked(launcher, packed_json({"command": "start", **request}))
+    assert answer == {"ok": True, "pid": 77} and launcher._children == {77}
+    assert (tmp_path / "log").stat().st_mode & 0o777 == 0o600
+    assert not any(os.path.realpath(f"/proc/self/fd/{each}") == str(tmp_path / "log") for each in os.listdir("/proc/self/fd"))  # fmt: skip
+    became = []
+
+    class Became(Exception):
+        pass
+
+    def become(*given):
+        became.append((*given[:3], launcher._listener.fileno(), os.fstat(given[3]).st_ino))
+        raise Became
+
+    monkeypatch.setattr(os, "fork", lambda: 0)
+    monkeypatch.setattr(launchers, "_become", become)
+    ours, its = socket.socketpair()
+    with ours, its, pytest.raises(Became):
+        launcher._start(request, its)
+    log = (tmp_path / "log").stat().st_ino
+    assert became == [("services.supervisor.engine", ["--a", "5"], {"B": "6"}, -1, log)] and its.fileno() == -1
+    assert launcher._children == {77}
+
+
+@pytest.mark.parametrize("hangs", [False, True])
+def test_children_that_do_not_end_after_the_supervisor_are_killed(launcher, monkeypatch, hangs):
+    now, killed = SimpleNamespace(s=100.0), []
+
+    def sleep(seconds):
+        now.s += seconds
+
+    def reap():
+        if not hangs and now.s > 100.5:
+            launcher._children.clear()
+
+    monkeypatch.setattr(launchers, "time", SimpleNamespace(monotonic=lambda: now.s, sleep=sleep))
+    monkeypatch.setattr(launcher, "_reap", reap)
+    monkeypatch.setattr(os, "kill", lambda *given: killed.append(given))
+    launcher._children.update({77})
+    launcher._end_children()
+    assert killed == ([(77, signal.SIGKILL)] if hangs else [])
+    assert 100.5 < now.s < 102 if not hangs else 101 < now.s < 103
+
+
+def test_the_program_serves_until_it_is_told_to_end(tmp_path, monkeypatch):
+    folder, handlers, made = RuntimeFolder(tmp_path), {}, []
+
+    class Served:
+        def __init__(self, path, parent):
+            made.append((path, parent.identity))
+
+        def stop(self, *_):
+            pass
+
+        def serve(self):
+            assert (folder.path / launchers.RECORD).exists()
+            raise RuntimeError("ended")
+
+    monkeypatch.setattr(launchers, "Launcher", Served)
+    monkeypatch.setattr(launchers, "FORKED", ())
+    monkeypatch.setattr(launchers, "LOADED", ())
+    monkeypatch.setattr(launchers.gc, "freeze", lambda: None)
+    monkeypatch.setattr(launchers, "keep_files_private", lambda: None)
+    monkeypatch.setattr(launchers.logging, "basicConfig", lambda **_: None)
+    monkeypatch.setattr(signal, "signal", lambda number, handler: handlers.update({number: handler}))
+    monkeypatch.setenv("PYTORCH_NVML_BASED_CUDA_CHECK", "0")
+    own = ProcessIdentity.own()
+    arguments = ["--folder", str(tmp_path), "--orphan-after-s", "2", "--supervisor", packed_json(asdict(own)).decode()]
+    with pytest.raises(RuntimeError, match="ended"):
+        launchers.main(arguments)
+    assert made == [(folder.path / launchers.SOCKET, own)]
+    assert set(handlers) == {signal.SIGTERM, signal.SIGINT, signal.SIGHUP}
+    assert not (folder.path / launchers.RECORD).exists(), "the record is removed although serving failed"
+    assert os.environ["PYTORCH_NVML_BASED_CUDA_CHECK"] == "1"
+    monkeypatch.setattr(launchers, "recorded_launcher", lambda _: own)
+    assert launchers.main(arguments) == 2 and len(made) == 1
