@@ -59,7 +59,7 @@ class Viewpoint:
     """Shift of the pivot to the right in the axes of the model's camera, in the unit of `distance`."""
     down: float
     time: float
-    """Time in seconds of the model's window."""
+    """Time in seconds, in the model's window."""
     width: float
     height: float
 

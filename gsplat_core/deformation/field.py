@@ -106,8 +106,8 @@ class CapturedMotion(FrameDeltas, Protocol):
     """Counterpart of `EditableMotion` for CUDA graphs."""
 
     def motion_tensors(self) -> Sequence[Tensor]:
-        """Return the tensors that `frame_deltas` and `move_to_at` access. Other objects signal that
-        captured graphs are invalid.
+        """Return the tensors that `frame_deltas` and `move_to_at` access. Captured graphs are valid while these
+        tensors are the same objects.
         """
 
     def move_to_at(self, tau: Tensor, deltas: Tensor) -> None:

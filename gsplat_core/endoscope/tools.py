@@ -64,7 +64,7 @@ class Regions:
     levels: NDArray[np.float64]
     """Histogram of brightness inside the field of view, [256]."""
     previous: Bytes | None
-    """Tools of the previous frame: 1, 0 elsewhere."""
+    """1 on tools of the previous frame, 0 elsewhere; None without a previous frame of the stream."""
     sharp_edge: float = SHARP_EDGE
     """Smallest change of redness across a tool's outline."""
 

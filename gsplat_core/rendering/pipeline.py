@@ -138,7 +138,7 @@ def render_splats(
 def project_splats(
     ops: StepOperations, geometry: Geometry, coloring: Coloring | None, settings: RenderSettings
 ) -> ColoredSplats:
-    """Project and colour the Gaussians."""
+    """Project the Gaussians, with the colours of `coloring`; without it the only channel is the depth."""
     means, covars, quats, scales, opacities, viewmats, Ks = geometry
     compensation_floor = CONSTANTS[settings.constants].compensation_floor
     batch_dims, n_gaussians, n_cameras = means.shape[:-2], means.shape[-2], viewmats.shape[-3]
@@ -594,7 +594,7 @@ def _named_as_in_gsplat(out: Rasterized, arguments: Arguments, settings: RenderS
 
 
 class Stepped(NamedTuple):
-    """Result of the chain of operations."""
+    """Pictures of one call, and the splats blended in them."""
 
     image: Tensor
     """Colours and depth [..., C, H, W, X]."""

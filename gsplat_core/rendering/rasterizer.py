@@ -86,7 +86,8 @@ class Rasterizer:
                 rasterize_mode, global_z_order, constants: as in `rasterization`.
             background: colour [3] behind the Gaussians; None for black.
             capture: False never uses a CUDA graph.
-            capacity: workspace of a CUDA graph for tile lists; None for an estimate. It grows when a picture needs more.
+            capacity: entries that the tile lists of a CUDA graph hold at first; None for an estimate. A picture that
+                needs more enlarges them.
 
         Raises:
             InvalidInput: for an invalid option.

@@ -80,7 +80,7 @@ class Version(BaseModel):
 
 
 class NewKey(BaseModel):
-    """New key. A name may have two valid keys with the same role, for a change-over."""
+    """Body of a request that creates an API key. A name may have two valid keys of one role, for a change-over."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
     name: ResourceName

@@ -27,7 +27,7 @@ class StreamOptions(BaseModel):
 
 
 class StreamRequest(StreamSettings):
-    """New stream."""
+    """Body of a request that creates a stream."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
     name: ResourceName

@@ -67,7 +67,7 @@ struct Lists {
 
   // Return the start of a tile's list; for tile = tiles, the end of the last list.
   __host__ __device__ int begin(int64_t tile) const { return tile < tiles ? tile_offsets[tile] : int(length); }
-  // The same in the forward pass, before the host knows the length.
+  // Return the same start in the forward pass, where the host does not know the length yet; at most `capacity`.
   __device__ int begin_within_capacity(int64_t tile) const {
     return tile_offsets[tile] < capacity ? tile_offsets[tile] : int(capacity);
   }

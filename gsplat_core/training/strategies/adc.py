@@ -215,7 +215,7 @@ class DefaultStrategy(Strategy):
 
 @dataclass
 class CappedAdc(DefaultStrategy):
-    """Adaptive density control that multiplies those with the largest gradients first, up to a number of Gaussians."""
+    """Adaptive density control that multiplies the Gaussians with the largest gradients first, up to `cap_max`."""
 
     cap_max: int = field(default=1_000_000, kw_only=True)
     """Largest number of Gaussians."""
