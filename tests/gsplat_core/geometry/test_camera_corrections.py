@@ -70,3 +70,15 @@ def test_wrong_arguments_are_refused():
         CameraCorrections(2, **SIGMAS, fixed=(2,))
     with pytest.raises(InvalidInput, match="one for each camera of ids"):
         CameraCorrections(2, **SIGMAS)(torch.eye(4)[None])
+
+
+def test_fixed_cameras_count_as_not_corrected_in_priors():
+    corrections = CameraCorrections(4, **SIGMAS, fixed=(2,))
+    corrections.normalised.data.normal_(generator=torch.Generator().manual_seed(0))
+    free = corrections.normalised.detach().clone()
+    free[2] = 0
+    torch.testing.assert_close(corrections.prior(), 0.5 * free.square().sum(1).mean())
+    torch.testing.assert_close(corrections.prior(torch.tensor([1, 2])), 0.5 * free[1:3].square().sum(1).mean())
+    steps = free[1:] - free[:-1]
+    torch.testing.assert_close(corrections.smoothness(0.5), 0.5 * (steps / 0.5).square().sum(1).mean())
+    assert CameraCorrections(1, **SIGMAS, fixed=()).smoothness().item() == 0

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
+from gsplat_core.depth import learned
 from gsplat_core.depth.learned import AGAINST, FLAT, GIVEN, NOT_FINITE, UNLIKE, UNSEEN, LearnedDepth
 from gsplat_core.depth.registry import DepthFinder, check_depth, new_estimator
 from gsplat_core.errors import InvalidSetting
@@ -292,3 +293,11 @@ def test_it_is_found_by_its_address(network):
     assert isinstance(new_estimator(choice), LearnedDepth)
     frame = DepthFinder(choice, CAMERA).with_depth(seen(inverse(surface())))
     assert frame.depth_origin is DEPTH_ORIGINS["learned"] and (frame.depth > 0).all() and not frame.depth_is_metric
+
+
+@pytest.mark.parametrize("size", [(30, 80), (80, 30), (64, 64), (500, 2)])
+def test_planes_are_compared_with_the_same_number_of_pixels_along_their_longer_side(size):
+    plane = learned._on_grid(np.ones((7, 9)), size)
+    assert max(plane.shape) == learned.GRID_PX and plane.shape == pytest.approx(
+        [max(1, side * learned.GRID_PX / max(size)) for side in size], abs=0.5
+    )

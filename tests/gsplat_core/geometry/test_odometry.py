@@ -305,3 +305,22 @@ def test_tools_highlights_and_the_outside_are_not_followed():
     expected = np.ones((24, 32), bool)
     expected[:, :8] = expected[:6] = False
     assert np.array_equal(part != 0, expected)
+
+
+def test_frames_between_key_frames_are_placed_again_with_the_final_points(monkeypatch):
+    """Frame 4 is lost at first. All is adjusted with the third key frame, after each 30 % more, and with the last."""
+    calls = []
+    made = object.__new__(odometry._Odometry)
+    made._count, made._points, made._known = 13, torch.zeros(1, 3), torch.zeros(1, dtype=torch.bool)
+    made._is_key = torch.zeros(13, dtype=torch.bool)
+    made._is_key[::2] = True
+    monkeypatch.setattr(made, "_take_up", lambda frame: calls.append(("points", frame)))
+    monkeypatch.setattr(made, "_place", lambda frame: calls.append(("pose", frame)) or frame != 4)
+    monkeypatch.setattr(made, "_adjust", lambda frame, flat_px: calls.append(("all", frame, flat_px)))
+    monkeypatch.setattr(made, "_whole", lambda: None)
+    monkeypatch.setattr(odometry, "errors_px", lambda bundle: torch.tensor([1.0, 3.0]))
+    found = made._followed(5.0)
+    assert [call[1] for call in calls if call[0] == "pose"] == [*range(1, 13), 1, 3, 5, 7, 9, 11]
+    assert [call[1] for call in calls if call[0] == "points"] == [0, 2, 4, 6, 8, 10, 12]
+    assert [call[1:] for call in calls if call[0] == "all"] == [(4, 5.0), (6, 5.0), (10, 5.0), (12, 5.0)]
+    assert found.lost == [4] and found.error == pytest.approx(np.log(2) + np.log(10))

@@ -61,3 +61,12 @@ def test_gaussians_stay_on_their_rays_and_grow_with_the_distance():
         if column not in {*range(RAW_COLUMNS)[POSITION], *range(RAW_COLUMNS)[LOG_SCALE]}
     ]
     assert torch.equal(deltas[:, others], before[:, others])
+
+
+def test_a_factor_is_that_of_the_row_of_a_gaussian():
+    """The depth rises from top to bottom."""
+    shown = torch.full((64, 96), 50.0)
+    depth = shown * torch.exp(torch.linspace(-0.2, 0.2, 64))[:, None]
+    at = torch.tensor([[20.0, 10.0], [80.0, 32.0], [40.0, 56.0], [40.0, -30.0], [40.0, 200.0]])
+    expected = torch.exp(0.5 * (-0.2 + 0.4 * (at[:, 1].clamp(0.5, 63.5) - 0.5) / 63))
+    torch.testing.assert_close(smooth_factor(depth, shown, WHOLE, at), expected, rtol=0.03, atol=0)

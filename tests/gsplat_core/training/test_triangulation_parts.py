@@ -176,3 +176,17 @@ def test_a_picture_is_blurred_over_three_standard_deviations(sigma_px):
     profile = found[0, 15, 17:24] / found[0, 15, 20]
     np.testing.assert_allclose(profile, np.exp(-0.5 * (away / sigma_px) ** 2), rtol=1e-4)
     np.testing.assert_allclose(found[0], found[0].flip(0), atol=1e-7)
+
+
+def test_a_match_that_lacks_a_coordinate_is_none():
+    cameras = [at(), at(3.0), at(-3.0), at(6.0)]
+    point = np.array([2.0, 1.0, 40.0])
+    pixels = [
+        (camera.K @ (camera.world_to_camera[:3, :3] @ point + camera.world_to_camera[:3, 3])) for camera in cameras
+    ]
+    matches = np.stack([each[:2] / each[2] for each in pixels])[None].repeat(3, 0)
+    matches[1, 3] = np.nan, 5.0
+    matches[2, 2:] = [[np.nan, 1.0], [7.0, np.nan]]
+    found, reliable = triangulate(matches, cameras)
+    np.testing.assert_allclose(found, [point] * 3, atol=1e-6)
+    assert reliable.tolist() == [True, True, False]
