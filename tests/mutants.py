@@ -16,7 +16,7 @@ Only tests that execute the changed line run, for a minute at most; `tests/execu
 A mutant on a line that no test executes survives. A run ends at the first failure. A test that also
 fails without the mutant is flaky: it is listed and excluded, and the remaining tests decide. Mutants
 are drawn at random with a seed, in equal parts from each folder. Without a GPU, what runs on one only is
-left out.
+left out. Log lines and examples in schemas are left out as well, because only people read them.
 
 The boundary of a comparison (`<` to `<=`) is shifted only where an integer is compared, by its text. Of 63
 boundaries drawn from all folders, the rule leaves out 44. 34 of them compare measured numbers or clock times,
@@ -119,7 +119,8 @@ class Mutant:
 def changeable(path: Path) -> tuple[ast.Module, tuple[ast.AST, ...], tuple[tuple[int, int], ...]]:
     """Return the tree of a module, its nodes, and the node index and change number of each of its mutants."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
-    unused = set() if torch.cuda.is_available() else {id(node) for each in _on_gpu(tree) for node in ast.walk(each)}
+    parts = [*_only_read(tree), *(() if torch.cuda.is_available() else _on_gpu(tree))]
+    unused = {id(node) for each in parts for node in ast.walk(each)}
     nodes = tuple(ast.walk(tree))
     places = (
         (index, number)
@@ -128,6 +129,16 @@ def changeable(path: Path) -> tuple[ast.Module, tuple[ast.AST, ...], tuple[tuple
         for number in range(len(_changes(node)))
     )
     return tree, nodes, tuple(places)
+
+
+def _only_read(tree: ast.Module) -> Iterator[ast.AST]:
+    """Return the parts of a module that only people read: the arguments of log lines, and examples in schemas."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call):
+            yield from (each.value for each in node.keywords if each.arg in ("examples", "json_schema_extra"))
+            is_of_log = isinstance(node.func, ast.Attribute) and isinstance(node.func.value, ast.Name)
+            if is_of_log and node.func.value.id == "log" and _called(node) in UNSEEN_CALLS:
+                yield from node.args
 
 
 def _on_gpu(tree: ast.Module) -> Iterator[ast.AST]:

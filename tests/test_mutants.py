@@ -95,6 +95,20 @@ def test_without_a_gpu_what_runs_on_one_only_is_not_changed(tmp_path: Path) -> N
     assert sorted({getattr(nodes[index], "lineno", 0) for index, _ in places}) == [12, 13, 15, 17, 19, 27]
 
 
+def test_what_only_people_read_is_not_changed(tmp_path: Path) -> None:
+    path = tmp_path / "sample.py"
+    path.write_text(
+        "count = Field(default=5, examples=[7], json_schema_extra={'examples': [{'count': 8}]})\n"
+        "def clipped(value, log, parser):\n"
+        "    log.warning('%d of %d', value + 3, len(value) // 4)\n"
+        "    parser.error(value + 5)\n"
+        "    return log.error\n",
+        encoding="utf-8",
+    )
+    _, nodes, places = changeable(path)
+    assert sorted(ast.unparse(nodes[index]) for index, _ in places) == ["5", "5", "value + 5"]
+
+
 def test_only_functions_that_loading_the_module_does_not_run_are_replaced(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
