@@ -80,7 +80,7 @@ DEPTHS: Registry[type[Estimator]] = Registry(
 )
 """Depth estimators by name. The constructor takes an address if the name is in `DEPTHS_WITH_ADDRESS`."""
 DEPTHS_WITH_ADDRESS = {"onnx": "onnx:FILE"}
-"""Names that are followed by a colon and an address, with an example of the syntax."""
+"""Names of depth estimators that are followed by a colon and an address, with an example of the syntax."""
 
 MOTION_PRIORS: Registry[Callable[[Any], Any]] = Registry(
     "motion prior",

@@ -26,7 +26,7 @@ A factory takes the fragment, the operator's name and the text after the colon o
 UserError for an invalid text. Input and output of the operator are named `frame`.
 """
 TOOL_MASKS_WITH_ADDRESS = {"onnx": "onnx:FILE"}
-"""Methods that are followed by a colon and an address, with an example of the syntax."""
+"""Tool mask methods that are followed by a colon and an address, with an example of the syntax."""
 
 SINKS: Registry[Callable[[Any, str, Any], Operator]] = Registry(
     "sink",

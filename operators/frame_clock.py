@@ -60,8 +60,8 @@ class ClockSettings:
     deadline. None: device default.
     """
     least_most_ms: float | None = None
-    """Upper limit of that guaranteed time in milliseconds, so that pictures of slow streams are not late. None: device
-    default.
+    """Upper limit in milliseconds of the time that `least_share` guarantees, so that pictures of slow streams are not
+    late. None: device default.
     """
     at_least_steps: int | None = None
     """Minimum number of optimiser steps per frame, even past the deadline. None: device default."""

@@ -48,9 +48,9 @@ class TruthResult:
 
     behind_tools: BehindTools | None
     depth: DepthShare | None
-    """Depth of visible tissue, with the best plane (constant and tilted) of each frame as trivial baselines."""
+    """Depth errors on visible tissue, with the best plane (constant and tilted) of each frame as trivial baselines."""
     depth_behind_tools: DepthShare | None
-    """Depth of tissue behind tools, with the same baselines."""
+    """Depth errors on tissue behind tools, with the baselines of `depth`."""
 
 
 class TruthOp(Operator):

@@ -142,7 +142,7 @@ EVERY_S = 0.3
 ALIKE = 0.6
 """Smallest correlation with the reference depth at which both count as showing the same scene."""
 LEAST_SEEN = 0.05
-"""Smallest share of the picture that must be tissue."""
+"""Share of tissue in the picture below which the depth is rejected."""
 UNSEEN = "too little of the picture is tissue for a depth network"
 NOT_FINITE = "the depth network gave values that are not finite"
 FLAT = "the depth network returned the same depth for the whole picture"

@@ -331,7 +331,7 @@ HALF_BELIEVED_PX = 0.5
 SAMPLED_PX = 200
 """Number of samples along a row (up to twice as many) for the depth range and the typical error of a picture."""
 LEAST_BELIEVED = 0.05
-"""Share of the pixels that must be confident."""
+"""Share of confident pixels below which the depth map is rejected."""
 ROWS_FROM_PX = 0.05
 """Row difference between the eyes in pixels below which rows are not corrected, since resampling costs sharpness."""
 SAID_FROM_PX = 1.0

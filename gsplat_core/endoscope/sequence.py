@@ -33,7 +33,7 @@ NOISE_SHARE = 0.5
 noise. Tissue has 0.01 to 0.04.
 """
 AVERAGED_PX = 4
-"""Side in pixels of the squares whose averages must be noise, too."""
+"""Side in pixels of squares. A picture is noise if its pixels and the averages of its squares are."""
 SAME_LEVELS = 2
 """Largest difference of equal pixels, as caused by re-encoding."""
 SAME_SHARE = 0.9995

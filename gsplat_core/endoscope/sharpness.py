@@ -42,17 +42,17 @@ DARK = 28
 
 
 BLURRED_BELOW = 0.75
-"""Relative sharpness below which a frame is blurred."""
+"""Ratio of the sharpness to the usual one below which a frame is blurred."""
 SHARP_ABOVE = 0.82
-"""Relative sharpness from which a frame after a blurred one is sharp again."""
+"""Ratio of the sharpness to the usual one from which a frame after a blurred one is sharp again."""
 SMOKE_CONTRAST = 0.75
-"""Relative contrast below which a frame may be smoky."""
+"""Ratio of the contrast to the usual one below which a frame may be smoky."""
 SMOKE_SATURATION = 0.8
-"""Relative saturation below which a frame may be smoky."""
+"""Ratio of the saturation to the usual one below which a frame may be smoky."""
 SMOKE_HAZE = 15.0
-"""Increase of the haze level required for smoke."""
+"""Excess of the haze over the usual one from which a frame may be smoky, in levels of 255."""
 CLEAR_ABOVE = 0.87
-"""Relative contrast or saturation above which a frame after smoke is clear again."""
+"""Ratio of contrast or saturation to the usual one above which a frame after smoke is clear again."""
 RECENT_S = 1.5
 """Window in seconds of the usual sharpness (median). Lasting blur is withheld for at most half of it.
 Smoke that lasts longer becomes the usual state.

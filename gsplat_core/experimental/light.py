@@ -91,7 +91,7 @@ NEWEST = 0.2
 averaged equally.
 """
 LEAST_SEEN = 0.25
-"""Smallest share of the picture that must be tissue that is neither under- nor overexposed."""
+"""Share of cells with enough well-exposed tissue below which a picture gives no depth."""
 ERROR = 0.05
 """Standard deviation of log brightness caused by pigment and model errors."""
 REACH = 0.05

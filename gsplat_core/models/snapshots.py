@@ -26,7 +26,7 @@ from gsplat_core.scene.gaussians import Gaussians, inert_gaussians
 from gsplat_core.transfers import copy_each
 
 ROW_STEP = 1024
-"""Granularity of the capacity for Gaussians."""
+"""The number of Gaussians for which a slot has room is a multiple of this."""
 ROW_HEADROOM = 1.25
 MOST_SLOTS = 9
 """Maximum number of simultaneously held snapshots per publisher. Replay needs three or four."""

@@ -230,7 +230,7 @@ FEWEST_POINTS = 20
 SHOWN = 0.4
 """Share of a key frame's points that must be inside the picture for it to be searched."""
 FOUND = 0.3
-"""Share of the searched points that must be found."""
+"""Share of the searched points of a key frame that must be found for it to be recognised."""
 AGREE, AGREE_PX = 0.5, 4.0
 """Share of the found points that must agree on a pose, and their largest reprojection error in pixels."""
 FEATURES = 400

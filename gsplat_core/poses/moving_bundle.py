@@ -156,9 +156,9 @@ def _matern(apart: Tensor) -> Tensor:
 LINEAR = 0.2
 """Prior standard deviation of the linear part of the tissue's motion field, in units of the median depth."""
 LOCAL = 0.03
-"""Prior standard deviation of the local part of the motion field, in the same units."""
+"""Prior standard deviation of the local part of the motion field, in units of the median depth."""
 LENGTH = 0.3
-"""Correlation length of the local part of the motion field, in the same units."""
+"""Correlation length of the local part of the motion field, in units of the median depth."""
 APART = 0.13
 """Smallest distance between nodes; larger if it would give more than `MOST_NODES`."""
 MOST_NODES = 32

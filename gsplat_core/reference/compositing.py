@@ -185,7 +185,7 @@ def _part_sizes(length: int) -> list[int]:
 
 
 NEAREST = 1e-6
-"""Smallest depth of a moved point that has a pixel."""
+"""Depth z in the second camera up to which a moved point is left out."""
 
 
 def blend_flow(

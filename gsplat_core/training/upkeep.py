@@ -47,7 +47,7 @@ learns the order along a line of sight.
 SURFACE_CELL = 2.0
 """Side of the cells with averaged depth, in default spacings of Gaussians."""
 SURFACE_REACH = 2
-"""Number of neighbouring cells on each side that are included."""
+"""Number of neighbouring cells on each side whose Gaussians count in the mean depth around a cell."""
 IDLE = 1e-3
 """Ratio of a Gaussian's mean squared gradient to the scene's mean below which it counts as idle. It
 is reached after about 7,000 steps without visibility.

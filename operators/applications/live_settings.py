@@ -40,7 +40,7 @@ LIVE_LEAST_STEPS = {"cpu": 1, "cuda": 3}
 LIVE_LEAST_SHARE = {"cpu": 0.34, "cuda": 0.2}
 """Share of the frame interval guaranteed for training, even past the display deadline."""
 LIVE_LEAST_MOST_MS = {"cpu": None, "cuda": 13.0}
-"""Upper limit of that guaranteed time in milliseconds; None for no limit. See benchmarks/results/live.md."""
+"""Upper limit in milliseconds of the time of `LIVE_LEAST_SHARE`; None for no limit. See benchmarks/results/live.md."""
 LIVE_SHOW_AFTER = {"cpu": (0.85, 28.3), "cuda": (0.6, 17.0)}
 """Display deadline: share of the frame interval, and upper limit in milliseconds. On a CPU another
 step improves the picture more than an earlier display, up to the next frame.

@@ -41,7 +41,7 @@ class Replays:
         return self._store.get(job_id)
 
     def counts(self, batch: str | None = None) -> dict[str, int]:
-        """Count replays in each state."""
+        """Return the number of replays in each state; if `batch` is given, of that batch."""
         return self._store.counts(batch)
 
     def cancel(self, job_id: str, by: str) -> JobRecord:

@@ -105,7 +105,7 @@ class RunFacts(Part):
     interrupted: bool = False
     peak_memory_bytes: Count | None = None
     machine: dict[str, str] = {}
-    """Processor, instruction set, versions of Python and torch."""
+    """Processor, instruction set, operating system, versions of Python and torch."""
 
 
 class FrameCounts(Part):

@@ -111,7 +111,7 @@ def smoothed(flow: NDArray[np.float32], tissue: NDArray[np.uint8]) -> Flow:
 
 
 CONSISTENT_PX = 1.0
-"""Largest distance in pixels between a pixel and its position after moving to the second picture and back."""
+"""Largest distance in pixels between a pixel of reliable flow and its position after moving to the second picture and back."""
 
 
 def consistent_flow(

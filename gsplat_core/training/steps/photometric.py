@@ -76,7 +76,7 @@ class Compared(NamedTuple):
     colour_change: Tensor | None = None
     """Correction [N, 3] of the colours of degree 0, `sh[:, 0]`, whose gradient is then 0; None without a correction."""
     screen: ScreenGradients | None = None
-    """Gradients in the picture; None for renderers other than alpha blending."""
+    """Gradients of the loss by the projected Gaussians; None for renderers other than alpha blending."""
 
 
 @torch.no_grad()

@@ -37,13 +37,13 @@ class DefaultStrategy(Strategy):
     grow_grad2d: float = 0.0002
     """Mean gradient by the centre, in half pictures, above which a Gaussian is multiplied. 0.0008 suits `absgrad`."""
     grow_scale3d: float = 0.01
-    """Largest scale, relative to the scene, of a Gaussian that is duplicated instead of split."""
+    """Largest scale, in units of the scene's size, of a Gaussian that is duplicated instead of split."""
     grow_scale2d: float = 0.05
-    """Radius relative to the picture above which a Gaussian is split, until `refine_scale2d_stop_iter`."""
+    """Radius above which a Gaussian is split, in units of the picture's longer side, until `refine_scale2d_stop_iter`."""
     prune_scale3d: float = 0.1
-    """Scale relative to the scene above which a Gaussian is removed after the first reset."""
+    """Scale above which a Gaussian is removed after the first reset, in units of the scene's size."""
     prune_scale2d: float = 0.15
-    """Radius relative to the picture above which a Gaussian is removed, until `refine_scale2d_stop_iter`."""
+    """Radius above which a Gaussian is removed, in the unit of `grow_scale2d`, until `refine_scale2d_stop_iter`."""
     refine_scale2d_stop_iter: int = 0
     """Step at which tests of the radius end; 0 for no tests."""
     refine_start_iter: int = 500
