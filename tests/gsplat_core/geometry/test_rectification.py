@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from gsplat_core.depth.rectification import Rectification, StereoCalibration
+from gsplat_core.depth.rectification import Rectification, StereoCalibration, Undistortion
 from gsplat_core.errors import InvalidInput
+from gsplat_core.scene.cameras import Camera
 
 SIZE = (320, 256)
 CALIBRATION = StereoCalibration(
@@ -82,6 +83,7 @@ def test_what_neither_pixel_shows_is_marked():
         ({"left_K": np.array([[300.0, 0, 2e6], [0, 300, 128], [0, 0, 1]])}, "the left eye's intrinsics"),
         ({"right_K": np.array([[300.0, 0, np.nan], [0, 300, 128], [0, 0, 1]])}, "the right eye's intrinsics"),
         ({"right_K": np.array([[300.0, 0, 160], [0, 0.9, 128], [0, 0, 1]])}, "the right eye's intrinsics"),
+        ({"right_K": np.array([[300.0, 0, 160], [0, 1.0, 128], [0, 0, 1]])}, "the right eye's intrinsics"),
         ({"left_distortion": np.array([0, 0, -1001.0, 0])}, "the left eye's distortion"),
         ({"right_K": np.array([[300.0, 0, 160], [0, 300, 256], [0, 0, 1]])}, "the right eye's principal point"),
         ({"right_K": np.array([[300.0, 0, 160], [0, 300, 0], [0, 0, 1]])}, "the right eye's principal point"),
@@ -111,3 +113,14 @@ def test_a_calibration_that_cannot_be_is_refused(fields, sentence):
 )
 def test_a_calibration_within_the_limits_is_possible(fields):
     assert replace(CALIBRATION, **fields).wrong() is None
+
+
+@pytest.mark.parametrize(("fold", "is_seen"), [(1.8, True), (1.4, False)])
+def test_a_lens_may_not_see_the_corners_but_sees_the_middle_of_each_side(fold, is_seen):
+    """The lens moves a radius r to r (1 - r² / (3 fold²)), which is 2/3 fold at most. The sides are at 1, the corners at 1.41."""
+    camera, coefficients = Camera.from_focal(100.0, 200, 200), [-1 / (3 * fold**2), 0, 0, 0]
+    if is_seen:
+        assert Undistortion(camera, coefficients).camera.K[0, 0] < 100
+    else:
+        with pytest.raises(InvalidInput, match="folds the picture"):
+            Undistortion(camera, coefficients)

@@ -216,6 +216,18 @@ def test_another_scene_is_looked_at_anew(left, right):
 def test_a_pair_with_too_many_distances_is_doubted(left, right, monkeypatch):
     monkeypatch.setattr("gsplat_core.depth.stereo.MARGIN_PX", 200)
     assert "range of distances is too large: 432 disparities" in estimate(frame(left, right)).doubt
+    monkeypatch.setattr("gsplat_core.depth.stereo.MARGIN_PX", 4)
+    counts = []
+    span_of = stereo.StereoDepth._span_of
+    monkeypatch.setattr(
+        stereo.StereoDepth, "_span_of", lambda self, width: counts.append(span_of(self, width)) or counts[-1]
+    )
+    assert estimate(frame(left, right)).doubt is None
+    most = counts[0].count
+    monkeypatch.setattr(stereo, "MOST_DISPARITIES", most)
+    assert estimate(frame(left, right)).doubt is None, "as many as are supported"
+    monkeypatch.setattr(stereo, "MOST_DISPARITIES", most - 1)
+    assert f"{most} disparities would have to be searched" in estimate(frame(left, right)).doubt
 
 
 def test_a_frame_with_one_eye_has_nothing_to_match(left, right):
@@ -380,6 +392,17 @@ def test_points_of_both_eyes_keep_three_pixels_from_overexposed_ones():
     away = np.abs(np.rint(here[:, :1]) - bright).min(1)
     assert tried >= len(here) > 20 and away.min() == 4 and np.count_nonzero(away <= 6) > 5
     np.testing.assert_allclose(np.median(here - there, axis=0), [6, 0], atol=0.1)
+
+
+def test_points_of_both_eyes_keep_three_pixels_from_overexposed_rows():
+    left = np.random.default_rng(0).uniform(40, 200, (60, 80)).astype(np.float32)
+    left = np.clip(cv2.resize(left, (240, 180), interpolation=cv2.INTER_CUBIC), 0, 240).astype(np.uint8)
+    bright = np.array([row for start in range(20, 170, 16) for row in (start, start + 1)])
+    left[bright] = 255
+    here, _, _ = stereo._points_in_both(left, np.roll(left, -6, 1), None)
+    above, below = ((np.rint(here[:, 1:]) - bright) * sign for sign in (1, -1))
+    for away in (above, below):
+        assert np.where(away > 0, away, 99).min() == 4
 
 
 @pytest.mark.parametrize("calibrated", [True, False])
