@@ -130,7 +130,7 @@ def without_depth(choice: str, fields: frozenset[str], config: ReconstructorConf
 FEW_CORES = 4
 """Largest number of cores at which depth estimation is throttled, because training uses them all."""
 SHARE_OF_FEW = 0.25
-"""Share of one core's time for depth estimation on a throttled machine."""
+"""Largest share of one core's time for depth estimation on a machine with at most `FEW_CORES` cores."""
 
 
 class BackgroundDepth:

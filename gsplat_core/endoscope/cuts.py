@@ -74,14 +74,14 @@ class View:
 
     @property
     def blocks(self) -> list[Part]:
-        """Blocks of `detail` with enough contrast to be searched near their position."""
+        """Blocks of `detail` with a contrast of at least `LEAST_CONTRAST`, to be searched near their position."""
         if self._blocks is None:
             self._blocks = _parts(self.detail, BLOCK_PLACES, (BLOCK_HEIGHT_PX, BLOCK_WIDTH_PX))
         return self._blocks
 
     @property
     def quarters(self) -> list[Part]:
-        """Quarters of `detail` with enough contrast to be searched in a whole picture."""
+        """Quarters of `detail` with a contrast of at least `LEAST_CONTRAST`, to be searched in a whole picture."""
         if self._quarters is None:
             self._quarters = _parts(self.detail, QUARTER_PLACES, (HEIGHT_PX // 2, WIDTH_PX // 2))
         return self._quarters
@@ -147,7 +147,7 @@ def moved(one: View, other: View, enough: float = 1.0) -> float:
 
 
 def _parts(detail: NDArray[np.float32], places: Iterable[tuple[int, int]], size: tuple[int, int]) -> list[Part]:
-    """Return the parts of this size, height and width, that have enough contrast."""
+    """Return the parts at `places` (top, left) of a size (height, width) with a contrast of at least `LEAST_CONTRAST`."""
     height, width = size
     cut = [(top, left, detail[top : top + height, left : left + width]) for top, left in places]
     return [(top, left, part) for top, left, part in cut if part.std() >= LEAST_CONTRAST]

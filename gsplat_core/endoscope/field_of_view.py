@@ -224,7 +224,7 @@ def _along(hull: Outline) -> Outline:
 
 
 def _ends_sharply(inside: NDArray[np.bool_], brightest: NDArray[np.uint8], limit: float) -> bool:
-    """Return True if most of the field's rim is clearly brighter than the surround next to it."""
+    """Return True if a share `EDGE_SHARE` of the field's rim is brighter than the surround by `EDGE_CONTRAST`."""
     three = np.ones((3, 3), np.uint8)
     field = inside.astype(np.uint8)
     inner = cv2.erode(field, three, iterations=2, borderType=cv2.BORDER_CONSTANT, borderValue=1)

@@ -119,7 +119,7 @@ class SequenceCheck:
         return None
 
     def _one_grey(self, levels: NDArray[Any], pixels: int) -> bool:
-        """Return True if enough pixels have one grey level for a single colour; faster than comparing colours."""
+        """Return True if all but `ODD_SHARE` of the pixels have nearly one grey level; faster than comparing colours."""
         # Allow one more level on either side, since grey values are rounded.
         wide = min(2 * ONE_COLOUR_LEVELS + 3, len(levels))
         below = np.append(0, levels.cumsum())

@@ -160,7 +160,7 @@ class LightDepth(Estimator):
 
 
 def shows_enough(look: Look) -> bool:
-    """Return True if enough tissue is visible for depth by shading."""
+    """Return True if at least `LEAST_SEEN` of the cells are known, which depth by shading needs."""
     return bool(look.shading.known.mean() >= LEAST_SEEN)
 
 

@@ -68,7 +68,7 @@ class Cells:
 
     @property
     def known(self) -> NDArray[np.bool_]:
-        """Cells with enough usable pixels, bool [h, w]."""
+        """Cells with a share of usable pixels of at least `LEAST_KNOWN`, bool [h, w]."""
         return self.share >= LEAST_KNOWN
 
 
@@ -245,7 +245,7 @@ class Change:
 
     @property
     def known(self) -> NDArray[np.bool_]:
-        """Cells with enough tracked pixels, bool [h, w]."""
+        """Cells with a share of tracked pixels of at least `LEAST_KNOWN`, bool [h, w]."""
         return self.share >= LEAST_KNOWN
 
     @property

@@ -58,7 +58,7 @@ MOST_POINTS = 700
 APART = 0.025
 """Smallest distance between points when they are detected, as a share of the longer side."""
 LEAST_QUALITY = 0.005
-"""Quality of a corner relative to the picture's best one."""
+"""Smallest quality of a detected corner, as a share of that of the picture's best one."""
 PATCH_PX = 21
 """Side of the square patch that is tracked, in pixels."""
 LEVELS = 3

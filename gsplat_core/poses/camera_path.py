@@ -42,11 +42,11 @@ RETURN_PX = 0.7
 LEAST_MOTION = 0.005
 """Median motion of the corners, as a share of the longer side, below which the scope counts as static."""
 MOVING_SHARE = 0.75
-"""Share of the image motion from which poses are worth an estimate, see `rigid_share`."""
+"""Share of the image motion that camera motion explains (`rigid_share`), from which poses are worth an estimate."""
 MOST_FRAMES = 600
 """Largest number of frames of which a path is estimated. More would take minutes."""
 CERTAIN_SHARE = 0.97
-"""Share of the image motion from which poses are estimated without a comparison on validation frames."""
+"""`rigid_share` from which poses are estimated without a comparison on validation frames."""
 
 
 def rigid_share(frames: Sequence[Frame]) -> float:

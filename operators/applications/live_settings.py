@@ -28,7 +28,7 @@ LIVE_GAUSSIANS = {"cpu": 12_000, "cuda": 45_000}
 LIVE_MOST_GAUSSIANS = 100_000
 """Maximum number of initial Gaussians of a scene, for large pictures. The capacity is twice the initial number."""
 LIVE_PIXELS_PER_GAUSSIAN = 13
-"""Pixels per initial Gaussian on a GPU, for pictures larger than usual."""
+"""Pixels per initial Gaussian on a GPU, for pictures in which these are more than `LIVE_GAUSSIANS`."""
 LIVE_TRAINING = {
     "cpu": LiveTraining(first_rate=2.0, last_rate=1.5, rate_steps=2, colour_relaxation=1.5, corrections_before=4),
     "cuda": LiveTraining(colour_relaxation=1.5),

@@ -492,7 +492,7 @@ class ProcessSource(LiveSource):
 
     @property
     def state_sentence(self) -> str:
-        """Reason for the state, as a sentence: the child process's own if it reported one, else the usual one."""
+        """Reason for the state, as a sentence: that of the child process if it reported one, else of this process."""
         reported, state = self._child_state, self.state
         if reported is not None and state is reported[0] and reported[1]:
             return reported[1]

@@ -64,8 +64,8 @@ MOSTLY = 0.75
 """Share of the image motion that the estimated camera motion must explain. Below it, the endoscope is reported as
 probably static."""
 OFF = 0.002
-"""Share of the focal length. A larger median reprojection error is attributed to tissue motion, not
-to tracking noise."""
+"""Median reprojection error, as a share of the focal length, above which it is attributed to tissue motion instead of
+tracking noise."""
 
 
 def poses_command(recording: Path, out: Path, max_frames: int | None, *, overwrite: bool, as_json: bool) -> int:

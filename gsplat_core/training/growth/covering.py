@@ -390,7 +390,7 @@ class OutOfView:
 
 
 USUAL_DENSITY = 0.3
-"""Ratio to the usual Gaussian density below which a cell counts as empty."""
+"""Mean number of Gaussians in a cell and its eight neighbours below which the cell counts as empty; about 1 at first."""
 LOOKS_AFTER = 0.02
 """Motion of the picture, as a share of its width, after which the picture is searched again for new tissue; each search
 takes some milliseconds.

@@ -58,7 +58,7 @@ class RandomScene:
     focal: float
     """Focal length per longer side of the picture."""
     lens: tuple[float, float]
-    """Displacement of the picture's corners by the terms of k1 and k2, as shares; 0 for a pinhole."""
+    """Displacement of the picture's corners by the terms of k1 and k2, over their distance from the centre."""
     baseline_mm: float
     shape: TissueShape
     look: TissueLook
