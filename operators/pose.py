@@ -132,7 +132,7 @@ class AutoPoseOp(PoseOp):
         op_output.emit(frame, "frame")
 
     def _pose_of(self, frame: Frame) -> NDArray[np.float64] | None:
-        """Return the pose to use for a frame; None before the scope has moved."""
+        """Return the pose to use for a frame: estimated while the scope moves, else the last one; None before there is one."""
         if frame.withheld is None and frame.status is not FrameStatus.DAMAGED:
             share = self._test.share(frame)
             if share is not None and not self._is_moving and share >= CERTAIN_SHARE:

@@ -461,8 +461,8 @@ def _without_speckles(labels: NDArray[np.float32], confidence: NDArray[np.float3
 def _filled(
     inverse: NDArray[np.float32], confidence: NDArray[np.float32], found: Parallax
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Replace unconfident depth by a smooth continuation of the confident depth around it, and far
-    from any by the mean plane.
+    """Replace unconfident depth by a smooth continuation of the confident depth around it, and far from any by the
+    mean plane. Its confidence becomes at most `FILLED`.
     """
     height, width = inverse.shape
     believed = (confidence >= BELIEVED).astype(np.float32)

@@ -85,9 +85,9 @@ class TrackErrors:
     median_px: float
     mean_px: float
     within_mm: float
-    """Mean share of points nearer than 2, 4, 8, 16 and 32 mm."""
+    """Share of positions nearer than 2 mm to the true one; mean of this and of the shares within 4, 8, 16 and 32 mm."""
     within_px: float
-    """Mean share of points nearer than 4, 8, 16, 32 and 64 pixels."""
+    """As `within_mm`, for 4, 8, 16, 32 and 64 pixels."""
 
 
 @dataclass(frozen=True)

@@ -137,7 +137,7 @@ class _Instances:
     def _blend_part(
         self, ids: Tensor, values: Tensor, pixels: Tensor, product: Tensor, through: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Blend one part of the list.
+        """Blend one part of the list. Returns the part's colours [P, channels], and `product` and `through` after it.
 
         Args:
             ids: splat ids of the part [L].

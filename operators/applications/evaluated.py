@@ -24,7 +24,8 @@ from operators.sources.registry import SourceOptions, open_source
 from operators.sources.source import FrameSource, SourceDescription
 
 SAME_CAMERA = 1e-3
-"""Largest difference of focal length and principal point, as a share of the picture's width."""
+"""Largest difference of focal lengths and of principal points for which two cameras count as equal, as a share of the
+picture's width."""
 
 
 @dataclass(frozen=True)

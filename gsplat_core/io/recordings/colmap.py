@@ -217,7 +217,7 @@ class _Binary:
         return struct.unpack(layout, data)
 
     def count(self, least_bytes: int) -> int:
-        """Read a number of entries; raise if as many, of `least_bytes` each, are larger than the file."""
+        """Read a number of entries. Raises RecordingInvalid if so many, of `least_bytes` each, do not fit into the file."""
         (found,) = self.take("<Q")
         if found * least_bytes > self.size:
             raise self._short(f": {found} entries do not fit into its {self.size} bytes")

@@ -36,7 +36,7 @@ struct TileWeights {
 };
 
 struct Kernels {
-  // Number of floats of a vector.
+  // Number of floats in a SIMD vector.
   int64_t lanes;
   // Prepares the splats [begin, end) for blending, in `records`.
   void (*records)(const compositing::Inputs& in, int64_t begin, int64_t end, compositing::SplatRecord* records);

@@ -56,7 +56,7 @@ class AllWeights {
   std::unique_ptr<Line[]> targets_;
 };
 
-// Check that codes and positions of pairs fit into 32 bits.
+// Check that no tile lists too many splats for the 32 bits of a pair's code.
 void check_lengths(const Splats& in) {
   for (int64_t tile = 0; tile < in.tiles(); ++tile) {
     const int64_t listed = (tile + 1 < in.tiles() ? in.offsets[tile + 1] : in.instances) - in.offsets[tile];

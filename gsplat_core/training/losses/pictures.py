@@ -24,7 +24,7 @@ class Photometric:
     default_weight: ClassVar[float] = 1.0
 
     def __call__(self, scene: Gaussians, observation: Observation, context: LossContext) -> Tensor | None:
-        """Return the mean colour difference between the rendered picture and the observation."""
+        """Return the mean absolute colour difference between the rendered picture and the observation over tissue."""
         output = render(scene, observation.camera, depth=False)
         return image_loss(output.image, observation.image, observation.mask).loss
 
@@ -40,7 +40,7 @@ class Depth:
     default_weight: ClassVar[float] = 1.0
 
     def __call__(self, scene: Gaussians, observation: Observation, context: LossContext) -> Tensor | None:
-        """Return the mean difference of inverse depths; None for an observation without depth."""
+        """Return the mean absolute difference of inverse depths; None for an observation without depth."""
         if observation.depth is None:
             return None
         output = render(scene, observation.camera)
