@@ -163,7 +163,7 @@ class LiveOdometry:
         self._error_px = self._still_px = 0.0
 
     def place(self, frame: Frame) -> NDArray[np.float64]:
-        """Return the frame's pose, world to camera float64 [4, 4]."""
+        """Return the pose of the next frame, world to camera float64 [4, 4]; the previous pose if it cannot be placed."""
         self.frames += 1
         if frame.withheld is not None or frame.status is FrameStatus.DAMAGED:
             self._hold_pose()

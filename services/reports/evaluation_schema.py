@@ -147,7 +147,7 @@ class ViewFacts(Part):
     left: ScoreFacts
     """Baseline: unchanged left picture."""
     shifted: ScoreFacts
-    """Baseline: left picture shifted by the median disparity."""
+    """Baseline: left picture reprojected as if all tissue were at its median distance."""
     seen: float
 
 

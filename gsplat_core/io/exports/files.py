@@ -59,7 +59,7 @@ def rows_of(gaussians: Gaussians) -> Rows:
 
 
 def unit_rotations(quats: Array) -> Array:
-    """Return normalised quaternions wxyz."""
+    """Return normalised quaternions wxyz [N, 4]; the identity for those of length zero."""
     # Divide by the largest component first, because squares of small numbers underflow in float32.
     largest = np.abs(quats).max(axis=1, keepdims=True)
     none = largest[:, 0] == 0

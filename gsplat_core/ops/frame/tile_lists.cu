@@ -62,7 +62,7 @@ __device__ inline Total scan_part(const Counts& in, int64_t block) {
   return all;
 }
 
-// The first blocks scan the tiles; when training, the remaining blocks scan the blocks of Gaussians.
+// Compute prefix sums: the first blocks of the tiles' counts, the remaining ones, when training, of the Gaussian blocks'.
 __global__ void __launch_bounds__(kScanThreads) scan_counts(Lists lists, Counts tiles, Counts splats) {
   allow_dependent_launch();
   wait_for_preceding_kernel();
