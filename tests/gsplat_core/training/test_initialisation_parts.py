@@ -1,0 +1,192 @@
+"""Parts of the start of a scene, in closed form: grid, points and sizes of pixels, colours at tools, filling and blur."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from gsplat_core.rendering.rasterization import render
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import Frame
+from gsplat_core.training.growth import initialisation
+from gsplat_core.training.growth.initialisation import (
+    StartOnDevice,
+    blur_sigma_px,
+    colours_beside_tools,
+    filled,
+    gaussians_at_pixels,
+    jittered_grid,
+    tissue_colours,
+    tissue_depth,
+    unprojected,
+)
+
+K = np.array([[50.0, 0, 40], [0, 60, 30], [0, 0, 1]])
+
+
+@pytest.mark.parametrize(("width", "height", "count"), [(120, 80, 96), (80, 120, 96), (33, 17, 40), (5, 300, 3)])
+def test_pixels_are_spread_evenly_with_a_jitter_of_a_seventh_of_the_spacing(width, height, count):
+    pixels, spacing = jittered_grid(width, height, count, 3)
+    assert spacing == pytest.approx(np.sqrt(width * height / count))
+    columns, rows = max(1, round(width / spacing)), max(1, round(height / spacing))
+    assert len(pixels) == columns * rows
+    cell = np.array([width / columns, height / rows])
+    centres = np.stack(np.meshgrid(np.arange(columns) + 0.5, np.arange(rows) + 0.5), -1).reshape(-1, 2)
+    off = pixels / cell - centres
+    assert np.abs(off).max() <= 0.15 and (len(pixels) < 30 or np.abs(off).max(0).min() > 0.1)
+    assert not np.array_equal(pixels, jittered_grid(width, height, count, 4)[0])
+
+
+def project(camera, points):
+    """Project points [M, 3] by the model's definition."""
+    x, y, z = points.T
+    if camera.model == "ortho":
+        plane = points[:, :2]
+    elif camera.model == "fisheye":
+        radius = np.hypot(x, y)
+        plane = points[:, :2] * (np.arctan2(radius, z) / np.maximum(radius, 1e-12))[:, None]
+    else:
+        plane = points[:, :2] / z[:, None]
+    return plane * np.diag(camera.K)[:2] + camera.K[:2, 2]
+
+
+@pytest.mark.parametrize("model", ["pinhole", "fisheye", "ortho"])
+def test_points_are_at_their_pixels_and_depth_and_a_pixel_has_its_size_there(model):
+    camera = Camera(K * [[1], [50 / 60], [1]], 80, 60, model=model)
+    pixels = np.random.default_rng(0).uniform([0, 0], [80, 60], (60, 2))
+    pixels[0] = camera.K[:2, 2]  # the principal point, whose angle is 0
+    z = np.random.default_rng(1).uniform(30, 60, 60)
+    points, size = unprojected(pixels, z, camera)
+    np.testing.assert_allclose(points[:, 2], z)
+    np.testing.assert_allclose(project(camera, points), pixels, atol=1e-8)
+    # The area of a pixel on a plane of constant depth, by finite differences.
+    step = 1e-4
+    right, below = (unprojected(pixels + offset, z, camera)[0] - points for offset in ([step, 0], [0, step]))
+    area = np.abs(right[:, 0] * below[:, 1] - right[:, 1] * below[:, 0]) / step**2
+    np.testing.assert_allclose(size**2, area, rtol=2e-3)
+
+
+def test_fisheye_pixels_beyond_85_degrees_are_placed_at_85_degrees():
+    camera = Camera(np.array([[20.0, 0, 40], [0, 20, 30], [0, 0, 1]]), 80, 60, model="fisheye")
+    angles = np.radians([80.0, 85.0, 90.0, 110.0])
+    pixels = np.stack([40 + 20 * angles, np.full(4, 30.0)], 1)
+    points, size = unprojected(pixels, np.full(4, 10.0), camera)
+    found = np.degrees(np.arctan2(points[:, 0], points[:, 2]))
+    np.testing.assert_allclose(found, [80, 85, 85, 85], atol=1e-6)
+    assert np.isfinite(size).all()
+
+
+@pytest.mark.parametrize(("spacing", "sigma"), [(0.5, 0.3), (1.0, 0.3), (2.0, 0.6), (10.0, 3.0)])
+def test_pictures_are_blurred_by_three_tenths_of_the_spacing(spacing, sigma):
+    assert blur_sigma_px(spacing) == pytest.approx(sigma)
+
+
+def test_gaussians_of_a_grid_cover_a_picture_without_holes_and_are_flat_towards_the_camera():
+    camera = Camera.from_focal(60.0, 64, 48)
+    pixels, spacing = jittered_grid(64, 48, 300, 0)
+    image, depth = np.full((48, 64, 3), 120, np.uint8), np.full((48, 64), 50, np.float32)
+    made = gaussians_at_pixels(pixels, spacing, image, depth, camera, sh_degree=1)
+    widths = made.log_scales.exp() * 60 / 50 / spacing
+    assert torch.allclose(widths[:, :2], torch.tensor(0.7), rtol=1e-4)
+    assert torch.allclose(widths[:, 2], torch.tensor(0.21), rtol=1e-4)
+    output = render(made, camera)
+    inner = output.alpha[4:-4, 4:-4]
+    assert float(inner.min()) > 0.95 and float((output.image[4:-4, 4:-4] - 120 / 255).abs().max()) < 0.06
+    assert torch.allclose(made.opacities, torch.tensor(0.9)) and made.sh.shape == (len(pixels), 4, 3)
+
+
+def beside_a_tool(columns=40):
+    """Tissue that is red at the left and green from column 20 on, beside a white tool."""
+    image = np.zeros((40, 80, 3), np.uint8)
+    image[:, :20], image[:, 20:columns], image[:, columns:] = (200, 0, 0), (0, 200, 0), 255
+    mask = np.ones((40, 80), np.uint8)
+    mask[:, columns:] = 0
+    return Frame(0, 0, image, mask=mask)
+
+
+def test_colours_beside_a_tool_come_from_ten_pixels_around():
+    frame = beside_a_tool()
+    found = colours_beside_tools(frame)
+    np.testing.assert_array_equal(found[:, :38], frame.image[:, :38])  # two pixels next to a tool belong to it
+    assert (found[:, 38:44] == (0, 200, 0)).all()
+    reached = np.flatnonzero((found[20] == 255).all(1))[0]
+    assert 44 <= reached <= 52, "farther colours of the tool are left, since no tissue is placed there"
+    assert (tissue_colours(frame)[:, 42:] < 255).any(1).all(), "all of a tool is filled for a new scene"
+
+
+@pytest.mark.parametrize("change", [tissue_colours, colours_beside_tools])
+@pytest.mark.parametrize("value", [None, 0, 1])
+def test_pictures_without_tools_or_without_tissue_stay(change, value):
+    frame = beside_a_tool()
+    mask = None if value is None else np.full((40, 80), value, np.uint8)
+    assert change(frame.with_fields(mask=mask)) is frame.image
+
+
+def test_a_margin_that_would_leave_no_tissue_is_left_out():
+    image = np.full((40, 80, 3), 255, np.uint8)
+    image[10, 10] = 30, 60, 90
+    mask = np.zeros((40, 80), np.uint8)
+    mask[10, 10] = 1
+    assert np.abs(tissue_colours(Frame(0, 0, image, mask=mask)).astype(int) - (30, 60, 90)).max() <= 1
+
+
+@pytest.mark.parametrize(("depth", "expected"), [(None, 70.0), (0.0, 70.0), (np.nan, 70.0), (-5.0, 70.0), (50.0, 50.0)])
+def test_the_usual_depth_stands_in_where_none_is_known(depth, expected):
+    plane = None if depth is None else np.full((40, 80), depth, np.float32)
+    found = tissue_depth(beside_a_tool(columns=80).with_fields(depth=plane, mask=None), 70.0)
+    assert found.shape == (40, 80) and found.dtype == np.float32
+    np.testing.assert_allclose(found, expected)
+
+
+@pytest.mark.parametrize("coarse", [1, 2, 4])
+def test_filling_averages_cells_and_goes_on_into_holes(coarse):
+    values = torch.arange(64.0).repeat(48, 1)[None]
+    known = torch.ones(1, 48, 64)
+    known[:, :, 32:] = 0
+    found = filled(values, known, coarse)
+    cells = torch.nn.functional.avg_pool2d(values, coarse)
+    expected = torch.nn.functional.interpolate(cells[None], size=(48, 64), mode="bilinear", align_corners=False)[0]
+    inner = slice(0, 32 - 2 * coarse)
+    torch.testing.assert_close(found[:, :, inner], expected[:, :, inner], rtol=1e-4, atol=1e-3)
+    assert 15 < float(found[0, 24, 63]) < 32 and float(found.max()) <= 31.01
+
+
+def test_filling_a_picture_of_which_nothing_is_known_gives_zeros():
+    assert torch.equal(filled(torch.ones(3, 12, 20), torch.zeros(1, 12, 20)), torch.zeros(3, 12, 20))
+
+
+def test_pictures_that_are_no_multiple_of_the_reduction_count_only_their_own_pixels():
+    assert torch.allclose(filled(torch.full((1, 13, 21), 7.0), torch.ones(1, 13, 21)), torch.tensor(7.0))
+
+
+@pytest.mark.parametrize("sigma", [0.4, 1.0, 2.3])
+def test_the_blur_on_a_device_is_that_of_the_host(sigma):
+    picture = np.random.default_rng(0).uniform(size=(40, 60, 3)).astype(np.float32)
+    found = initialisation._blurred(torch.from_numpy(picture).permute(2, 0, 1), sigma).permute(1, 2, 0).numpy()
+    side = 2 * max(1, int(np.ceil(3 * sigma))) + 1
+    expected = cv2.GaussianBlur(picture, (side, side), sigma, borderType=cv2.BORDER_REFLECT_101)
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(("side", "is_blurred"), [(3, False), (4, True)])
+def test_a_picture_too_small_for_a_blur_stays(side, is_blurred):
+    picture = torch.rand(1, side, 9, generator=torch.Generator().manual_seed(0))
+    assert torch.equal(initialisation._blurred(picture, 1.0), picture) != is_blurred
+
+
+@pytest.mark.parametrize(
+    ("changed", "fits"),
+    [({}, True), ({"pose": True}, True), ({"width": 66}, False), ({"height": 50}, False), ({"focal": 61.0}, False), ({"model": "fisheye"}, False)],
+)  # fmt: skip
+def test_a_prepared_grid_fits_cameras_of_its_size_lens_and_focal_length(changed, fits):
+    start = StartOnDevice(Camera.from_focal(60.0, 64, 48), 100, torch.device("cpu"))
+    camera = Camera.from_focal(changed.get("focal", 60.0), changed.get("width", 64), changed.get("height", 48))
+    if "width" in changed or "height" in changed:
+        camera = Camera(start.camera.K, camera.width_px, camera.height_px)
+    if "model" in changed:
+        camera = Camera(camera.K, 64, 48, model=changed["model"])
+    if "pose" in changed:
+        camera = camera.with_pose(np.diag([-1.0, -1, 1, 1]))
+    assert start.fits(camera) == fits
