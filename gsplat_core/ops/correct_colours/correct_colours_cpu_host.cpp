@@ -64,7 +64,7 @@ void check_lengths(const Splats& in) {
   }
 }
 
-// Tensor [N, 3] of the corrected colours.
+// Return the corrected colours [N, 3].
 Tensor correct_colours(Tensor means2d, Tensor conics, Tensor colors_, Tensor opacities, Tensor offsets, Tensor flatten_ids,
                        Tensor image_, Tensor mask_, int64_t steps, double relaxation, double least_weight, double max_alpha) {
   const Call call(means2d);

@@ -168,8 +168,8 @@ __device__ inline void add_geometry(const float* added, float (&row)[kRawColumns
   row[kRawOpacity] += d.y;
 }
 
-// Results of a warp: the raw gradients of its 32 Gaussians, and the coefficients' gradients, stored over the
-// coefficients.
+// Results of a warp: the raw gradients of its 32 Gaussians, and the coefficients' gradients, which overwrite
+// the coefficients.
 template <int kDegree>
 struct WarpGradients {
   static constexpr int kHarmonics = 3 * kBasesOf<kDegree>;

@@ -120,8 +120,8 @@ void drop_patches(const Pair& pair, int32_t* sixteenths, int32_t* scratch) {
     if (sizes[root_of(parents, i)] <= kPatchPixels) sixteenths[i] = kUnknown;
 }
 
-// Compute the minimum and maximum over the surrounding rows, padded by kJumpRadius columns, and whether one of the
-// nearest rows has a hole.
+// Write to `one_surface` of rows [begin, end) whether the disparities within kJumpRadius pixels have no jump, and those
+// within kHoleRadius no hole. `scratch`: per column, least and greatest disparity of the rows around, and a hole's flag.
 void surfaces(const Pair& pair, const Matched& matched, int64_t begin, int64_t end, int32_t* scratch) {
   const int64_t width = pair.width, wide = width + 2 * kJumpRadius;
   int32_t *const least = scratch, *const most = scratch + wide, *const holes = scratch + 2 * wide;

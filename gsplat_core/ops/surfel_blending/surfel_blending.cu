@@ -64,7 +64,7 @@ __device__ inline void stage(const Inputs& in, const Prepared& surfels, int posi
     values[kNormal + d] = usable && d < channels ? in.splats.colors[int64_t(id) * channels + d] : 0;
 }
 
-// Depth of the window's first surfel, which is the origin of depths.
+// Return the depth of the window's first surfel, the origin of depths; 0 without one, or if it is not finite.
 __device__ inline float reference_depth(const Inputs& in, const Window& w) {
   if (w.begin >= w.end) return 0;
   const int id = in.splats.flatten_ids[w.begin], channels = in.splats.channels;
