@@ -18,7 +18,7 @@ CUDA_TOOLKIT := build/cuda-toolkit
 # Runs on the NVIDIA GPU if torch can use one. The CUDA kernels are built first; a failed build ends the target.
 demo: native
 	$(BIN)/intrasplat synthesize --out out/recording --frames 90 --behind
-	@set -e; if $(BIN)/python -m services.cli.gpu_check; then device=cuda; $(MAKE) --no-print-directory cuda; else device=cpu; fi; \
+	@set -e; if $(BIN)/python -m services.cli.doctor; then device=cuda; $(MAKE) --no-print-directory cuda; else device=cpu; fi; \
 	  set -x; $(BIN)/intrasplat replay out/recording --out $(OUT) --depth stereo --device $$device
 
 # Run the fast tests (`test`), or also those marked as slow (`test-all`), in groups of which JOBS run at a time. `tests/groups.py` has the

@@ -28,13 +28,13 @@ import numpy as np
 import torch
 
 from gsplat_core.io.recordings import open_recording
-from gsplat_core.memory import return_freed_memory
+from gsplat_core.machine import return_freed_memory
 from gsplat_core.rendering.alpha import AlphaRenderer
 from gsplat_core.rendering.renderer import PendingFrame
 from gsplat_core.scene.frames import Frame
-from gsplat_core.training.budget import Budget
 from gsplat_core.training.metrics import psnr_tissue_db
 from gsplat_core.training.reconstructor import Reconstructor
+from gsplat_core.training.schedule import Budget
 from operators.applications.live_settings import LiveSettings
 from operators.frame_clock import FrameClock
 from operators.reconstruct import warm_reconstructor

@@ -31,13 +31,13 @@ import torch
 from gsplat_core.depth.registry import DepthFinder
 from gsplat_core.evaluation.views import EVERY, evaluate_second_eye, matched_disparity
 from gsplat_core.io.recordings import open_recording
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
-from gsplat_core.training.budget import Budget
 from gsplat_core.training.metrics import psnr_tissue_db
 from gsplat_core.training.reconstructor import Reconstructor
+from gsplat_core.training.schedule import Budget
 from operators.applications.live_settings import LiveSettings
 from operators.applications.replay import ReplaySettings
 from operators.reconstruct import warm_reconstructor

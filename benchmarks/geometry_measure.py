@@ -33,7 +33,7 @@ from gsplat_core.geometry.measure import Length, Measurement
 from gsplat_core.geometry.mesh import points_of, rays_of
 from gsplat_core.io.model_sources import load_model
 from gsplat_core.io.recordings import open_recording
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_origin import BELIEVED
 from operators.applications.replay import ReplaySettings, replay

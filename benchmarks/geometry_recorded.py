@@ -21,7 +21,7 @@ from gsplat_core.depth.maps import measured_confidence
 from gsplat_core.depth.registry import DepthFinder
 from gsplat_core.evaluation.depth import DepthShareSums
 from gsplat_core.io.recordings import open_recording
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame

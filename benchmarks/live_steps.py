@@ -27,11 +27,10 @@ from gsplat_core.io.recordings import open_recording
 from gsplat_core.rendering.renderer import new_renderer
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
-from gsplat_core.training.budget import Budget
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.metrics import SETTLING_S, psnr_tissue_db
 from gsplat_core.training.reconstructor import Reconstructor
-from gsplat_core.training.schedule import LiveTraining
+from gsplat_core.training.schedule import Budget, LiveTraining
 from operators.applications.live_settings import LiveSettings
 from operators.applications.replay import ReplaySettings
 from operators.graph import Application

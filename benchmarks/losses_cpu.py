@@ -18,7 +18,7 @@ import torch
 from gsplat_core.ops.image_loss import image_loss
 from gsplat_core.ops.native import instruction_set
 from gsplat_core.ops.ssim import ssim_map
-from gsplat_core.reference.image_loss import image_loss as reference_image_loss
+from gsplat_core.reference.training import image_loss as reference_image_loss
 from gsplat_core.training.steps.optimiser import FusedAdam
 
 WIDTH_PX, HEIGHT_PX, GAUSSIANS = 640, 512, 50_000

@@ -19,7 +19,7 @@ import torch
 
 from gsplat_core.deformation import new_field
 from gsplat_core.io.bundle import save_bundle
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 from services.registry.bundle_file import pack

@@ -19,7 +19,7 @@ import torch
 
 from gsplat_core import Camera, Gaussians
 from gsplat_core.io.bundle import save_bundle
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
 
 COUNT = 200_000
 SLEEP_S = 0.0002

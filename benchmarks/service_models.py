@@ -13,7 +13,7 @@ import torch
 from service_server import Server
 
 from gsplat_core.io.bundle import save_bundle
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 from services.registry.bundle_file import pack

@@ -30,7 +30,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.endoscope.onnx_tools import OnnxToolFinder
+from gsplat_core.endoscope.onnx import OnnxToolFinder
 from gsplat_core.endoscope.out_of_body import BodyGate
 from gsplat_core.endoscope.tool_network import NETWORK, NetworkToolFinder, round_view
 from gsplat_core.endoscope.tools import ToolFinder, field_of_view

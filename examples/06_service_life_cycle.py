@@ -20,7 +20,7 @@ import torch
 from gsplat_core import Camera, Gaussians
 from gsplat_core.io.bundle import save_bundle
 from gsplat_core.io.recordings import synthesize
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
 from services.client import Client, Refused
 from services.registry.bundle_file import pack
 

@@ -18,8 +18,7 @@ if TYPE_CHECKING:
     from gsplat_core.io.ply import load_ply, save_ply
     from gsplat_core.io.png_compression import PngCompression
     from gsplat_core.io.recordings import open_recording
-    from gsplat_core.models.model import Model
-    from gsplat_core.models.snapshots import Snapshot, SnapshotSlots
+    from gsplat_core.models import Model, Snapshot, SnapshotSlots
     from gsplat_core.ops.compositing import accumulate, rasterize_to_indices_in_range, rasterize_to_pixels
     from gsplat_core.ops.covariance import quat_scale_to_covar_preci
     from gsplat_core.ops.projection.projection import fully_fused_projection
@@ -128,7 +127,7 @@ _HOME = {
     "Gaussians": "scene.gaussians",
     "InvalidInput": "errors",
     "MCMCStrategy": "training.strategies.mcmc",
-    "Model": "models.model",
+    "Model": "models",
     "PngCompression": "io.png_compression",
     "Rasterizer": "rendering.rasterizer",
     "Reconstructor": "training.reconstructor",
@@ -137,8 +136,8 @@ _HOME = {
     "Renderer": "rendering.renderer",
     "RollingShutterType": "poses.rolling_shutter",
     "SelectiveAdam": "training.steps.optimiser",
-    "Snapshot": "models.snapshots",
-    "SnapshotSlots": "models.snapshots",
+    "Snapshot": "models",
+    "SnapshotSlots": "models",
     "Strategy": "training.strategies.strategy",
     "UnscentedTransformParameters": "ops.unscented_projection",
     "accumulate": "ops.compositing",

@@ -19,8 +19,7 @@ from gsplat_core.registry import Registry
 if TYPE_CHECKING:
     from gsplat_core.deformation.kinds import FieldKind
     from gsplat_core.depth.maps import Estimator
-    from gsplat_core.rendering.outputs import OutputKind
-    from gsplat_core.rendering.renderer import RendererKind
+    from gsplat_core.rendering.renderer import OutputKind, RendererKind
     from gsplat_core.scene.range_sensors import RangeSensor
     from gsplat_core.training.losses.loss import LossKind
     from gsplat_core.training.strategies.strategy import StrategyKind
@@ -53,15 +52,15 @@ CONTRIBUTING.md, "A renderer", describes how to add one.
 OUTPUTS: Registry[OutputKind] = Registry(
     "output",
     {
-        "ray_depth": "gsplat_core.rendering.outputs:RAY_DEPTH",
-        "median_depth": "gsplat_core.rendering.outputs:MEDIAN_DEPTH",
-        "normals": "gsplat_core.rendering.outputs:NORMALS",
-        "depth_normals": "gsplat_core.rendering.outputs:DEPTH_NORMALS",
-        "spread": "gsplat_core.rendering.outputs:SPREAD",
-        "confidence": "gsplat_core.rendering.outputs:CONFIDENCE",
-        "semantics": "gsplat_core.rendering.outputs:SEMANTICS",
-        "flow": "gsplat_core.rendering.outputs:FLOW",
-        "occlusion": "gsplat_core.rendering.outputs:OCCLUSION",
+        "ray_depth": "gsplat_core.rendering.renderer:RAY_DEPTH",
+        "median_depth": "gsplat_core.rendering.renderer:MEDIAN_DEPTH",
+        "normals": "gsplat_core.rendering.renderer:NORMALS",
+        "depth_normals": "gsplat_core.rendering.renderer:DEPTH_NORMALS",
+        "spread": "gsplat_core.rendering.renderer:SPREAD",
+        "confidence": "gsplat_core.rendering.renderer:CONFIDENCE",
+        "semantics": "gsplat_core.rendering.renderer:SEMANTICS",
+        "flow": "gsplat_core.rendering.renderer:FLOW",
+        "occlusion": "gsplat_core.rendering.renderer:OCCLUSION",
     },
 )
 """Outputs in addition to picture, opacity and depth, by name. `Capabilities.outputs` states those of a renderer."""
@@ -95,16 +94,16 @@ MOTION_PRIORS: Registry[Callable[[Any], Any]] = Registry(
 LOSSES: Registry[LossKind] = Registry(
     "loss",
     {
-        "photometric": "gsplat_core.training.losses.pictures:Photometric",
-        "depth": "gsplat_core.training.losses.pictures:Depth",
+        "photometric": "gsplat_core.training.losses.loss:Photometric",
+        "depth": "gsplat_core.training.losses.loss:Depth",
         "ray_depth": "gsplat_core.training.losses.rays:RayDepth",
         "normal_consistency": "gsplat_core.training.losses.rays:NormalConsistency",
-        "semantics": "gsplat_core.training.losses.semantics:Semantics",
+        "semantics": "gsplat_core.training.losses.loss:Semantics",
         "flow": "gsplat_core.training.losses.flow:FlowLoss",
         "triangulation": "gsplat_core.training.losses.triangulation:TriangulationLoss",
         "range": "gsplat_core.training.losses.ranges:RangeLoss",
-        "opacity": "gsplat_core.training.losses.sparsity:MeanOpacity",
-        "scale": "gsplat_core.training.losses.sparsity:MeanScale",
+        "opacity": "gsplat_core.training.losses.loss:MeanOpacity",
+        "scale": "gsplat_core.training.losses.loss:MeanScale",
     },
 )
 """Losses of training by name. Every step computes `photometric` and `depth`; others are added when a user names them."""

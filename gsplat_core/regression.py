@@ -20,8 +20,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gsplat_core.argument_checks import require_float32
 from gsplat_core.errors import InvalidInput, InvalidSetting
+from gsplat_core.ops.arguments import require_float32
 from gsplat_core.ops.splat_regression import check_splats, splat_regression
 
 SMALLEST_MASS = 1e-4

@@ -18,12 +18,17 @@ from numpy.typing import NDArray
 
 from gsplat_core.endoscope.cuts import CutDetector
 from gsplat_core.endoscope.field_of_view import FieldOfView
-from gsplat_core.endoscope.interlacing import Deinterlacer, without_combs
 from gsplat_core.endoscope.mask_and_depth import DepthCheck, MaskCheck
-from gsplat_core.endoscope.ordinary import LOOK_EVERY_S, OrdinaryPictures, Turns
-from gsplat_core.endoscope.sequence import OUT_OF_ORDER, SequenceCheck, StreamClock
+from gsplat_core.endoscope.recorder import Deinterlacer, StripDetector, without_combs
+from gsplat_core.endoscope.sequence import (
+    LOOK_EVERY_S,
+    OUT_OF_ORDER,
+    OrdinaryPictures,
+    SequenceCheck,
+    StreamClock,
+    Turns,
+)
 from gsplat_core.endoscope.sharpness import SharpnessGate
-from gsplat_core.endoscope.strip import StripDetector
 from gsplat_core.scene.frames import CUT_IN_DOUBT, Frame, FrameStatus
 from operators.graph import Operator, OperatorSpec
 from operators.outcome import OutcomeBuilder

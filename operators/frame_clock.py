@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.frames import Frame
-from gsplat_core.training.budget import Budget
 from gsplat_core.training.metrics import psnr_tissue_db
+from gsplat_core.training.schedule import Budget
 from operators.settings import check_option
 
 INTERVAL_DECAY = 0.1

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidSetting
-from operators.remembered import COVERED
+from operators.display import COVERED
 
 STOPS = 9
 """Number of evenly spaced colours in a legend."""

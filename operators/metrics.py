@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from gsplat_core.memory import return_freed_memory
+from gsplat_core.machine import return_freed_memory
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.metrics import SETTLING_S, FrameQuality, QualityTracker, ScoredMean, psnr_tissue_db
 from operators.frame_log import FrameLog, LogLine, Value

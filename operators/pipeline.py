@@ -25,7 +25,7 @@ from gsplat_core.io.recordings.truth import TissueBehindTools
 from gsplat_core.io.sessions import SessionReader
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.reconstructor import Reconstructor
-from operators.applications.device import scheduler_for
+from operators.applications.session import scheduler_for
 from operators.checks import (
     MaskAndDepthStage,
     PictureStagesOp,

@@ -13,8 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from gsplat_core.choices import RENDERERS
-from gsplat_core.models.model import Model
-from gsplat_core.models.snapshots import Snapshot
+from gsplat_core.models import Model, Snapshot
 from gsplat_core.rendering.renderer import STANDARD_OUTPUTS, Renderer, RendererOptions, new_renderer, standard_outputs
 from gsplat_core.scene.frames import Frame
 from gsplat_core.transfers import HostCopy

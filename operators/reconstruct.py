@@ -15,12 +15,11 @@ import torch
 from numpy.typing import NDArray
 
 from gsplat_core.choices import Eyes
-from gsplat_core.models.model import Model
-from gsplat_core.models.snapshots import Snapshot
+from gsplat_core.models import Model, Snapshot
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
-from gsplat_core.training.budget import Budget
 from gsplat_core.training.reconstructor import Reconstructor
+from gsplat_core.training.schedule import Budget
 from operators.graph import Operator, OperatorSpec
 from operators.messages import Reconstruction
 from operators.outcome import OutcomeBuilder

@@ -22,12 +22,11 @@ from gsplat_core.io.sessions.records import (
     SceneBegun,
     ScheduleLine,
 )
-from gsplat_core.models.model import Model
-from gsplat_core.models.snapshots import Snapshot
+from gsplat_core.models import Model, Snapshot
 from gsplat_core.scene.frames import Frame, FrameStatus
-from gsplat_core.training.budget import Budget
 from gsplat_core.training.placement import MOST_LATE, LateDepth
 from gsplat_core.training.reconstructor import Reconstructor
+from gsplat_core.training.schedule import Budget
 from operators.depth import BackgroundDepth, TakenDepth
 from operators.frame_clock import BehindGuard, FrameClock
 from operators.graph.tracking import Histogram

@@ -17,15 +17,15 @@ from prometheus_client import Metric
 from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.registry import Collector
 
-from services.audit.system_events import SystemEvents
+from services.audit.log import SystemEvents
 from services.errors import StoreUnavailable
-from services.jobs.records import JOBS, JobState
 from services.jobs.results import REPORT
+from services.jobs.store import JOBS, JobState
 from services.recordings import store as recording_records
 from services.recordings.store import RECORDINGS, UPLOAD, file_name
 from services.registry.database import Database
 from services.registry.records import VERSIONS
-from services.schemas.service import CheckResult
+from services.schemas import CheckResult
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.exports.files import rows_of
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
 from gsplat_core.scene.gaussians import SH_C0
 
 log = logging.getLogger(__name__)

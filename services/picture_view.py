@@ -22,7 +22,7 @@ import torch
 
 from gsplat_core.choices import RENDERERS
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
 from gsplat_core.rendering.renderer import PROGRESSIVE_SAMPLES, Renderer, RendererOptions, check_renderer, new_renderer
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.value_ranges import plain_float

@@ -201,10 +201,7 @@ WITHOUT_TORCH = [
 
 CLIENT_WITHOUT_FASTAPI = (
     "services.client",
-    "services.schemas.streams",
-    "services.schemas.models",
-    "services.schemas.replays",
-    "services.schemas.service",
+    "services.schemas",
 )
 
 

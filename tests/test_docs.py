@@ -25,7 +25,7 @@ from gsplat_core import Camera, Frame, Gaussians
 from gsplat_core.io.manifest import manifest_bytes, parse_manifest
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.io.recordings.truth import open_views
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
 from operators.graph import Application, Operator, OperatorSpec
 from operators.ingest import SourceOp
 from operators.sinks.registry import CallbackSinkOp

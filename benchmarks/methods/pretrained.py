@@ -33,8 +33,8 @@ ROOT = Path(__file__).resolve().parents[2]
 LOAD = """
 import json, sys, time
 from pathlib import Path
-from gsplat_core.io.model_sources import READERS
-from gsplat_core.memory import peak_bytes
+from gsplat_core.io.model_files import READERS
+from gsplat_core.machine import peak_bytes
 path = Path(sys.argv[1])
 Path("/proc/self/clear_refs").write_text("5")  # the peak counts from here
 before, begun = peak_bytes(), time.perf_counter()

@@ -33,7 +33,7 @@ from gsplat_core.choices import RENDERERS
 from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.io.bundle import load_bundle
 from gsplat_core.io.recordings import open_recording
-from gsplat_core.models.model import Model, TrainedBy
+from gsplat_core.models import Model, TrainedBy
 from gsplat_core.ops.stochastic import QUEUE_BYTES, Method, SplatScene, new_sums, picture_of, sample_splats
 from gsplat_core.reference.stochastic import point_moments, sample_moments
 from gsplat_core.rendering.rasterization import render

@@ -27,7 +27,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from gsplat_core.choices import RENDERERS
 from gsplat_core.io.recordings import is_heldout, open_recording
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
 from gsplat_core.rendering.rasterization import RenderOutput, render
 from gsplat_core.rendering.renderer import new_renderer
 from gsplat_core.rendering.weighted_sum import WeightedSumRenderer

@@ -18,7 +18,7 @@ from gsplat_core.errors import InvalidInput
 VERSION = "1.5.3"
 """Version of gsplat whose names and signatures the modules have."""
 
-_ABSENT_EXTENSION = "gsplat_core.as_gsplat.extension"
+_ABSENT_EXTENSION = "gsplat_core.as_gsplat.functions"
 _FUNCTIONS = "gsplat_core.as_gsplat.functions"
 _PLAIN = "gsplat_core.reference.gsplat_names"
 _STRATEGIES = {
@@ -69,7 +69,7 @@ MODULES: Mapping[str, Mapping[str, str]] = {
         "accumulate_2dgs": "gsplat_core.ops.surfel_blending",
         "export_splats": "gsplat_core.io.exports.export",
     },
-    "gsplat._helper": {"load_test_data": "gsplat_core.as_gsplat.test_scene"},
+    "gsplat._helper": {"load_test_data": "gsplat_core.as_gsplat.functions"},
     "gsplat.compression": {"PngCompression": "gsplat_core.io.png_compression"},
     "gsplat.compression.png_compression": {"PngCompression": "gsplat_core.io.png_compression"},
     "gsplat.contrib": {},
@@ -159,8 +159,8 @@ MODULES: Mapping[str, Mapping[str, str]] = {
     },
     "gsplat.training": {"TwoStageScheduleStep": _SURGICAL, "TwoStageScheduler": _SURGICAL},
     "gsplat.utils": {
-        "depth_to_normal": "gsplat_core.rendering.depth_maps",
-        "depth_to_points": "gsplat_core.rendering.depth_maps",
+        "depth_to_normal": "gsplat_core.rendering.surface",
+        "depth_to_points": "gsplat_core.rendering.surface",
         "get_projection_matrix": _FUNCTIONS,
         "inverse_log_transform": _FUNCTIONS,
         "log_transform": _FUNCTIONS,

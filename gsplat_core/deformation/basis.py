@@ -27,8 +27,7 @@ from gsplat_core.deformation.basis_bumps import (
     BumpTensors,
     bump_capacity,
 )
-from gsplat_core.deformation.continuation import Continuation
-from gsplat_core.deformation.field import Capabilities, DeformationField, FieldSlot, displaced, ops_for
+from gsplat_core.deformation.field import Capabilities, Continuation, DeformationField, FieldSlot, displaced, ops_for
 from gsplat_core.deformation.kinds import PARAMETER_BYTES, FieldKind, FieldRates, NewField
 from gsplat_core.deformation.regularisers import least_squares_weights, towards_neighbours_, towards_others_
 from gsplat_core.errors import InvalidInput

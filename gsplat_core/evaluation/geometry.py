@@ -41,7 +41,7 @@ from gsplat_core.evaluation.motion import FlowErrors, FlowSums, FollowedPoints, 
 from gsplat_core.evaluation.scores import why_left_out
 from gsplat_core.evaluation.views import NovelView, Pose, Shown, ViewSums
 from gsplat_core.io.recordings.truth import GroundTruth
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
 from gsplat_core.rendering.renderer import picture_of
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_origin import BELIEVED

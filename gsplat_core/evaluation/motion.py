@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsplat_core.io.recordings.truth import MotionFiles, Tracks, TrueMotion
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
 from gsplat_core.rendering.rasterization import rasterization
 from gsplat_core.scene.cameras import Camera, Points, at_pixels, inverse, moved, pixel_rays, pixels_of, points_of
 from gsplat_core.scene.frames import Frame

@@ -21,8 +21,7 @@ from gsplat_core.evaluation.baselines import BaselineScore
 from gsplat_core.evaluation.depth import DepthErrors, DepthSums
 from gsplat_core.evaluation.scores import Entry, Record, Score, ScoreSums, finite, measures, number, why_left_out
 from gsplat_core.io.recordings.recording import is_heldout
-from gsplat_core.models.model import Model
-from gsplat_core.models.snapshots import Snapshot
+from gsplat_core.models import Model, Snapshot
 from gsplat_core.rendering.renderer import STANDARD_OUTPUTS, Renderer, new_renderer, standard_outputs
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame

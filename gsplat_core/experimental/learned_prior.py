@@ -26,7 +26,7 @@ from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import COLOUR, POSITION, RAW_COLUMNS
 from gsplat_core.training.motion.image_motion import CELL_PX, Flow, SurfaceMotion
 from gsplat_core.training.motion.prior import AT_FIRST, HORIZON_S, FlowPrior
-from gsplat_core.training.steps.colour_correction import colour_change
+from gsplat_core.training.steps.photometric import colour_change
 from gsplat_core.training.steps.step import TrainingStep
 from gsplat_core.transfers import tensor_of
 

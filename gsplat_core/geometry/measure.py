@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.geometry.mesh import in_world, rays_of
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
 from gsplat_core.rendering.surface import COVERED, Surface
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_origin import UNKNOWN_ERROR

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from gsplat_core.errors import ExportError, InvalidInput
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
 from gsplat_core.rendering.surface import COVERED
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.transfers import HostCopy

@@ -25,7 +25,7 @@ from gsplat_core.errors import BundleCorrupt, BundleError, InvalidInput
 from gsplat_core.io.files import replace_durably, write_durably
 from gsplat_core.io.manifest import MAX_MANIFEST_BYTES, Manifest, manifest_bytes, parse_manifest
 from gsplat_core.io.model_files import check_memory, open_model_file
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
 from gsplat_core.scene.gaussians import Gaussians
 
 PIECE_BYTES = 1 << 22

@@ -17,7 +17,7 @@ from gsplat_core.deformation.field import DeformationField
 from gsplat_core.deformation.kinds import field_from_config, kind_of
 from gsplat_core.errors import BundleCorrupt, InvalidInput, InvalidSetting, UnknownFormatVersion
 from gsplat_core.io.json_object import JsonObject
-from gsplat_core.models.model import Model, TrainedBy
+from gsplat_core.models import Model, TrainedBy
 from gsplat_core.scene.cameras import CAMERA_MODELS, Camera, CameraModel
 from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
 from gsplat_core.scene.depth_source import DepthError, DepthSource

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from gsplat_core.errors import BundleCorrupt, BundleError
 from gsplat_core.io.files import open_regular
-from gsplat_core.memory import available_bytes, in_gib
+from gsplat_core.machine import available_bytes, in_gib
 
 if TYPE_CHECKING:
     from gsplat_core.scene.gaussians import Gaussians

@@ -15,7 +15,7 @@ from gsplat_core.io.exports.files import ROW
 from gsplat_core.io.model_files import check_memory, gaussians_of, logit_of_bytes, open_model_file, read_rows
 from gsplat_core.io.ply import load_ply
 from gsplat_core.io.spz import load_spz
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
 

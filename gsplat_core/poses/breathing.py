@@ -22,6 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsplat_core.machine import one_thread
 from gsplat_core.poses.bundle import Bundle
 from gsplat_core.poses.bundle import adjust as adjust_still
 from gsplat_core.poses.moving_bundle import (
@@ -39,7 +40,6 @@ from gsplat_core.poses.moving_bundle import (
     with_waves,
 )
 from gsplat_core.poses.se3 import exp, inverse, log
-from gsplat_core.threads import one_thread
 
 BREATHING_HZ, HEART_HZ = (0.1, 0.8), (0.8, 3.0)
 LEAST_CYCLES, FEWEST_TRIED = 1.5, 0.5

@@ -20,8 +20,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from gsplat_core.machine import one_thread
 from gsplat_core.poses.se3 import exp
-from gsplat_core.threads import one_thread
 
 State = TypeVar("State")
 DONE = 1e-6

@@ -18,12 +18,12 @@ import torch
 from torch import Tensor
 
 from gsplat_core.geometry.tracks import FeatureTracks, Observations
+from gsplat_core.machine import one_thread
 from gsplat_core.poses.bundle import Bundle, adjust, errors_px
 from gsplat_core.poses.odometry import Trajectory, followed_part, trajectory_of
 from gsplat_core.poses.se3 import exp, log
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
-from gsplat_core.threads import one_thread
 
 SHORTEST, LONGEST = 0.6, 1.6
 """Bounds of the search in units of the picture's longer side, corresponding to fields of view of 80° and 35°."""

@@ -27,9 +27,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from gsplat_core.machine import one_thread
 from gsplat_core.poses.bundle import FIRST_DAMPING, descend, diagonal_of, ray_derivatives, summed
 from gsplat_core.poses.se3 import exp, hat, log
-from gsplat_core.threads import one_thread
 
 LENGTHS_S = (0.6, 0.8, 1.0, 1.3, 1.7, 2.2, 2.8, 3.6, 4.6, 6.0, 8.0, 12.0)
 """Candidate kernel lengths in seconds."""

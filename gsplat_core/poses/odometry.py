@@ -32,12 +32,12 @@ from gsplat_core.endoscope.highlights import without_highlights
 from gsplat_core.errors import InvalidInput
 from gsplat_core.geometry.reference_tracks import ReferenceTracks
 from gsplat_core.geometry.tracks import Observations
+from gsplat_core.machine import one_thread
 from gsplat_core.poses.breathing import BreathingTrajectory, Sightings, breathing_trajectory
 from gsplat_core.poses.bundle import Bundle, adjust, errors_px
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_origin import RELATIVE_DISTANCE
 from gsplat_core.scene.frames import Frame
-from gsplat_core.threads import one_thread
 
 LEAST_SEEN = 4
 """Fewest frames in which a point must be observed."""

@@ -8,8 +8,8 @@ from enum import Enum
 import torch
 from torch import Tensor
 
-from gsplat_core.argument_checks import require_shape
 from gsplat_core.errors import InvalidInput
+from gsplat_core.ops.arguments import require_shape
 from gsplat_core.poses.se3 import SMALL, exp
 
 

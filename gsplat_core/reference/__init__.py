@@ -18,9 +18,12 @@ from gsplat_core.ops.hexplane.plain_torch import (
     hexplane_space,
 )
 from gsplat_core.reference.compositing import blend_flow, correct_colours, rasterize_to_pixels, weighted_sums
-from gsplat_core.reference.covariance import quat_scale_to_covar_preci
-from gsplat_core.reference.image_loss import frame_loss, image_loss, ssim_map
-from gsplat_core.reference.projection import fully_fused_projection, isect_offset_encode, isect_tiles
+from gsplat_core.reference.projection import (
+    fully_fused_projection,
+    isect_offset_encode,
+    isect_tiles,
+    quat_scale_to_covar_preci,
+)
 from gsplat_core.reference.ray_blending import blend_rays, range_histogram, ray_depth_loss, ray_normal_loss, splat_rays
 from gsplat_core.reference.rendering import rasterization, render_frame
 from gsplat_core.reference.spherical_harmonics import spherical_harmonics
@@ -28,7 +31,14 @@ from gsplat_core.reference.splat_regression import splat_regression, splat_regre
 from gsplat_core.reference.stereo import fit_disparities, match_disparities, smooth_within_edges
 from gsplat_core.reference.stochastic import point_moments, sample_moments
 from gsplat_core.reference.surfels import fully_fused_projection_2dgs, rasterize_to_pixels_2dgs
-from gsplat_core.reference.training import accumulate_gradient_norms_, adam_step, diffuse_positions_
+from gsplat_core.reference.training import (
+    accumulate_gradient_norms_,
+    adam_step,
+    diffuse_positions_,
+    frame_loss,
+    image_loss,
+    ssim_map,
+)
 
 __all__ = [
     "accumulate_gradient_norms_",

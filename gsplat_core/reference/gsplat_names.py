@@ -11,8 +11,14 @@ from torch import Tensor
 from gsplat_core.ops.arguments import DenseProjection, DenseSurfels
 from gsplat_core.ops.projection.separate_steps import proj, world_to_cam
 from gsplat_core.reference.compositing import rasterize_to_pixels
-from gsplat_core.reference.covariance import matrix_to_triu, quat_scale_to_covar_preci, quat_to_rotmat
-from gsplat_core.reference.projection import fully_fused_projection, isect_offset_encode, isect_tiles
+from gsplat_core.reference.projection import (
+    fully_fused_projection,
+    isect_offset_encode,
+    isect_tiles,
+    matrix_to_triu,
+    quat_scale_to_covar_preci,
+    quat_to_rotmat,
+)
 from gsplat_core.reference.rendering import rasterization
 from gsplat_core.reference.spherical_harmonics import spherical_harmonics, spherical_harmonics_bases
 from gsplat_core.reference.surfels import fully_fused_projection_2dgs, rasterize_to_pixels_2dgs

@@ -12,9 +12,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsplat_core.argument_checks import require_same_kind, require_shape
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.arguments import Pairs, TileGrid, View
+from gsplat_core.ops.arguments import Pairs, TileGrid, View, require_same_kind, require_shape
 from gsplat_core.reference import ray_blending
 from gsplat_core.reference.compositing import rasterize_to_pixels
 from gsplat_core.reference.projection import fully_fused_projection, isect_offset_encode, isect_tiles, values_of_rows

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gsplat_core.argument_checks import check_spherical_harmonics_arguments
+from gsplat_core.ops.arguments import check_spherical_harmonics_arguments
 
 
 def spherical_harmonics_bases(degree: int, directions: Tensor) -> Tensor:

@@ -19,7 +19,7 @@ from gsplat_core.ops.arguments import (
     pack_surfels,
 )
 from gsplat_core.reference.compositing import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_STOP
-from gsplat_core.reference.covariance import quat_to_rotmat
+from gsplat_core.reference.projection import quat_to_rotmat
 
 
 def fully_fused_projection_2dgs(

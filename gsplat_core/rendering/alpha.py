@@ -11,14 +11,15 @@ import torch
 from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.models.model import Model
-from gsplat_core.models.snapshots import Snapshot
+from gsplat_core.models import Model, Snapshot
 from gsplat_core.ops.native import CUDA_MISSING
 from gsplat_core.rendering.frame_renderer import FrameRenderer, LaunchedFrame
-from gsplat_core.rendering.outputs import FLOW_OUTPUTS, FLOW_STEP_S, SURFACE_OUTPUTS
 from gsplat_core.rendering.rasterization import RenderOutput, render
 from gsplat_core.rendering.renderer import (
+    FLOW_OUTPUTS,
+    FLOW_STEP_S,
     STANDARD_OUTPUTS,
+    SURFACE_OUTPUTS,
     Capabilities,
     FinishedFrame,
     PendingFrame,

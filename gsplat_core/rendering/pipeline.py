@@ -16,9 +16,16 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from gsplat_core.argument_checks import require_same_kind, require_shape
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.arguments import DenseProjection, DenseSurfels, PackedProjection, Pairs, TileGrid
+from gsplat_core.ops.arguments import (
+    DenseProjection,
+    DenseSurfels,
+    PackedProjection,
+    Pairs,
+    TileGrid,
+    require_same_kind,
+    require_shape,
+)
 from gsplat_core.rendering.settings import (
     CONSTANTS,
     EPS2D,

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from gsplat_core.argument_checks import require_shape
+from gsplat_core.ops.arguments import require_shape
 from gsplat_core.ops.compositing import rasterize_to_pixels
 from gsplat_core.ops.frame import STATUS_NEEDED, STATUS_OVERFLOW, View, render_frame
 from gsplat_core.ops.packed_projection import values_of_rows, visible_harmonics

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from gsplat_core.argument_checks import require_shape
+from gsplat_core.ops.arguments import require_shape
 from gsplat_core.ops.frame import TILE_SIZE as FRAME_TILE_SIZE
 from gsplat_core.ops.native import CUDA_MISSING
 from gsplat_core.rendering.frame_renderer import FrameRenderer, TileListCapacity

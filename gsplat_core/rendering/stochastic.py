@@ -13,8 +13,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.errors import InvalidInput, InvalidSetting
-from gsplat_core.models.model import Model
-from gsplat_core.models.snapshots import Snapshot
+from gsplat_core.models import Model, Snapshot
 from gsplat_core.ops.covariance import quat_scale_to_covar_preci
 from gsplat_core.ops.native import CUDA_MISSING
 from gsplat_core.ops.stochastic import (

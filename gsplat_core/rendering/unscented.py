@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from torch import Tensor
 
-from gsplat_core.argument_checks import require_shape
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.arguments import DenseProjection
+from gsplat_core.ops.arguments import DenseProjection, require_shape
 from gsplat_core.ops.unscented_projection import UnscentedTransformParameters, fully_fused_projection_with_ut
 from gsplat_core.ops.world_blending import rasterize_to_pixels_eval3d
 from gsplat_core.poses.rolling_shutter import RollingShutterType, Shutter

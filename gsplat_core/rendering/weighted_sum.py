@@ -16,8 +16,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.models.model import Model
-from gsplat_core.models.snapshots import Snapshot
+from gsplat_core.models import Model, Snapshot
 from gsplat_core.ops.arguments import DenseProjection, TileGrid
 from gsplat_core.ops.projection.projection import fully_fused_projection
 from gsplat_core.ops.spherical_harmonics import spherical_harmonics

@@ -13,29 +13,32 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsplat_core.choices import FIELDS
-from gsplat_core.deformation.continuation import NewestState
+from gsplat_core.deformation.field import NewestState
 from gsplat_core.deformation.kinds import NewField
 from gsplat_core.errors import InvalidInput
-from gsplat_core.models.model import Model
-from gsplat_core.models.snapshots import Snapshot, SnapshotSlots
+from gsplat_core.models import Model, Snapshot, SnapshotSlots
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_source import DepthSource
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.training.budget import Budget, ObserveReport
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.depth_errors import depth_errors
 from gsplat_core.training.growth.covering import Covering
 from gsplat_core.training.growth.initialisation import StartOnDevice, gaussians_from_frame
 from gsplat_core.training.motion.prior import Following, continued, newest_state
 from gsplat_core.training.observations import Observation, ObservationWindow
 from gsplat_core.training.offline import OfflineTraining, ToFit, least_spacing_s, to_fit
-from gsplat_core.training.placement import MOST_LATE, LateDepth, Placement
-from gsplat_core.training.places import LeftScenes
+from gsplat_core.training.placement import MOST_LATE, LateDepth, Placement, depth_errors
 from gsplat_core.training.right_eye import BothEyes, for_eyes
-from gsplat_core.training.schedule import LiveTraining, NewestFirstSchedule, Schedule, WindowSchedule
+from gsplat_core.training.schedule import (
+    Budget,
+    LiveTraining,
+    NewestFirstSchedule,
+    ObserveReport,
+    Schedule,
+    WindowSchedule,
+)
 from gsplat_core.training.steps.step import TrainingStep
-from gsplat_core.training.upkeep import PostponedGrowth
+from gsplat_core.training.upkeep import LeftScenes, PostponedGrowth
 from gsplat_core.transfers import HostCopy
 
 
@@ -383,7 +386,7 @@ class Reconstructor:
         """Return the model for displaying the time of the newest trained frame and later, with the next version number.
 
         On a GPU the whole model is copied into a preallocated slot without allocation or synchronisation, see
-        `gsplat_core.models.snapshots`. On a CPU with a motion prior the model covers only the times from the newest
+        `gsplat_core.models`. On a CPU with a motion prior the model covers only the times from the newest
         trained frame on; `whole_model` includes the past. In all other cases the result is that of `snapshot`.
         """
         step, prior = self._step, self._motion.prior

@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.model_sources import load_model
-from gsplat_core.memory import peak_bytes
+from gsplat_core.machine import peak_bytes
 from gsplat_core.rendering.renderer import RendererOptions, check_renderer, new_renderer
-from operators.applications.device import check_device
 from operators.applications.limits import check_picture, render_bytes, require_memory
-from operators.applications.progress import Progress, ProgressCallback
 from operators.applications.render import VIDEO_SUFFIX, ViewWish, check_video_path, view_of, write_video
+from operators.applications.session import Progress, ProgressCallback, check_device
 from operators.errors import OutputError
 from operators.rasterize import displayed
 

@@ -36,12 +36,11 @@ from gsplat_core.evaluation.views import SecondEye, evaluate_second_eye
 from gsplat_core.io.recordings.calibration import read_poses
 from gsplat_core.io.recordings.findings import Findings
 from gsplat_core.io.recordings.truth import GroundTruth, open_truth
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
 from gsplat_core.rendering.renderer import check_renderer
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.reconstructor import Reconstructor
-from operators.applications.device import check_device, seeded
 from operators.applications.evaluated import (
     EvaluatedRun,
     Playback,
@@ -52,8 +51,8 @@ from operators.applications.evaluated import (
     with_poses_of_run,
 )
 from operators.applications.limits import check_picture, render_bytes, replay_bytes, require_memory
-from operators.applications.progress import Progress, ProgressCallback
 from operators.applications.replay import ReplaySettings
+from operators.applications.session import Progress, ProgressCallback, check_device, seeded
 from operators.choices import Device
 from operators.frame_log import FRAMES_FILE, FrameLog, is_live_log, read_frames, read_live_log
 from operators.settings import check_option

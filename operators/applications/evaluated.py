@@ -15,7 +15,7 @@ from gsplat_core.errors import InvalidSetting, RecordingInvalid
 from gsplat_core.io.recordings.calibration import POSES_FILE, read_poses
 from gsplat_core.io.recordings.findings import Findings
 from gsplat_core.io.sessions import SessionReader, is_session
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from operators.applications.session import FirstFrames

@@ -13,7 +13,7 @@ import math
 from gsplat_core.choices import FIELDS
 from gsplat_core.deformation.kinds import PARAMETER_BYTES
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.memory import available_bytes
+from gsplat_core.machine import available_bytes
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.training.config import ReconstructorConfig
 from operators.errors import MemoryTooSmall

@@ -21,15 +21,13 @@ from pydantic import TypeAdapter
 from gsplat_core.io.frame_codec import camera_record
 from gsplat_core.io.sessions import SessionInfo
 from gsplat_core.io.sessions.records import ReconstructorMade
-from gsplat_core.models.model import Model
-from gsplat_core.models.snapshots import Snapshot
+from gsplat_core.models import Model, Snapshot
 from gsplat_core.rendering.renderer import check_renderer
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.reconstructor import Reconstructor
-from operators.applications.device import check_device, seeded
 from operators.applications.limits import check_picture
 from operators.applications.live_settings import LIVE_PREDICT_EVERY, LiveSettings
-from operators.applications.session import Report, RunOutcome, Session, delivered, saves_model
+from operators.applications.session import Report, RunOutcome, Session, check_device, delivered, saves_model, seeded
 from operators.applications.working_size import (
     SHARE_OF_INTERVAL,
     PacedTissue,

@@ -19,14 +19,14 @@ from gsplat_core.depth.registry import DepthFinder, of_recording
 from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.io.recordings import is_heldout
 from gsplat_core.io.recordings.calibration import POSES_FILE, write_poses
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
 from gsplat_core.poses.camera_path import MOVING_SHARE, CameraPath, camera_path_of, rigid_share
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training import validation
-from gsplat_core.training.budget import Budget, ObserveReport
 from gsplat_core.training.offline import ToFit
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.right_eye import BothEyes
+from gsplat_core.training.schedule import Budget, ObserveReport
 from gsplat_core.training.validation import (
     INPUT_GAIN_DB,
     LEAST_FRAMES,
@@ -40,11 +40,11 @@ from gsplat_core.training.validation import (
     trial_of,
     validation_psnr_db,
 )
-from operators.applications.device import seeded
-from operators.applications.progress import Progress, ProgressCallback
 from operators.applications.replay import ReplaySettings, new_reconstructor, prepare, replay_graph
 from operators.applications.session import (
     FirstFrames,
+    Progress,
+    ProgressCallback,
     Report,
     RunOutcome,
     Session,
@@ -52,6 +52,7 @@ from operators.applications.session import (
     delivered,
     measures_baselines,
     saves_model,
+    seeded,
 )
 from operators.errors import NothingShown
 from operators.settings import OfflineSection, check_option

@@ -21,11 +21,10 @@ from gsplat_core.io.camera_path import read_camera_path
 from gsplat_core.io.files import PartialFile
 from gsplat_core.io.model_sources import is_scene_file, load_model
 from gsplat_core.io.recordings import open_recording
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
 from gsplat_core.rendering.renderer import Renderer, RendererOptions, check_renderer, new_renderer
 from gsplat_core.scene.cameras import Camera, Orbit
 from gsplat_core.transfers import HostCopy
-from operators.applications.device import check_device
 from operators.applications.limits import (
     check_picture,
     check_shown_size,
@@ -34,7 +33,7 @@ from operators.applications.limits import (
     render_bytes,
     require_memory,
 )
-from operators.applications.progress import Progress, ProgressCallback
+from operators.applications.session import Progress, ProgressCallback, check_device
 from operators.errors import OutputError
 from operators.layer_pictures import OutputPictures, mark_unobserved
 from operators.output_folder import OutputFolder, check_file_path

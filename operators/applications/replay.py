@@ -26,17 +26,19 @@ from gsplat_core.rendering.renderer import check_renderer
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.schedule import LiveTraining
-from operators.applications.device import check_device, seeded
 from operators.applications.limits import check_picture, replay_bytes, require_memory
-from operators.applications.progress import Progress, ProgressCallback
 from operators.applications.session import (
+    Progress,
+    ProgressCallback,
     Report,
     RunOutcome,
     RunSettings,
     Session,
+    check_device,
     delivered,
     measures_baselines,
     saves_model,
+    seeded,
 )
 from operators.depth import without_depth
 from operators.metrics import ScoredFrame

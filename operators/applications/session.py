@@ -1,10 +1,11 @@
-"""Execution of one run of a graph, from its start to its outcome, and delivery of the results to the output folder."""
+"""Execution of one run of a graph: device and seed, progress reports, outcome, and delivery of the results to the output folder."""
 
 from __future__ import annotations
 
 import resource
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -14,11 +15,10 @@ from typing import Protocol, TypeVar, cast
 from gsplat_core.errors import CoreError
 from gsplat_core.evaluation.baselines import measure_baselines
 from gsplat_core.io.bundle import save_bundle
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
 from gsplat_core.scene.frames import Frame
-from operators.applications.device import seeded
-from operators.errors import OperatorsError, RunFailed
-from operators.graph import Application, DurationSummary, run
+from operators.errors import DeviceMissing, OperatorsError, RunFailed
+from operators.graph import Application, DurationSummary, GreedyScheduler, ManualClock, MultiThreadScheduler, run
 from operators.graph.application import Engine
 from operators.ingest import LOOK_S, SourceResult
 from operators.metrics import QualityResult
@@ -27,6 +27,55 @@ from operators.output_folder import OutputFolder
 from operators.reconstruct import ModelResult
 from operators.sources.source import FrameSource, SourceState
 from operators.storage import storage_errors
+
+DEVICES = ("cpu", "cuda")
+
+
+def check_device(device: str) -> None:
+    """Raise DeviceMissing if this machine or this build cannot run on `device`."""
+    import torch
+
+    if device == "cpu":
+        return
+    if device != "cuda":
+        raise DeviceMissing(f"device {device!r} is not known; use --device {' or '.join(DEVICES)}")
+    if not torch.cuda.is_available():
+        raise DeviceMissing(
+            f"device cuda is not available: torch {torch.__version__} finds no GPU; use --device cpu, "
+            "or let `intrasplat doctor` say what is missing"
+        )
+    from gsplat_core.ops.native import CUDA_MISSING
+
+    if CUDA_MISSING is not None:
+        raise DeviceMissing(f"device cuda is not available: the CUDA kernels are {CUDA_MISSING}; use --device cpu")
+
+
+def scheduler_for(device: str, app: Application) -> GreedyScheduler | MultiThreadScheduler:
+    """Return the scheduler for an application that processes every frame, such as a replay.
+
+    The results do not depend on the scheduler.
+
+    On the CPU, training occupies all cores, so one thread runs all operators in turn. With a GPU
+    the host is idle during training: each operator gets a thread, and decoding, scoring and
+    encoding overlap with the training on later frames.
+    """
+    return GreedyScheduler(app, clock=ManualClock()) if device == "cpu" else MultiThreadScheduler(app)
+
+
+@contextmanager
+def seeded(seed: int, device: str) -> Iterator[None]:
+    """Context manager that seeds torch's random generators and restores their state on exit.
+
+    Args:
+        seed: the seed.
+        device: `cuda` also covers the generators of all GPUs.
+    """
+    import torch
+
+    with torch.random.fork_rng(devices=range(torch.cuda.device_count()) if device == "cuda" else []):
+        torch.manual_seed(seed)
+        yield
+
 
 Part = TypeVar("Part")
 
@@ -349,3 +398,27 @@ def delivered(
         except RunFailed as failed:
             assert isinstance(failed.result, RunOutcome)
             raise RunFailed(str(failed), deliver(failed.result)) from failed.__cause__
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Report of a running application: how far its current stage is, with the newest frame's scores (None if not
+    scored).
+    """
+
+    stage: str
+    """Name of the current stage as one word, such as "train"."""
+    done: int
+    total: int
+    unit: str = "frames"
+    psnr_tissue_db: float | None = None
+    """Tissue PSNR of the newest displayed frame in dB; its training error if `trained`."""
+    previous_frame_db: float | None = None
+    """Tissue PSNR in dB of the previous raw frame (trivial baseline)."""
+    next_frame_db: float | None = None
+    """Tissue PSNR in dB of the frame's prediction before training on it."""
+    trained: bool = True
+    """True if the newest displayed frame was trained on before display."""
+
+
+ProgressCallback = Callable[[Progress], None]

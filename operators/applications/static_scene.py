@@ -16,14 +16,13 @@ from gsplat_core.io.bundle import save_bundle
 from gsplat_core.io.model_sources import load_model
 from gsplat_core.io.ply import save_ply
 from gsplat_core.io.recordings.colmap import HELD_OUT_EVERY, read_colmap
-from gsplat_core.memory import peak_bytes
-from gsplat_core.models.model import Model
+from gsplat_core.machine import peak_bytes
+from gsplat_core.models import Model
 from gsplat_core.rendering.renderer import Renderer, RendererOptions, check_renderer, new_renderer
 from gsplat_core.training.metrics import frame_quality
 from gsplat_core.training.static import StaticConfig, StaticTrainer, read_pictures, read_points
-from operators.applications.device import check_device, seeded
 from operators.applications.limits import check_picture, render_bytes, require_memory
-from operators.applications.progress import Progress, ProgressCallback
+from operators.applications.session import Progress, ProgressCallback, check_device, seeded
 from operators.rasterize import displayed
 from operators.settings import TrainOptions, check_images_folder, check_option
 from operators.sinks.writers import write_png

@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.scene.frames import Frame, FrameStatus
-from operators.applications.device import seeded
 from operators.applications.live_settings import LiveSettings
+from operators.applications.session import seeded
 from operators.graph import Application, run
 from operators.messages import ShownPicture
 from operators.sources.derived import scaled_description

@@ -13,6 +13,7 @@ from operators.graph.conditions import (
     Condition,
     CountCondition,
     DownstreamMessageAffordableCondition,
+    EdgeStats,
     ManualClock,
     MessageAvailableCondition,
     MessageOrTimeoutCondition,
@@ -34,7 +35,6 @@ from operators.graph.operator import (
     Operator,
     OutputContext,
 )
-from operators.graph.queues import EdgeStats
 from operators.graph.schedulers import GreedyScheduler, MultiThreadScheduler
 from operators.graph.spec import REQUIRED, ConditionType, ConnectorType, IOSpec, OperatorSpec, QueuePolicy
 from operators.graph.tracking import DurationSummary, FlowTracker

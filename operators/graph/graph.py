@@ -16,9 +16,8 @@ from typing import Any, Protocol, Union, get_args, get_origin
 
 from gsplat_core.errors import UserError
 from operators.errors import GraphDeadlock, GraphInvalid, OperatorFailed, OperatorStuck
-from operators.graph.conditions import Clock, MessageOrTimeoutCondition, SchedulingStatus
+from operators.graph.conditions import Clock, Edge, EdgeStats, Message, MessageOrTimeoutCondition, SchedulingStatus
 from operators.graph.operator import ExecutionContext, Fault, FaultAction, InputContext, Operator, OutputContext
-from operators.graph.queues import Edge, EdgeStats, Message
 from operators.graph.spec import ConditionType, IOSpec, QueuePolicy
 from operators.graph.tracking import FlowTracker, Trail
 

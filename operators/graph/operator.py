@@ -10,8 +10,14 @@ from enum import Enum
 from typing import Any, ClassVar
 
 from operators.errors import GraphInvalid, MetadataConflict, OperatorFailed, PortError
-from operators.graph.conditions import Clock, Condition, DownstreamMessageAffordableCondition, MessageAvailableCondition
-from operators.graph.queues import Edge, Message
+from operators.graph.conditions import (
+    Clock,
+    Condition,
+    DownstreamMessageAffordableCondition,
+    Edge,
+    Message,
+    MessageAvailableCondition,
+)
 from operators.graph.spec import REQUIRED, ConditionType, IOSpec, OperatorSpec
 from operators.graph.tracking import Trail
 

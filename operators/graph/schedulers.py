@@ -8,9 +8,8 @@ from functools import partial
 from typing import Any
 
 from operators.errors import GraphInvalid, OperatorStuck
-from operators.graph.conditions import Clock, ManualClock, RealtimeClock, SchedulingStatus
+from operators.graph.conditions import Clock, Edge, LockedEdge, ManualClock, RealtimeClock, SchedulingStatus
 from operators.graph.graph import Graph, OperatorTask
-from operators.graph.queues import Edge, LockedEdge
 from operators.graph.spec import QueuePolicy
 
 _LOOK_S = 0.25

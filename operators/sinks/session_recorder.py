@@ -29,8 +29,8 @@ from gsplat_core.io.frame_codec import MOST_NS
 from gsplat_core.io.sessions import SessionInfo, SessionWriter, WriterOptions
 from gsplat_core.io.sessions.records import SESSION_FILE, LostLine, ScheduleLine
 from gsplat_core.io.sessions.writer import Shown
+from gsplat_core.machine import step_back
 from gsplat_core.scene.frames import Frame
-from gsplat_core.threads import step_back
 from operators.errors import OutputError
 from operators.graph import Operator, OperatorSpec
 from operators.messages import ShownPicture

@@ -13,11 +13,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from operators.display import marked
 from operators.graph import Operator, OperatorSpec
 from operators.layer_pictures import OutputPictures
 from operators.messages import RenderedFrame
 from operators.outcome import OutcomeBuilder
-from operators.remembered import marked
 from operators.sinks.registry import SinkOptions
 from operators.sinks.writers import VideoFile
 from operators.storage import StorageReserve

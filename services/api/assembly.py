@@ -15,10 +15,11 @@ from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.registry import Collector
 
 from services.api import pages
+from services.api.observability import StreamMeasures
 from services.api.problems import Conflicting, Missing, Problem, Unavailable, Unprocessable
 from services.api.state import Parts
 from services.audit.files import Outcome
-from services.audit.system_events import SystemEvents
+from services.audit.log import SystemEvents
 from services.bus.runtime import RuntimeFolder
 from services.clock_guard import ClockGuard
 from services.errors import (
@@ -42,9 +43,8 @@ from services.missing_files import StoredFiles, StoredFilesWatch
 from services.recordings.store import RecordingStore, State
 from services.registry.models import DATABASE_FILE, ModelRegistry
 from services.registry.records import NICENESS
-from services.schemas.service import CheckResult
+from services.schemas import CheckResult
 from services.settings import ServiceSettings
-from services.supervisor.metrics import StreamMeasures
 from services.supervisor.process import StreamEvent
 from services.supervisor.stream import ShownModels, SupervisedStreams
 

@@ -15,7 +15,7 @@ from services.api.guard import CallerOf, new_router, recorded, requires
 from services.api.state import control_of
 from services.audit import ExportFormat, Wanted
 from services.audit.files import Outcome
-from services.schemas.service import AuditPage, EntryView, Moment
+from services.schemas import AuditPage, EntryView, Moment
 
 router = new_router("audit")
 MEDIA_TYPES = {"csv": "text/csv; charset=utf-8", "jsonl": "application/jsonl"}

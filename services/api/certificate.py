@@ -17,8 +17,8 @@ from prometheus_client import Metric
 from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.registry import Collector
 
-from services.audit.system_events import SystemEvents
-from services.schemas.service import CheckResult
+from services.audit.log import SystemEvents
+from services.schemas import CheckResult
 
 log = logging.getLogger(__name__)
 LOOK_S = 2.0

@@ -14,7 +14,7 @@ from services.api.problems import Conflicting, Missing
 from services.api.state import ControlState, control_of
 from services.auth.keys import ApiKey, KeyConflict, limits_of
 from services.auth.roles import Role
-from services.schemas.service import CallerView, KeyView, MadeKey, NewKey, Ticket, TicketFor
+from services.schemas import CallerView, KeyView, MadeKey, NewKey, Ticket, TicketFor
 
 router = new_router("keys")
 

@@ -12,7 +12,7 @@ from starlette.requests import Request
 from services.api.guard import CallerOf, new_router, recorded, requires
 from services.api.state import ControlState, control_of, is_missing, known_problem, part
 from services.api.uploads import incoming_file, stated_sha256
-from services.schemas.replays import RecordingView
+from services.schemas import RecordingView
 from services.settings import ResourceName
 
 if TYPE_CHECKING:

@@ -19,10 +19,9 @@ from services.api.guard import CallerOf, new_router, recorded, requires
 from services.api.models import check_soon, registry_of
 from services.api.problems import Conflicting, Missing, Unavailable, problem_answer
 from services.api.state import control_of, part
-from services.jobs.records import JobState
 from services.jobs.results import FILES
-from services.schemas.models import VersionView
-from services.schemas.replays import BatchView, ModelTarget, ReplayRequest, ReplayView, Submitted
+from services.jobs.store import JobState
+from services.schemas import BatchView, ModelTarget, ReplayRequest, ReplayView, Submitted, VersionView
 
 if TYPE_CHECKING:
     from services.jobs.replays import Replays

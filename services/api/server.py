@@ -26,7 +26,7 @@ from services.api.certificate import ServerCertificate
 from services.api.middleware import MOST_HEAD_BYTES, network_of_address
 from services.api.service import ProbeListener
 from services.api.state import ControlState
-from services.audit.system_events import SystemEvents
+from services.audit.log import SystemEvents
 from services.errors import CannotServe
 from services.settings import ServiceSettings
 

@@ -25,7 +25,7 @@ from starlette.requests import Request
 from services.api.guard import new_router, requires
 from services.api.state import ControlState, control_of
 from services.errors import CannotServe
-from services.schemas.service import Alive, CheckResult, Readiness, Version
+from services.schemas import Alive, CheckResult, Readiness, Version
 from services.settings import ServiceSettings
 
 CHECK_TIMEOUT_S = 2.0

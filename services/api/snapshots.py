@@ -21,8 +21,7 @@ from services.api.state import IdempotencyKey, control_of, part
 from services.api.streams import streams_of
 from services.exports.cache import ALL
 from services.exports.renderings import PICTURES
-from services.schemas.models import RenderRequest, VersionView
-from services.schemas.streams import SnapshotRequest, SnapshotView
+from services.schemas import RenderRequest, SnapshotRequest, SnapshotView, VersionView
 from services.settings import ResourceName
 
 if TYPE_CHECKING:

@@ -28,10 +28,10 @@ from services.api.middleware import TokenBuckets
 from services.api.observability import Measures
 from services.api.problems import Missing, NotBuiltIn, Problem, Unprocessable
 from services.audit import AuditError, AuditLog
-from services.audit.system_events import SystemEvents
+from services.audit.log import SystemEvents
 from services.auth.keys import KeyStore
 from services.auth.roles import Tickets
-from services.schemas.service import CheckResult
+from services.schemas import CheckResult
 from services.settings import ServiceSettings
 
 if TYPE_CHECKING:

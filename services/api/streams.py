@@ -16,7 +16,7 @@ from starlette.requests import Request
 from services.api.guard import CallerOf, new_router, recorded, requires
 from services.api.problems import Forbidden, Unprocessable
 from services.api.state import control_of, part
-from services.schemas.streams import StreamOptions, StreamRequest, StreamView, VirtualCamera
+from services.schemas import StreamOptions, StreamRequest, StreamView, VirtualCamera
 from services.settings import ResourceName, SourceRules
 
 if TYPE_CHECKING:

@@ -32,8 +32,7 @@ if TYPE_CHECKING:
     from pydantic import BaseModel
 
     from services.client import Client
-    from services.schemas.service import AuditPage
-    from services.schemas.streams import StreamView
+    from services.schemas import AuditPage, StreamView
 
 
 URL, KEY, KEY_FILE = "INTRASPLAT_URL", "INTRASPLAT_KEY", "INTRASPLAT_KEY_FILE"

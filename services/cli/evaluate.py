@@ -21,7 +21,7 @@ from services.cli.exit_codes import INTERRUPTED, OK
 from services.cli.options import EvaluateOptions, renderer_options
 from services.cli.terminal import InterruptRequest, ProgressPrinter, printable
 from services.reports.evaluation_build import build_evaluation, write_evaluation
-from services.reports.evaluation_rows import decibels, future, geometry_lines, measured
+from services.reports.evaluation_html import decibels, future, geometry_lines, measured
 from services.reports.evaluation_schema import EvaluationReport, load_evaluated
 
 ONLY_WITH_SCENE = ("scene", "images", "every", "samples", "supersampling", "order")

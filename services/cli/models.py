@@ -28,8 +28,8 @@ from gsplat_core.io.exports.formats import ExportWish, format_named, format_of
 from gsplat_core.io.manifest import parse_manifest
 from gsplat_core.io.model_sources import load_model
 from gsplat_core.io.surface_files import read_surface
-from gsplat_core.memory import in_gib
-from gsplat_core.models.model import Model
+from gsplat_core.machine import in_gib
+from gsplat_core.models import Model
 from gsplat_core.scene.collection import GaussianCollection
 from operators.applications.bench import BenchSettings, bench_model
 from operators.applications.render import render_model

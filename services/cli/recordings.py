@@ -21,7 +21,7 @@ from gsplat_core.poses.odometry import Trajectory, trajectory_of
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_origin import RELATIVE_DISTANCE
 from gsplat_core.scene.frames import Frame
-from operators.applications.progress import Progress
+from operators.applications.session import Progress
 from operators.errors import OutputError
 from operators.output_folder import check_file_path, check_folder_path
 from operators.storage import storage_errors

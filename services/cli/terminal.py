@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress as Bar
     from rich.progress import TaskID
 
-    from operators.applications.progress import Progress
+    from operators.applications.session import Progress
 
 OUTPUT_CLOSED = 141
 """Exit code that a shell reports after a broken pipe: 128 plus the number of SIGPIPE."""

@@ -16,9 +16,9 @@ import typer
 from gsplat_core.errors import BundleError, InvalidSetting
 from gsplat_core.io.model_files import open_model_file
 from gsplat_core.io.model_sources import load_model
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
 from gsplat_core.rendering.renderer import RendererOptions, check_renderer
-from operators.applications.device import check_device
+from operators.applications.session import check_device
 from services.cli.exit_codes import OK
 from services.cli.terminal import InterruptRequest
 from services.display import KINDS

@@ -12,10 +12,21 @@ from pydantic import TypeAdapter, ValidationError
 
 from services.client.requests import Picture, Requests, pictures, refused_by, waited_for
 from services.errors import ClientError
-from services.schemas.models import ModelView, VersionView
-from services.schemas.replays import BatchView, RecordingView, ReplayView, Submitted
-from services.schemas.service import AuditPage, CallerView, KeyView, MadeKey, Readiness
-from services.schemas.streams import SnapshotView, StreamView
+from services.schemas import (
+    AuditPage,
+    BatchView,
+    CallerView,
+    KeyView,
+    MadeKey,
+    ModelView,
+    Readiness,
+    RecordingView,
+    ReplayView,
+    SnapshotView,
+    StreamView,
+    Submitted,
+    VersionView,
+)
 
 OPEN = ("queued", "running")
 

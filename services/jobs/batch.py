@@ -22,10 +22,9 @@ from operators.output_folder import BATCH_DATABASE, DESCRIPTIONS, is_whole_outpu
 from operators.settings import JobOptions
 from operators.storage import storage_errors
 from services.jobs.pool import JobPool, PoolSettings
-from services.jobs.records import JobRecord, JobState, NewJob
 from services.jobs.results import RUNNING, Results
 from services.jobs.runners import Runner
-from services.jobs.store import MOST_AT_ONCE, JobStore
+from services.jobs.store import MOST_AT_ONCE, JobRecord, JobState, JobStore, NewJob
 
 DATABASE = BATCH_DATABASE
 WHO = "batch"

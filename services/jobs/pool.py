@@ -20,10 +20,9 @@ from pathlib import Path
 from typing import Any
 
 from services.errors import StoreUnavailable
-from services.jobs.records import SCHEMA, Claimed, JobState
 from services.jobs.results import Results, Task, Workspace
 from services.jobs.runners import Runner
-from services.jobs.store import Claims
+from services.jobs.store import SCHEMA, Claimed, Claims, JobState
 from services.private_files import keep_files_private
 from services.registry.database import Database
 from services.supervisor.process import Restarts

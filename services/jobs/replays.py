@@ -12,11 +12,10 @@ from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from services.audit.system_events import SystemEvents
+from services.audit.log import SystemEvents
 from services.errors import CheckFailed, NotFound, StoreUnavailable
-from services.jobs.records import JobRecord, JobState, NewJob, Submission
 from services.jobs.results import FILES, Results
-from services.jobs.store import JobStore
+from services.jobs.store import JobRecord, JobState, JobStore, NewJob, Submission
 from services.recordings.store import Expired, RecordingStore
 
 

@@ -18,7 +18,7 @@ from typing import Any
 from gsplat_core.choices import OUTPUTS, STANDARD
 from gsplat_core.io.files import sync_folder
 from services.errors import StoreUnavailable
-from services.jobs.records import JobProgress, JobState
+from services.jobs.store import JobProgress, JobState
 
 RUNNING, LOCK = ".running", "lock"
 OUT, REPORT = "out", "report.json"

@@ -10,12 +10,11 @@ from pathlib import Path
 
 import torch
 
-from operators.applications.progress import Progress
 from operators.applications.replay import ReplaySettings, replay
-from operators.applications.session import RunOutcome
+from operators.applications.session import Progress, RunOutcome
 from services.cli.exit_codes import user_sentence
-from services.jobs.records import JobProgress, JobState
 from services.jobs.results import Task
+from services.jobs.store import JobProgress, JobState
 from services.registry.bundle_file import SUFFIX, pack
 from services.reports.build import require_shown, write_reports
 

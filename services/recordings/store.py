@@ -1,6 +1,6 @@
 """Store of uploaded recordings: records, table, files and checks.
 
-Each change of the table needs a new file in `migrations/versions`.
+Each change of the table needs a new file in `migrations`.
 """
 
 from __future__ import annotations

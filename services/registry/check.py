@@ -25,7 +25,7 @@ from gsplat_core.errors import BundleCorrupt, UnknownFormatVersion, UserError
 from gsplat_core.io.bundle import MANIFEST, load_bundle
 from gsplat_core.io.manifest import MAX_MANIFEST_BYTES, parse_manifest
 from gsplat_core.io.model_files import open_model_file
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
 from gsplat_core.rendering.renderer import new_renderer
 from services.private_files import keep_files_private
 from services.registry.records import (

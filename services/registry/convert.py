@@ -1,7 +1,7 @@
 """Conversion of a splat file of another program to a packed model, as a separate program:
 `python -m services.registry.convert FILE TARGET --json`.
 
-Reads the file with `gsplat_core.io.model_sources`, by its suffix, and makes a static model of it with a camera that shows
+Reads the file with `gsplat_core.io.model_files`, by its suffix, and makes a static model of it with a camera that shows
 all of it. With `--json` one line is printed: `{"stage": "ready", …}` or `{"stage": "rejected", "reason": …}`. Exit code 0
 means that there is a result; any other code means that the conversion itself failed.
 

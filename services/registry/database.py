@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import alembic.command
-import alembic.config
-import alembic.runtime.migration
-import alembic.script
 import sqlalchemy as sa
+from alembic.config import Config
+from alembic.runtime.environment import EnvironmentContext
+from alembic.runtime.migration import MigrationContext
+from alembic.script import ScriptDirectory
 from alembic.util import CommandError
 from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
@@ -93,24 +93,25 @@ class Database:
             SchemaTooNew: if a later version of the program wrote the database.
             StoreUnavailable: if the database does not answer.
         """
-        config = alembic.config.Config()
-        config.set_main_option("script_location", str(self._schema.migrations).replace("%", "%%"))
-        options = {"version_table": self._schema.version_table}
+        script = ScriptDirectory(self._schema.migrations, version_locations=[self._schema.migrations])
+        table = self._schema.version_table
         with self.writing() as connection:
-            context = alembic.runtime.migration.MigrationContext.configure(connection, opts=options)
-            current = context.get_current_heads()
-            script = alembic.script.ScriptDirectory.from_config(config)
+            current = MigrationContext.configure(connection, opts={"version_table": table}).get_current_heads()
             for revision in current:
                 self._check_known(script, revision)
             if set(current) != set(script.get_heads()):
-                config.attributes.update(connection=connection, **options)
-                alembic.command.upgrade(config, "head")
+                with EnvironmentContext(
+                    Config(), script, fn=lambda revision, _: script._upgrade_revs("head", revision)
+                ) as run:
+                    run.configure(connection, version_table=table, render_as_batch=True, transactional_ddl=True)
+                    with run.begin_transaction():
+                        run.run_migrations()
 
     def close(self) -> None:
         """Close all connections. Later use opens new ones."""
         self._engine.dispose()
 
-    def _check_known(self, script: alembic.script.ScriptDirectory, revision: str) -> None:
+    def _check_known(self, script: ScriptDirectory, revision: str) -> None:
         try:
             script.get_revision(revision)
         except CommandError as error:

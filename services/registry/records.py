@@ -1,6 +1,6 @@
 """Records of the registry: versions, models and changes, their tables, and the queries that convert between rows and records.
 
-Each change of a table needs a new file in `migrations/versions`.
+Each change of a table needs a new file in `migrations`.
 
 Resource budgets of uploads and their checks, and resource limits of the processes that read uploads.
 """

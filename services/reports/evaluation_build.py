@@ -18,7 +18,7 @@ from gsplat_core.evaluation.baselines import (
 from gsplat_core.evaluation.live import Live
 from gsplat_core.evaluation.protocols import PlaceScore
 from gsplat_core.evaluation.views import MATCHED, RIGHT_BEFORE, SHIFTED, SecondEye
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
 from operators.applications.evaluate import Evaluation, EvaluationSettings
 from operators.applications.evaluated import EvaluatedRun
 from operators.frame_log import MAX_SERIES, LogLine, frames_per_entry, read_frames, series

@@ -12,7 +12,7 @@ from pydantic import Field, ValidationError
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.bundle import load_bundle
 from gsplat_core.io.files import read_regular
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
 from operators.applications.evaluated import EvaluatedRun
 from operators.storage import write_whole
 from services.reports.schema import MOST_REPORT_BYTES, NOTICE, Count, ModelFacts, Part, RecordingFacts, RunReport

@@ -12,11 +12,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
 from gsplat_core.scene.cameras import Orbit
+from operators.display import marked
 from operators.metrics import ScoredFrame
 from operators.rasterize import displayed
-from operators.remembered import marked
 from operators.sinks.video import depth_map, depth_range, error_map
 
 HEIGHT = 290

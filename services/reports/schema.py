@@ -17,8 +17,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from gsplat_core.choices import Eyes
 from gsplat_core.io.files import read_regular
+from gsplat_core.machine import usable_cores
 from gsplat_core.ops.native import instruction_set
-from gsplat_core.threads import usable_cores
 from operators.sources.source import SourceDescription
 from operators.storage import write_whole
 

@@ -21,15 +21,13 @@ import torch
 
 from gsplat_core.errors import UserError
 from gsplat_core.io.bundle import save_bundle
-from gsplat_core.models.model import Model
-from gsplat_core.models.snapshots import Snapshot
+from gsplat_core.models import Model, Snapshot
 from gsplat_core.rendering.renderer import check_renderer
 from gsplat_core.transfers import StagedCopies
-from operators.applications.device import check_device
 from operators.applications.limits import check_picture
 from operators.applications.live import LiveParts, live_graph, low_latency, measured_size, new_parts, warm_up
 from operators.applications.live_settings import LiveSettings
-from operators.applications.session import Session
+from operators.applications.session import Session, check_device
 from operators.applications.working_size import WorkingSize, trial_run
 from operators.errors import SourceUnavailable
 from operators.graph.application import Application

@@ -19,20 +19,18 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsplat_core.models.model import Model
-from gsplat_core.models.snapshots import Snapshot
+from gsplat_core.machine import step_back
+from gsplat_core.models import Model, Snapshot
 from gsplat_core.rendering.rasterization import RenderOutput, render
 from gsplat_core.rendering.surface import certainty
 from gsplat_core.scene.cameras import Camera, Orbit
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
-from gsplat_core.threads import step_back
 from gsplat_core.transfers import HostCopy
-from operators.display import draw_label, picture_state
+from operators.display import RememberedTissue, draw_label, picture_state, share_of
 from operators.layer_pictures import DepthColours, confidence_picture, mark_unobserved, mark_virtual
 from operators.messages import PictureState, ShownPicture
 from operators.metrics import ScoredFrame
 from operators.rasterize import displayed
-from operators.remembered import RememberedTissue, share_of
 from operators.sources.source import SourceState
 from services.bus.messages import Durations
 from services.bus.pictures import PicturePublisher, WatchedPublisher, wait_for_readers

@@ -14,12 +14,12 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from gsplat_core.errors import InvalidSetting
-from services.audit.system_events import SystemEvents
+from services.audit.log import SystemEvents
 from services.bus.runtime import Role, RuntimeFolder, StreamFolder
 from services.display import KINDS, DisplayHub, EncodedPicture, PictureKind
 from services.errors import BusError, Conflict, NotFound, RegistryError, Rejected
 from services.registry.models import ModelRegistry
-from services.schemas.streams import StreamView
+from services.schemas import StreamView
 from services.settings import StreamSettings
 from services.supervisor.launcher import ByLauncher, Direct, Start
 from services.supervisor.process import ManagedProcess, ProcessState, StreamEvent

@@ -11,7 +11,7 @@ from safetensors.torch import save
 from gsplat_core.deformation import new_field
 from gsplat_core.errors import BundleCorrupt, BundleError, UnknownFormatVersion
 from gsplat_core.io.bundle import load_bundle, save_bundle
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 

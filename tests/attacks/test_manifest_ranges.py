@@ -26,7 +26,7 @@ from gsplat_core.io.manifest import (
     SIDE_PX,
     VERSION,
 )  # fmt: skip
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 

@@ -13,13 +13,12 @@ import pytest
 import yaml
 
 from services.api.certificate import ServerCertificate
-from services.api.observability import Measures
+from services.api.observability import STATES, Measures, StreamMeasures
 from services.api.state import Storage
 from services.audit import AuditLog
-from services.audit.system_events import SystemEvents
+from services.audit.log import SystemEvents
 from services.missing_files import StoredFiles, StoredFilesWatch
 from services.registry.database import Database
-from services.supervisor.metrics import STATES, StreamMeasures
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 OF_PROMETHEUS = {"up": {"job", "instance"}}

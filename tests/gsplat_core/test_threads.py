@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 import pytest
 import torch
 
-from gsplat_core.threads import one_thread, use_one_thread
+from gsplat_core.machine import one_thread, use_one_thread
 
 
 @pytest.fixture(autouse=True)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.growth.initialisation import gaussians_from_frame

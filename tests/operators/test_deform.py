@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from gsplat_core.deformation import BasisField
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
 from operators.messages import Reconstruction
 from operators.rasterize import DeformOp
 

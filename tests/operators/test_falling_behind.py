@@ -8,11 +8,10 @@ import pytest
 
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
-from gsplat_core.training.budget import Budget
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.metrics import psnr_tissue_db
 from gsplat_core.training.reconstructor import Reconstructor
-from gsplat_core.training.schedule import LiveTraining
+from gsplat_core.training.schedule import Budget, LiveTraining
 from operators.frame_clock import RENEW_AFTER, BehindGuard
 
 WIDTH, HEIGHT = 64, 48

@@ -10,8 +10,7 @@ import pytest
 import torch
 
 from gsplat_core.choices import RENDERERS
-from gsplat_core.models.model import Model
-from gsplat_core.models.snapshots import SnapshotSlots
+from gsplat_core.models import Model, SnapshotSlots
 from gsplat_core.rendering.renderer import Capabilities, FinishedFrame
 from gsplat_core.scene.frames import FrameStatus
 from operators.messages import DeformedScene

@@ -6,8 +6,7 @@ from types import SimpleNamespace
 
 import torch
 
-from gsplat_core.models.model import Model
-from gsplat_core.models.snapshots import Snapshot, SnapshotSlots
+from gsplat_core.models import Model, Snapshot, SnapshotSlots
 from gsplat_core.scene.frames import FrameStatus
 from gsplat_core.transfers import HostCopy
 from operators.outcome import OutcomeBuilder

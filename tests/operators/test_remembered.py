@@ -9,7 +9,7 @@ import pytest
 
 from gsplat_core.io.sessions.tracks import TrackWriter
 from gsplat_core.training.metrics import psnr_tissue_db
-from operators.remembered import COVERED, RememberedTissue, marked
+from operators.display import COVERED, RememberedTissue, marked
 from tests.operators.conftest import make_frame, make_rendered
 
 

@@ -8,7 +8,7 @@ import threading
 
 import pytest
 
-from gsplat_core.threads import NICENESS, step_back, usable_cores
+from gsplat_core.machine import NICENESS, step_back, usable_cores
 
 
 def in_a_thread(work):

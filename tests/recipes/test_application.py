@@ -13,9 +13,7 @@ import pytest
 
 from gsplat_core.io.recordings import synthesize
 from gsplat_core.scene.frames import Frame
-from operators.applications.device import scheduler_for
-from operators.applications.progress import Progress, ProgressCallback
-from operators.applications.session import RunOutcome, RunSettings, Session
+from operators.applications.session import Progress, ProgressCallback, RunOutcome, RunSettings, Session, scheduler_for
 from operators.errors import RunFailed, StorageFull
 from operators.graph import Application, Operator, OperatorSpec
 from operators.ingest import SourceOp, SourceResult

@@ -11,7 +11,7 @@ import torch
 from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
 
 ROOT = Path(__file__).resolve().parents[2]
-OP = "covariance"
+OP = "splat_regression"
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from gsplat_core.deformation import FIELDS, Capabilities, DeformationField, Fiel
 from gsplat_core.errors import BundleCorrupt, InvalidInput, InvalidSetting
 from gsplat_core.io.bundle import load_bundle
 from gsplat_core.io.recordings import open_recording, synthesize
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.metrics import psnr_tissue_db

@@ -12,11 +12,10 @@ from gsplat_core.deformation import FIELDS
 from gsplat_core.io.bundle import load_bundle
 from gsplat_core.io.recordings import open_recording, synthesize
 from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
-from gsplat_core.training.budget import Budget
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.metrics import psnr_tissue_db
 from gsplat_core.training.reconstructor import Reconstructor
-from gsplat_core.training.schedule import LiveTraining
+from gsplat_core.training.schedule import Budget, LiveTraining
 from gsplat_core.training.upkeep import RENEW_EVERY
 from services.cli.app import run
 from tests.recipes.test_deformation_field import DRIFT, POLYNOMIAL

@@ -12,7 +12,7 @@ import torch
 from gsplat_core.choices import RENDERERS
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings import synthesize
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
 from gsplat_core.rendering.renderer import (
     STANDARD_OUTPUTS,
     Capabilities,

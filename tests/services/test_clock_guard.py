@@ -10,7 +10,7 @@ import pytest
 
 from services.audit import AuditLog, Keeping
 from services.audit.files import closed_segments
-from services.audit.system_events import SystemEvents
+from services.audit.log import SystemEvents
 from services.clock_guard import CONFIRM_S, FILE, ClockGuard
 from services.jobs.replays import RecordingRetention, ReplayRetention
 

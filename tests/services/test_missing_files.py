@@ -7,9 +7,9 @@ import asyncio
 import pytest
 import sqlalchemy as sa
 
-from services.audit.system_events import SystemEvents
-from services.jobs.records import JOBS, JobState
+from services.audit.log import SystemEvents
 from services.jobs.results import REPORT
+from services.jobs.store import JOBS, JobState
 from services.missing_files import MissingFile, StoredFiles, StoredFilesWatch, count_by_kind, missing_files
 from services.recordings.store import RECORDINGS, UPLOAD, State
 from services.registry.database import Database

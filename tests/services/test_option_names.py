@@ -17,8 +17,7 @@ from operators.settings import JobOptions, LiveOptions, ReconstructOptions, Repl
 from operators.sources.registry import SOURCES
 from services.api import streams
 from services.cli import app as command_line
-from services.schemas.replays import ReplayRequest
-from services.schemas.streams import StreamRequest
+from services.schemas import ReplayRequest, StreamRequest
 from services.settings import SettingsInvalid, StreamSettings, load_settings
 from services.supervisor.worker import specs_of
 
@@ -67,7 +66,7 @@ def given(monkeypatch, tmp_path):
         monkeypatch.setattr("operators.applications.reconstruct.ReconstructSettings", keep)
         monkeypatch.setattr("services.cli.runs.live_settings", keep)
         monkeypatch.setattr(
-            "services.cli.batch.batch_command", lambda folder, out, workers, options, **_: keep(**options)
+            "services.cli.runs.batch_command", lambda folder, out, workers, options, **_: keep(**options)
         )
         where = ["--out", str(tmp_path / "out")] if command in ("replay", "reconstruct") else []
         monkeypatch.setattr(

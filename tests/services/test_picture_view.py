@@ -14,7 +14,7 @@ import torch
 
 from gsplat_core.choices import RENDERERS
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.models.model import TrainedBy
+from gsplat_core.models import TrainedBy
 from gsplat_core.rendering.renderer import PROGRESSIVE_SAMPLES, Capabilities, FinishedFrame, RendererOptions
 from services.cli.app import run
 from services.cli.exit_codes import BAD_INPUT

@@ -20,7 +20,7 @@ from services.jobs.results import Task
 from services.private_files import KEPT, FolderNotPrivate, make_state_private
 
 SERVICES = Path(services.__file__).parent
-OF_THE_USER = {"services/cli/gpu_check.py"}
+OF_THE_USER = {"services/cli/doctor.py"}
 """Programs of the command line, whose files are the user's own."""
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from services.client import Client
-from services.schemas.service import KeyView
+from services.schemas import KeyView
 from tests.system.browsers import chromium_by_playwright
 from tests.system.servers import serving
 

@@ -32,7 +32,7 @@ def dry_run(*arguments: str, **environment: str) -> str:
 def test_the_demo_builds_for_a_gpu_only_where_there_is_one():
     """`make` runs what is under `$(MAKE)` even in a dry run, so its line is read here."""
     recipe = (ROOT / "Makefile").read_text().partition("\ndemo:")[2].partition("\n\n")[0]
-    assert "set -e; if $(BIN)/python -m services.cli.gpu_check; then" in recipe
+    assert "set -e; if $(BIN)/python -m services.cli.doctor; then" in recipe
     assert "||" not in recipe  # a build that fails ends the demo
 
 

@@ -13,7 +13,6 @@ from typing import BinaryIO, Literal, get_args
 import torch
 from torch import Tensor
 
-from gsplat_core.argument_checks import require_shape
 from gsplat_core.errors import BundleError, ExportError, InvalidInput, InvalidSetting
 from gsplat_core.geometry.mesh import mesh_of
 from gsplat_core.io.bundle import save_bundle
@@ -31,7 +30,8 @@ from gsplat_core.io.files import PartialFile
 from gsplat_core.io.model_sources import static_model
 from gsplat_core.io.ply import ply_pieces
 from gsplat_core.io.spz import spz_pieces
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
+from gsplat_core.ops.arguments import require_shape
 from gsplat_core.scene.gaussians import Gaussians
 
 TIMES_FILE = "times.json"

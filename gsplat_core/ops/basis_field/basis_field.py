@@ -12,9 +12,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsplat_core.argument_checks import require_float32
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
+from gsplat_core.ops.arguments import require_float32
 from gsplat_core.ops.basis_field.plain_torch import BASIS_CHANNELS as CHANNELS
 from gsplat_core.ops.scalars import store_scalars_
 from gsplat_core.scene.gaussians import RAW_COLUMNS

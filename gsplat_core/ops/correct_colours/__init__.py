@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gsplat_core.argument_checks import check_max_alpha, require_tiled_splats
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled op
+from gsplat_core.ops.arguments import check_max_alpha, require_tiled_splats
 
 
 def correct_colours(

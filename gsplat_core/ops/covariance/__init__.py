@@ -7,8 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsplat_core.argument_checks import check_covariance_arguments, require_float32
 from gsplat_core.ops import native  # noqa: F401  registers the compiled op
+from gsplat_core.ops.arguments import check_covariance_arguments, require_float32
 
 
 def quat_scale_to_covar_preci(

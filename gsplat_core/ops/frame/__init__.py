@@ -14,10 +14,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gsplat_core.argument_checks import require_shape
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native
-from gsplat_core.ops.arguments import GAUSSIAN_TENSORS, View, check_inputs
+from gsplat_core.ops.arguments import GAUSSIAN_TENSORS, View, check_inputs, require_shape
 
 __all__ = [
     "GAUSSIAN_TENSORS",

@@ -12,10 +12,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from gsplat_core.argument_checks import require_shape
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
-from gsplat_core.ops.arguments import GAUSSIAN_TENSORS, View, check_inputs
+from gsplat_core.ops.arguments import GAUSSIAN_TENSORS, View, check_inputs, require_shape
 from gsplat_core.scene.gaussians import COLOUR, LOG_SCALE, OPACITY, POSITION, RAW_COLUMNS, ROTATION
 
 if TYPE_CHECKING:
@@ -60,7 +59,7 @@ class GaussianAdam(NamedTuple):
 class ColourCorrection(NamedTuple):
     """Colour update from image residuals in place of a gradient.
 
-    See `gsplat_core.training.steps.colour_correction`.
+    See `gsplat_core.training.steps.photometric`.
     """
 
     residuals: Tensor

@@ -8,7 +8,7 @@ namespace gsplat::frame {
 constexpr int kTensors = 5;  // parameter tensors: means, quats, log-scales, logit opacities, spherical harmonics
 
 // Colour corrections from image residuals in place of the colours' gradient
-// (gsplat_core/training/steps/colour_correction.py). If null, the colours have a gradient.
+// (gsplat_core/training/steps/photometric.py). If null, the colours have a gradient.
 struct ColourCorrection {
   // [H, W, 4]: tissue mask (0 or 1) times (target - rendered) in the colours; the mask itself in the last channel
   const float* residuals;

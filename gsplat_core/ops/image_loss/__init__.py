@@ -55,7 +55,7 @@ def image_loss(
         Loss, its terms, and the gradients of image and depth.
 
     Raises:
-        InvalidInput: for wrong shapes, dtypes or weights; `gsplat_core.reference.image_loss` accepts float64.
+        InvalidInput: for wrong shapes, dtypes or weights; `gsplat_core.reference.training` accepts float64.
     """
     if image.ndim != 3 or image.shape != target.shape or not 1 <= image.shape[2] <= MAX_CHANNELS:
         raise InvalidInput(

@@ -8,7 +8,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsplat_core.argument_checks import require_float32
 from gsplat_core.ops import native  # noqa: F401  registers the compiled op
 from gsplat_core.ops.arguments import (
     COMPENSATION_FLOOR,
@@ -17,9 +16,9 @@ from gsplat_core.ops.arguments import (
     check_projection_options,
     check_projection_tensors,
     check_sparse_gradient,
+    require_float32,
 )
-from gsplat_core.ops.packed_projection import project_visible
-from gsplat_core.ops.projection.intrinsics_gradient import intrinsics_gradient, world_covariances
+from gsplat_core.ops.packed_projection import intrinsics_gradient, project_visible, world_covariances
 from gsplat_core.scene.cameras import CAMERA_MODELS
 
 

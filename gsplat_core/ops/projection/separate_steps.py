@@ -8,9 +8,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gsplat_core.argument_checks import require_same_kind, require_shape, require_trailing
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.arguments import FOV_MARGIN
+from gsplat_core.ops.arguments import FOV_MARGIN, require_same_kind, require_shape, require_trailing
 
 FISHEYE_SERIES_BELOW = 0.01
 """Bound of tan θ below which the fisheye's quotients by r use their Taylor series."""

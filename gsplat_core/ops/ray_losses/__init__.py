@@ -11,9 +11,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsplat_core.argument_checks import require_float32, require_shape
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
+from gsplat_core.ops.arguments import require_float32, require_shape
 from gsplat_core.scene.cameras import CAMERA_MODELS
 
 
@@ -51,7 +51,7 @@ def ray_normal_loss(
 
     Returns:
         Mean of alpha - normals · n, [], over tissue where the depths have a unit normal n
-        (`gsplat_core.rendering.depth_maps.depth_normals`); 0 without compared pixels.
+        (`gsplat_core.rendering.surface.depth_normals`); 0 without compared pixels.
 
     Raises:
         InvalidInput: for wrong shapes, dtypes or camera models; `gsplat_core.reference.ray_normal_loss` accepts float64.

@@ -26,7 +26,7 @@ def ssim_map(image: Tensor, target: Tensor) -> Tensor:
         [H, W, C] in -1..1.
 
     Raises:
-        InvalidInput: if shapes differ or a dtype is not float32; `gsplat_core.reference.image_loss`
+        InvalidInput: if shapes differ or a dtype is not float32; `gsplat_core.reference.training`
             accepts any floating dtype.
     """
     if image.shape != target.shape or image.ndim != 3 or not 1 <= image.shape[2] <= MAX_CHANNELS:

@@ -12,9 +12,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsplat_core.argument_checks import require_shape, require_trailing
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
+from gsplat_core.ops.arguments import require_shape, require_trailing
 from gsplat_core.ops.compositing import MAX_ALPHA, MIN_ALPHA, blend_pairs, blended_pairs
 
 MAX_CHANNELS = 16

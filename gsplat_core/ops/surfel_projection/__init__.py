@@ -8,13 +8,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsplat_core.argument_checks import require_float32
 from gsplat_core.ops import native  # noqa: F401  registers the compiled op
 from gsplat_core.ops.arguments import (
     DenseSurfels,
     PackedSurfels,
     check_surfel_arguments,
     pack_surfels,
+    require_float32,
 )
 
 

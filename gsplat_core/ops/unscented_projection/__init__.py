@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from gsplat_core.argument_checks import require_kernels, require_same_kind, require_shape
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled op
 from gsplat_core.ops.arguments import (
@@ -23,6 +22,9 @@ from gsplat_core.ops.arguments import (
     MAX_RADIUS_PX,
     DenseProjection,
     check_projection_tensors,
+    require_kernels,
+    require_same_kind,
+    require_shape,
 )
 from gsplat_core.poses.rolling_shutter import RollingShutterType, Shutter
 from gsplat_core.scene.cameras import CAMERA_MODELS

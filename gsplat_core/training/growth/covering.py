@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsplat_core.deformation.field import DeformationField
-from gsplat_core.models.snapshots import SnapshotSlots
+from gsplat_core.models import SnapshotSlots
 from gsplat_core.rendering.alpha import AlphaRenderer
 from gsplat_core.rendering.rasterization import RenderOutput, render
 from gsplat_core.scene.cameras import Camera

@@ -1,17 +1,22 @@
-"""Interface of the loss terms of training, their selection by name, and their weighted sum."""
+"""Loss terms of training: their interface, selection by name and weighted sum, and the terms of colours, depth, classes and sparsity."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Protocol, runtime_checkable
 
+import torch
 from torch import Tensor
 
 from gsplat_core.choices import LOSSES
 from gsplat_core.errors import InvalidSetting
+from gsplat_core.ops.image_loss import image_loss
+from gsplat_core.rendering.rasterization import render
+from gsplat_core.rendering.surface import SEMANTICS
 from gsplat_core.scene.gaussians import Gaussians
+from gsplat_core.training.growth.unseen import depth_of
 from gsplat_core.training.losses.rays import EVERY, RenderedRays, rays_of
 from gsplat_core.training.observations import Observation
 
@@ -201,3 +206,108 @@ class WeightedLosses:
             (EVERY * weight) * loss.compare(rays) for loss, weight in self._of_rays if has_depth or not loss.needs_depth
         ]
         return sum(terms[1:], start=terms[0])
+
+
+class MeanOpacity:
+    """Mean opacity of all Gaussians."""
+
+    name: ClassVar[str] = "opacity"
+    default_weight: ClassVar[float] = 0.01
+
+    def __call__(self, scene: Gaussians, observation: Observation, context: LossContext) -> Tensor | None:
+        """Return the mean opacity of the scene's Gaussians, None without Gaussians; the observation is not read."""
+        return scene.opacities.mean() if scene.count else None
+
+
+class MeanScale:
+    """Mean standard deviation of all Gaussians, relative to the scene's distance from the camera of the first
+    observation.
+    """
+
+    name: ClassVar[str] = "scale"
+    default_weight: ClassVar[float] = 0.01
+
+    def __init__(self) -> None:
+        self._distance: Tensor | None = None
+
+    def __call__(self, scene: Gaussians, observation: Observation, context: LossContext) -> Tensor | None:
+        """Return the mean standard deviation of the scene's Gaussians, relative to the scene's median distance at the
+        first call; None without Gaussians.
+        """
+        if not scene.count:
+            return None
+        if self._distance is None:
+            self._distance = depth_of(scene.means.detach(), observation.camera).abs().median()
+        return scene.scales.mean() / self._distance
+
+
+class Photometric:
+    """L1 difference of the colours over tissue.
+
+    Every step computes this term by the fused path of `image_loss`, with the settings `ssim_weight` and
+    `squared_error`. This class evaluates it alone.
+    """
+
+    name: ClassVar[str] = "photometric"
+    default_weight: ClassVar[float] = 1.0
+
+    def __call__(self, scene: Gaussians, observation: Observation, context: LossContext) -> Tensor | None:
+        """Return the mean absolute colour difference between the rendered picture and the observation over tissue."""
+        output = render(scene, observation.camera, depth=False)
+        return image_loss(output.image, observation.image, observation.mask).loss
+
+
+class Depth:
+    """Mean absolute difference of inverse depths over tissue of known depth, in 1/mm.
+
+    Every step computes this term by the fused path of `image_loss`, with the setting `depth_weight`. This class
+    evaluates it alone.
+    """
+
+    name: ClassVar[str] = "depth"
+    default_weight: ClassVar[float] = 1.0
+
+    def __call__(self, scene: Gaussians, observation: Observation, context: LossContext) -> Tensor | None:
+        """Return the mean absolute difference of inverse depths; None for an observation without depth."""
+        if observation.depth is None:
+            return None
+        output = render(scene, observation.camera)
+        image = output.image.detach()
+        result = image_loss(image, observation.image, observation.mask, output.depth, observation.depth, 0.0, 1.0)
+        return result.loss - image_loss(image, observation.image, observation.mask).loss
+
+
+CLASSES = 4
+"""Number of classes of a scene; labels are 0 to 3."""
+
+
+class Semantics:
+    """Mean cross-entropy of the rendered classes over labelled pixels. Only frames with `Frame.labels` are compared.
+
+    A scene that is trained with this loss has the logits `Gaussians.extra["semantics"]` [N, 4]. They move with the
+    Gaussians, so labels on a few frames classify all frames. Colours and geometry receive no gradient. Pixels of tools are
+    compared, too, where they have a label.
+    """
+
+    name: ClassVar[str] = SEMANTICS
+    default_weight: ClassVar[float] = 1.0
+    rates: ClassVar[Mapping[str, float]] = {SEMANTICS: 0.05}
+
+    def extended(self, gaussians: Gaussians) -> Gaussians:
+        """Return the Gaussians with logits, 0 for those without."""
+        if SEMANTICS in gaussians.extra:
+            return gaussians
+        logits = gaussians.means.new_zeros(gaussians.count, CLASSES)
+        return replace(gaussians, extra={**gaussians.extra, SEMANTICS: logits})
+
+    def __call__(self, scene: Gaussians, observation: Observation, context: LossContext) -> Tensor | None:
+        """Return the mean cross-entropy over the observation's labelled pixels; None without labels."""
+        if observation.labels is None:
+            return None
+        geometry = replace(scene.detach(), extra={})
+        rays = rays_of(geometry, observation, scene.extra[SEMANTICS])
+        labels = rays.sampled(observation.labels).long()
+        known = labels < CLASSES
+        target = torch.where(known, labels, 0)
+        off = torch.nn.functional.cross_entropy(rays.values.permute(2, 0, 1)[None], target[None], reduction="none")[0]
+        return torch.where(known, off, 0).sum() / known.sum().clamp(min=1)

@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsplat_core.choices import MOTION_PRIORS
-from gsplat_core.deformation.continuation import Continuation, NewestState
-from gsplat_core.deformation.field import DeformationField, EditableMotion, displaced
+from gsplat_core.deformation.field import Continuation, DeformationField, EditableMotion, NewestState, displaced
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import LOG_SCALE, POSITION, RAW_COLUMNS, Gaussians

@@ -22,10 +22,10 @@ from torch import Tensor
 
 from gsplat_core.depth.maps import possible_depth
 from gsplat_core.depth.plane_fits import filled_depth
+from gsplat_core.machine import usable_cores
 from gsplat_core.ops.surface_motion import surface_path
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
-from gsplat_core.threads import usable_cores
 from gsplat_core.training.motion.image_motion import SMALLEST_PX, Flow, ImageMotion, Seen, SurfaceMotion, beside
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.steps.step import TrainingStep

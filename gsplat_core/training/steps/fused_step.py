@@ -37,9 +37,8 @@ from gsplat_core.scene.gaussians import COLOUR, LOG_SCALE, OPACITY, POSITION, RO
 from gsplat_core.training.losses.loss import WeightedLosses
 from gsplat_core.training.losses.rays import compared_rays
 from gsplat_core.training.observations import Observation
-from gsplat_core.training.steps.colour_correction import ResidualTarget
 from gsplat_core.training.steps.optimiser import FusedAdam
-from gsplat_core.training.steps.photometric import LEFT, RIGHT, LossWeights
+from gsplat_core.training.steps.photometric import LEFT, RIGHT, LossWeights, ResidualTarget
 from gsplat_core.transfers import copy_each
 
 GEOMETRY: Mapping[str, slice | int] = {

@@ -16,7 +16,7 @@ from gsplat_core.choices import RENDERERS, STRATEGIES
 from gsplat_core.deformation.field import DeformationField
 from gsplat_core.deformation.kinds import FieldRates, FieldTraining, kind_of
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.models.model import TrainedBy
+from gsplat_core.models import TrainedBy
 from gsplat_core.rendering.rasterization import RenderOutput, render
 from gsplat_core.rendering.renderer import TrainableRenderer
 from gsplat_core.scene.cameras import Camera

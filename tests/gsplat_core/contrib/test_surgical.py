@@ -10,7 +10,7 @@ import torch
 from gsplat_core import rasterization
 from gsplat_core.contrib import surgical
 from gsplat_core.contrib.dynamic import DeformNetwork, DynamicStrategy, HexPlaneField, hexplane_regularization
-from gsplat_core.reference.image_loss import ssim_map
+from gsplat_core.reference.training import ssim_map
 
 K = torch.tensor([[20.0, 0, 8], [0, 20, 6], [0, 0, 1]])
 

@@ -11,7 +11,7 @@ from gsplat_core import Camera, Model
 from gsplat_core.deformation import BasisField, BasisRates
 from gsplat_core.errors import InvalidInput
 from gsplat_core.io.bundle import load_bundle, save_bundle
-from gsplat_core.models.snapshots import SnapshotSlots
+from gsplat_core.models import SnapshotSlots
 from gsplat_core.scene.gaussians import RowMoves
 
 RATES = BasisRates(position=0.02, centers=5e-3, widths=5e-3)

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gsplat_core.deformation import BasisField
-from gsplat_core.deformation.continuation import Continuation
+from gsplat_core.deformation.field import Continuation
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.gaussians import Gaussians
 

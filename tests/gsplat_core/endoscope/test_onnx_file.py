@@ -7,8 +7,7 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from gsplat_core.endoscope import onnx
-from gsplat_core.endoscope.onnx import has_external_data, read_model
-from gsplat_core.endoscope.onnx_tools import OnnxToolFinder
+from gsplat_core.endoscope.onnx import OnnxToolFinder, has_external_data, read_model
 from gsplat_core.errors import InvalidSetting
 
 from .networks import external_weights, grey_network

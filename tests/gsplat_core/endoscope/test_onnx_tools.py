@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from gsplat_core.endoscope.onnx_tools import OnnxToolFinder
+from gsplat_core.endoscope.onnx import OnnxToolFinder
 from gsplat_core.errors import InvalidInput, InvalidSetting
 
 from .networks import GREY, conv, grey_network, write

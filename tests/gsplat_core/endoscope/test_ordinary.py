@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from gsplat_core.endoscope import ordinary
-from gsplat_core.endoscope.ordinary import OrdinaryPictures
+from gsplat_core.endoscope import sequence
+from gsplat_core.endoscope.sequence import OrdinaryPictures
 
 FRAME_NS = 33_000_000
 
@@ -25,7 +25,7 @@ def stream(rng):
 def judged(pictures, frame_ns=FRAME_NS, **constants):
     with pytest.MonkeyPatch.context() as patch:
         for name, value in constants.items():
-            patch.setattr(ordinary, name, value)
+            patch.setattr(sequence, name, value)
         follower = OrdinaryPictures()
         return [follower.is_ordinary(picture, k * frame_ns) for k, picture in enumerate(pictures)]
 
@@ -91,7 +91,7 @@ def test_a_closer_look_becomes_the_reference_after_two_tenths_of_a_second(monkey
     noisy = [np.full_like(small, level) for level in (100, 103)]
     count = iter(range(1000))
     monkeypatch.setattr(
-        ordinary, "_sampled", lambda image: (noisy[next(count) % 2], np.full(3, 100 + 0.001 * next(colours)), 5.0)
+        sequence, "_sampled", lambda image: (noisy[next(count) % 2], np.full(3, 100 + 0.001 * next(colours)), 5.0)
     )
     looked = []
     for k in range(40):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from gsplat_core.endoscope.ordinary import Turns
+from gsplat_core.endoscope.sequence import Turns
 
 LOOKS, EVERY_S = 6, 0.2
 

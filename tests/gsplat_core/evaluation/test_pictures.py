@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from gsplat_core.evaluation.protocols import PictureMaker
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.config import ReconstructorConfig

@@ -7,7 +7,7 @@ import torch
 
 from gsplat_core.deformation.field import DeformationField
 from gsplat_core.io.recordings.synthetic.scene import SyntheticScene
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
 
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from gsplat_core.experimental.learned_prior import LearnedPrior
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.reconstructor import Reconstructor

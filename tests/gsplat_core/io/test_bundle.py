@@ -12,7 +12,7 @@ from gsplat_core.deformation import new_field
 from gsplat_core.errors import BundleCorrupt, BundleError, InvalidInput
 from gsplat_core.io import bundle, files
 from gsplat_core.io.bundle import load_bundle, save_bundle
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
 from gsplat_core.scene.depth_source import DepthError, DepthSource

@@ -7,7 +7,7 @@ import torch
 
 from gsplat_core.deformation import new_field
 from gsplat_core.errors import InvalidInput
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
 from gsplat_core.scene.cameras import Camera
 
 CAMERA = Camera.from_focal(40.0, 32, 24)

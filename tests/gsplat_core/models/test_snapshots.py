@@ -10,7 +10,7 @@ import torch
 
 from gsplat_core import Camera, InvalidInput, Model, render
 from gsplat_core.deformation import BasisField, DeformationField, new_field
-from gsplat_core.models.snapshots import ROW_STEP, SnapshotSlots
+from gsplat_core.models import ROW_STEP, SnapshotSlots
 
 CAMERA = Camera.from_focal(40.0, 32, 24)
 WINDOW_S = (0.0, 1.0)

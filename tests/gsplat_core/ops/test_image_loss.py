@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.image_loss import image_loss
-from gsplat_core.reference.image_loss import image_loss as reference_image_loss
+from gsplat_core.reference.training import image_loss as reference_image_loss
 
 SHAPES = [(1, 1, 3), (1, 37, 3), (5, 7, 3), (33, 65, 3), (18, 270, 3), (10, 11, 1)]
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.reference.image_loss import inverse_depth_l1, masked_l1, masked_squared_error, masked_ssim_loss
+from gsplat_core.reference.training import inverse_depth_l1, masked_l1, masked_squared_error, masked_ssim_loss
 
 
 def images(height=9, width=13, dtype=torch.float64, seed=0):

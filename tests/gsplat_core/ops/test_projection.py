@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gsplat_core import fully_fused_projection, reference
-from gsplat_core.ops.projection.intrinsics_gradient import intrinsics_gradient
+from gsplat_core.ops.packed_projection import intrinsics_gradient
 
 MODELS = ("pinhole", "ortho", "fisheye")
 

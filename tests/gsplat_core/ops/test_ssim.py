@@ -5,8 +5,8 @@ import torch
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.ssim import fused_ssim, ssim_map
-from gsplat_core.reference.image_loss import gaussian_window
-from gsplat_core.reference.image_loss import ssim_map as reference_ssim_map
+from gsplat_core.reference.training import gaussian_window
+from gsplat_core.reference.training import ssim_map as reference_ssim_map
 
 # 700 x 3 is wider than one strip; 49 and 100 rows end inside a band.
 SHAPES = [

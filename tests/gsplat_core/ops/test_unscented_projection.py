@@ -73,7 +73,7 @@ def test_moments_are_those_of_projected_samples(coefficients):
     generator = torch.Generator().manual_seed(1)
     noise = torch.randn(8_000, 3, generator=generator, dtype=torch.float64)
     noise = torch.cat([noise, -noise])  # the sampled mean is exact to first order
-    from gsplat_core.reference.covariance import quat_scale_to_covar_preci
+    from gsplat_core.reference.projection import quat_scale_to_covar_preci
 
     covars, _ = quat_scale_to_covar_preci(given["quats"], given["scales"])
     for i in range(2):

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from gsplat_core import Camera, Gaussians, InvalidInput, reference
-from gsplat_core.models.model import Model
-from operators.remembered import share_of
+from gsplat_core.models import Model
+from operators.display import share_of
 
 CAMERA = Camera.from_focal(40.0, 37, 29)
 

@@ -11,8 +11,14 @@ from gsplat_core import RENDERERS, Camera, InvalidInput, Model, SnapshotSlots, n
 from gsplat_core.deformation import new_field
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.rendering.flow import render_flow
-from gsplat_core.rendering.outputs import FLOW_OUTPUTS, FLOW_STEP_S
-from gsplat_core.rendering.renderer import Capabilities, FinishedFrame, RendererOptions, checked_outputs
+from gsplat_core.rendering.renderer import (
+    FLOW_OUTPUTS,
+    FLOW_STEP_S,
+    Capabilities,
+    FinishedFrame,
+    RendererOptions,
+    checked_outputs,
+)
 
 CAMERA = Camera.from_focal(40.0, 32, 24)
 WINDOW_S = (1.0, 3.0)

@@ -10,7 +10,7 @@ import torch
 
 from gsplat_core.deformation import new_field
 from gsplat_core.errors import InvalidInput, InvalidSetting
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
 from gsplat_core.ops.stochastic import new_sums, picture_of, sample_splats
 from gsplat_core.rendering.renderer import RendererOptions, new_renderer
 from gsplat_core.rendering.stochastic import dequantised, morton_codes, prepared_splats, quantised_splats, raw_splats

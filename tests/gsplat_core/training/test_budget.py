@@ -11,9 +11,9 @@ import pytest
 import torch
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.training.budget import Budget, Spending, StepsInFlight
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.reconstructor import Reconstructor
+from gsplat_core.training.schedule import Budget, Spending, StepsInFlight
 from gsplat_core.training.steps.step import TrainingStep
 
 CONFIG = ReconstructorConfig(gaussians=200, max_gaussians=400, first_frame_steps=6, steps_per_frame=8)

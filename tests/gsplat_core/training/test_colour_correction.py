@@ -11,8 +11,13 @@ from gsplat_core import reference
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import SH_C0
 from gsplat_core.training.observations import Observation
-from gsplat_core.training.steps.colour_correction import LEAST_WEIGHT_PX, ResidualTarget, colour_correction
-from gsplat_core.training.steps.photometric import LossWeights, loss_and_gradients
+from gsplat_core.training.steps.photometric import (
+    LEAST_WEIGHT_PX,
+    LossWeights,
+    ResidualTarget,
+    colour_correction,
+    loss_and_gradients,
+)
 
 SQUARED = LossWeights(squared=True)
 

@@ -10,7 +10,7 @@ import torch
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
-from gsplat_core.training.steps.colour_correction import colour_change
+from gsplat_core.training.steps.photometric import colour_change
 
 CAMERA = Camera.from_focal(60.0, 48, 32)
 

@@ -10,14 +10,13 @@ import torch
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.training.budget import Budget
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.growth.covering import NewTissue, entered, has_moved
 from gsplat_core.training.growth.unseen import around_cells
 from gsplat_core.training.metrics import psnr_tissue_db
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.reconstructor import Reconstructor
-from gsplat_core.training.schedule import LiveTraining
+from gsplat_core.training.schedule import Budget, LiveTraining
 
 WIDTH, HEIGHT, FOCAL, DEPTH_MM = 48, 40, 50.0, 60.0
 CAMERA = Camera.from_focal(FOCAL, WIDTH, HEIGHT)

@@ -8,9 +8,8 @@ import pytest
 import torch
 
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.training.budget import Budget
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.schedule import LiveTraining, NewestFirstSchedule
+from gsplat_core.training.schedule import Budget, LiveTraining, NewestFirstSchedule
 
 
 def test_rates_fall_from_2_to_a_half_within_thirty_steps_in_equal_ratios():

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidInput, InvalidSetting
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.config import ReconstructorConfig

@@ -12,7 +12,7 @@ from gsplat_core.errors import ExportError, InvalidSetting
 from gsplat_core.io.bundle import load_bundle, save_bundle
 from gsplat_core.io.exports.export import export_model
 from gsplat_core.io.exports.formats import FORMATS, ExportWish
-from gsplat_core.models.model import TrainedBy
+from gsplat_core.models import TrainedBy
 from gsplat_core.rendering.weighted_sum import OPACITY
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.reconstructor import Reconstructor

@@ -12,7 +12,6 @@ import torch
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians, RowMoves
-from gsplat_core.training.budget import Budget
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.growth import covering
 from gsplat_core.training.growth.covering import OutOfView
@@ -20,8 +19,8 @@ from gsplat_core.training.growth.unseen import Archive, LastSeen, pixels_of
 from gsplat_core.training.metrics import psnr_tissue_db
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.reconstructor import Reconstructor
-from gsplat_core.training.schedule import LiveTraining
-from operators.remembered import share_of
+from gsplat_core.training.schedule import Budget, LiveTraining
+from operators.display import share_of
 
 WIDTH, HEIGHT = 48, 40
 FOCAL = 50.0

@@ -11,13 +11,12 @@ import torch
 
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
-from gsplat_core.training.budget import Budget
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.growth.initialisation import gaussians_from_frame
 from gsplat_core.training.metrics import psnr_tissue_db
-from gsplat_core.training.places import LEAST_SHARE, MOST_PLACES, LeftScenes, Places, Structure, structure_of
 from gsplat_core.training.reconstructor import Reconstructor
-from gsplat_core.training.schedule import LiveTraining
+from gsplat_core.training.schedule import Budget, LiveTraining
+from gsplat_core.training.upkeep import LEAST_SHARE, MOST_PLACES, LeftScenes, Places, Structure, structure_of
 
 WIDTH, HEIGHT = 64, 48
 CAMERA = Camera.from_focal(60.0, WIDTH, HEIGHT)

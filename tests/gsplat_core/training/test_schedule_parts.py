@@ -9,9 +9,8 @@ from typing import Any
 import pytest
 import torch
 
-from gsplat_core.training.budget import Budget
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.schedule import JUMP_EXTRA, LiveTraining, NewestFirstSchedule, WindowSchedule
+from gsplat_core.training.schedule import JUMP_EXTRA, Budget, LiveTraining, NewestFirstSchedule, WindowSchedule
 
 CPU = torch.device("cpu")
 

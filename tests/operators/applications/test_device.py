@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gsplat_core.ops import native
-from operators.applications.device import check_device, scheduler_for, seeded
+from operators.applications.session import check_device, scheduler_for, seeded
 from operators.errors import DeviceMissing
 from operators.graph import Application, GreedyScheduler, MultiThreadScheduler
 

@@ -10,7 +10,7 @@ import pytest
 
 from gsplat_core.io.bundle import load_bundle
 from gsplat_core.scene.frames import Frame, FrameStatus
-from gsplat_core.training.budget import Budget
+from gsplat_core.training.schedule import Budget
 from operators import display
 from operators.applications import live as live_module
 from operators.applications.live import live

@@ -188,7 +188,7 @@ def test_the_next_frame_is_predicted_as_the_causal_protocol_does(settings):
     """Compare with the causal protocol, which renders through a separate path."""
     from gsplat_core.evaluation.protocols import PictureMaker, evaluate_causal
     from gsplat_core.io.recordings import open_recording
-    from operators.applications.device import seeded
+    from operators.applications.session import seeded
 
     settings = replace(settings, steps_per_frame=3)
     outcome = replay(settings)

@@ -13,7 +13,7 @@ from typing import Any
 from services.api.problems import Conflicting, Missing, Unprocessable
 from services.api.state import Parts
 from services.display import EncodedPicture
-from services.schemas.streams import StreamView
+from services.schemas import StreamView
 from services.settings import StreamSettings
 
 

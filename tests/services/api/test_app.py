@@ -17,7 +17,7 @@ from services.api.pages import SWAGGER_FILES, SWAGGER_UI
 from services.api.problems import PROBLEM_JSON, Problem
 from services.api.state import Parts
 from services.auth.roles import Role
-from services.schemas.service import CheckResult
+from services.schemas import CheckResult
 
 ROOT = Path(__file__).resolve().parents[3]
 PUBLIC = {"/livez", "/readyz", "/openapi.json", "/docs", "/docs/{file}"}

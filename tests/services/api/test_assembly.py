@@ -8,10 +8,10 @@ import tempfile
 import pytest
 
 from services.api.assembly import assembled, event_receiver
-from services.audit.system_events import SystemEvents
-from services.schemas.streams import StreamView
+from services.api.observability import StreamMeasures
+from services.audit.log import SystemEvents
+from services.schemas import StreamView
 from services.settings import ServiceSettings
-from services.supervisor.metrics import StreamMeasures
 from services.supervisor.process import StreamEvent
 from services.supervisor.stream import SupervisedStreams
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from services.api.certificate import ServerCertificate, expiry_of
-from services.audit.system_events import SystemEvents
+from services.audit.log import SystemEvents
 
 x509 = pytest.importorskip("cryptography.x509", reason="cryptography comes with the extra oidc")
 from cryptography.hazmat.primitives import hashes, serialization  # noqa: E402

@@ -172,7 +172,7 @@ def test_a_head_has_a_time_whatever_trickles_in(served):
 
 
 def test_the_probe_says_what_the_service_says(served):
-    from services.schemas.service import CheckResult
+    from services.schemas import CheckResult
 
     async def broken():
         return CheckResult(False, "no database")

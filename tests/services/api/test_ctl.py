@@ -23,8 +23,7 @@ from services.cli.ctl import moment, stream_row
 from services.cli.exit_codes import BAD_INPUT, OK
 from services.cli.terminal import table
 from services.client import Client
-from services.schemas.service import CheckResult
-from services.schemas.streams import StreamView
+from services.schemas import CheckResult, StreamView
 from services.settings import ServiceSettings
 
 PROCESSES = {

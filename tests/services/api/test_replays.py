@@ -13,10 +13,9 @@ from services.api.assembly import ERRORS
 from services.api.problems import Conflicting, Missing
 from services.api.replays import REPORT_POLICY
 from services.errors import NotFound
-from services.jobs.records import JobProgress, JobState
 from services.jobs.replays import Replays
 from services.jobs.results import Results
-from services.jobs.store import Claims, JobStore
+from services.jobs.store import Claims, JobProgress, JobState, JobStore
 
 REPLAYS = "/v1/replays"
 

@@ -7,8 +7,8 @@ import time
 
 import pytest
 
-from services.audit import AuditLog, AuditUnwritable, system_events
-from services.audit.system_events import SystemEvents
+from services.audit import AuditLog, AuditUnwritable, log
+from services.audit.log import SystemEvents
 
 
 @pytest.fixture
@@ -38,7 +38,7 @@ def test_events_are_written_while_the_server_runs_and_what_is_left_when_it_ends(
 
 
 def test_more_than_may_wait_are_counted(audit, monkeypatch):
-    monkeypatch.setattr(system_events, "MOST_WAITING", 20)
+    monkeypatch.setattr(log, "MOST_WAITING", 20)
 
     async def run() -> None:
         events = SystemEvents()

@@ -5,18 +5,18 @@ from __future__ import annotations
 import pytest
 
 from gsplat_core.ops import native
-from services.cli import doctor, gpu_check
+from services.cli import doctor
 
-GPU = gpu_check.Graphics(True, "NVIDIA H200 (compute capability 9.0)")
-NONE = gpu_check.Graphics(False, "none: this machine has no NVIDIA driver", "not needed")
+GPU = doctor.Graphics(True, "NVIDIA H200 (compute capability 9.0)")
+NONE = doctor.Graphics(False, "none: this machine has no NVIDIA driver", "not needed")
 
 
 @pytest.fixture
 def said(monkeypatch):
     """Doctor's lines by name for a machine, what is missing of the kernels, and what the GPU says of them."""
 
-    def look(machine: gpu_check.Graphics, missing: str | None, refusal: str | None = None) -> dict[str, doctor.Check]:
-        monkeypatch.setattr(gpu_check, "look", lambda: machine)
+    def look(machine: doctor.Graphics, missing: str | None, refusal: str | None = None) -> dict[str, doctor.Check]:
+        monkeypatch.setattr(doctor, "look", lambda: machine)
         monkeypatch.setattr(native, "CUDA_MISSING", missing)
         monkeypatch.setattr(native, "cuda_build", lambda: "nvcc 13.0 for 8.0, 9.0")
         monkeypatch.setattr(native, "cuda_refusal", lambda: refusal)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from services.cli import gpu_check
+from services.cli import doctor
 
 
 @pytest.fixture
@@ -17,7 +17,7 @@ def machine(monkeypatch, tmp_path):
             path = tmp_path / name
             if name in files.split():
                 path.touch()
-            monkeypatch.setattr(gpu_check, name, path)
+            monkeypatch.setattr(doctor, name, path)
         monkeypatch.setattr(torch.version, "cuda", cuda)
         monkeypatch.setattr(torch.cuda, "is_available", lambda: bool(capabilities))
         monkeypatch.setattr(torch.cuda, "device_count", lambda: len(capabilities))
@@ -29,17 +29,15 @@ def machine(monkeypatch, tmp_path):
 
 def test_a_gpu_that_torch_sees_is_used(machine, capsys):
     machine("DRIVER DEVICE", ((9, 0), (8, 6)))
-    assert gpu_check.look() == gpu_check.Graphics(
-        True, "GPU 0 (compute capability 9.0), GPU 1 (compute capability 8.6)"
-    )
-    assert gpu_check.main() == 0
+    assert doctor.look() == doctor.Graphics(True, "GPU 0 (compute capability 9.0), GPU 1 (compute capability 8.6)")
+    assert doctor.main() == 0
     assert "GPU 0" in capsys.readouterr().out
 
 
 def test_a_gpu_that_is_too_old_is_named(machine):
     machine("DRIVER DEVICE", ((7, 5),))
-    assert not gpu_check.look().usable
-    assert "7.5" in gpu_check.look().found and "8.0" in gpu_check.look().advice
+    assert not doctor.look().usable
+    assert "7.5" in doctor.look().found and "8.0" in doctor.look().advice
 
 
 @pytest.mark.parametrize(
@@ -52,9 +50,9 @@ def test_a_gpu_that_is_too_old_is_named(machine):
 )
 def test_without_a_gpu_the_reason_is_given(machine, capsys, files, cuda, found, advice):
     machine(files, cuda=cuda)
-    seen = gpu_check.look()
+    seen = doctor.look()
     assert not seen.usable and found in seen.found and advice in seen.advice
-    assert gpu_check.main() == 1
+    assert doctor.main() == 1
     assert found in capsys.readouterr().out
 
 
@@ -66,6 +64,6 @@ def test_a_gpu_that_torch_cannot_start_is_told_with_what_torch_says(machine, mon
         raise RuntimeError("The NVIDIA driver on your system is too old (found version 12040). Please update.\nMore")
 
     monkeypatch.setattr(torch.cuda, "init", refuse)
-    seen = gpu_check.look()
+    seen = doctor.look()
     assert not seen.usable and "too old (found version 12040)" in seen.found and "More" not in seen.found
     assert "CUDA 13.0 or later" in seen.advice

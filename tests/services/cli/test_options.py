@@ -46,7 +46,7 @@ def inputs(tmp_path_factory):
     import torch
 
     from gsplat_core.io.recordings import synthesize
-    from gsplat_core.models.model import Model
+    from gsplat_core.models import Model
     from gsplat_core.scene.cameras import Camera
     from gsplat_core.scene.gaussians import Gaussians
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from operators.applications.progress import Progress
+from operators.applications.session import Progress
 from services.cli.terminal import ProgressPrinter
 
 

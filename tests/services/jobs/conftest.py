@@ -10,9 +10,8 @@ import pytest
 
 from gsplat_core.io.recordings import synthesize
 from services.jobs.pool import JobPool, PoolSettings
-from services.jobs.records import JobProgress, JobState
 from services.jobs.results import Results, Task
-from services.jobs.store import JobStore
+from services.jobs.store import JobProgress, JobState, JobStore
 
 
 @pytest.fixture(scope="session")

@@ -14,8 +14,7 @@ from operators.output_folder import OutputFolder
 from operators.settings import CallerJobOptions, JobOptions
 from services.errors import StoreUnavailable
 from services.jobs.batch import Batch, recordings_in
-from services.jobs.records import JOBS, JobState
-from services.jobs.store import JobStore
+from services.jobs.store import JOBS, JobState, JobStore
 
 
 @pytest.fixture

@@ -7,8 +7,7 @@ import threading
 import pytest
 
 from services.jobs import store as module
-from services.jobs.records import JobProgress, JobState, NewJob
-from services.jobs.store import Claims
+from services.jobs.store import Claims, JobProgress, JobState, NewJob
 
 NOTHING = JobProgress(0, None, None)
 

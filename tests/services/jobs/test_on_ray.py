@@ -9,8 +9,8 @@ import pytest
 
 from services.errors import StoreUnavailable
 from services.jobs.pool import JobPool, PoolSettings
-from services.jobs.records import JobState, NewJob
 from services.jobs.results import RUNNING, Results
+from services.jobs.store import JobState, NewJob
 
 pytestmark = pytest.mark.slow
 

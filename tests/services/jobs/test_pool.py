@@ -8,8 +8,8 @@ import pytest
 
 from services.errors import StoreUnavailable
 from services.jobs.pool import JobPool
-from services.jobs.records import JobState, NewJob
 from services.jobs.results import RUNNING
+from services.jobs.store import JobState, NewJob
 
 
 def submitted(store, count=1):

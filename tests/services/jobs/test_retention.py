@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import asyncio
 
-from services.jobs.records import NewJob
 from services.jobs.replays import DAY_S, RecordingRetention, ReplayRetention, Replays
 from services.jobs.results import Results
-from services.jobs.store import JobStore
+from services.jobs.store import JobStore, NewJob
 from services.recordings.store import Expired
 
 

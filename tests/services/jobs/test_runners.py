@@ -17,12 +17,12 @@ import pytest
 import torch
 
 from gsplat_core.errors import InvalidSetting
-from operators.applications.progress import Progress
+from operators.applications.session import Progress
 from services.jobs import runners, work
 from services.jobs.pool import new_runner
-from services.jobs.records import JobProgress, JobState
 from services.jobs.results import Task
 from services.jobs.runners import Forks
+from services.jobs.store import JobProgress, JobState
 
 
 @pytest.fixture

@@ -11,8 +11,7 @@ from alembic.runtime.migration import MigrationContext
 
 from operators.settings import JobOptions
 from services.errors import Conflict, NotFound, Rejected
-from services.jobs.records import METADATA, SCHEMA, JobState, NewJob
-from services.jobs.store import DAY_S, MOST_AT_ONCE, Claims, uses_recording
+from services.jobs.store import DAY_S, METADATA, MOST_AT_ONCE, SCHEMA, Claims, JobState, NewJob, uses_recording
 from services.registry import records
 
 

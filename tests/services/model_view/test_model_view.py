@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
 from services import model_view
 from services.model_view import DISTANCE, ModelView, rotation_matrices, scene_to_view
 from tests.gsplat_core.io.exports.test_exports import random_model

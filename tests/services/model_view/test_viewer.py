@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from gsplat_core.io.bundle import save_bundle
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
 from gsplat_core.ops.covariance import quat_scale_to_covar_preci
 from services.cli.view import bundle_in
 from services.errors import Rejected

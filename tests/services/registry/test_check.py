@@ -16,7 +16,7 @@ import torch
 
 from gsplat_core.io import model_files
 from gsplat_core.io.bundle import load_bundle, save_bundle
-from gsplat_core.models.model import TrainedBy
+from gsplat_core.models import TrainedBy
 from gsplat_core.rendering.alpha import AlphaRenderer
 from gsplat_core.rendering.weighted_sum import WeightedSumRenderer
 from services.errors import CheckFailed

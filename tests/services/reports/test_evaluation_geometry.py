@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from services.reports.evaluation_rows import geometry_lines, geometry_rows, geometry_section, scale_sentence
+from services.reports.evaluation_html import geometry_lines, geometry_rows, geometry_section, scale_sentence
 
 NOTHING: dict[str, Any] = {
     "frames": 1200, "depth": None, "normals": None, "views": [], "scaled_views": [], "tracking": None, "flow": None,

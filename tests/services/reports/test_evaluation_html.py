@@ -8,8 +8,7 @@ import pytest
 from pydantic import ValidationError
 
 from services.cli.evaluate import table
-from services.reports.evaluation_html import render_evaluation, table_section, write_evaluation_html
-from services.reports.evaluation_rows import at_age
+from services.reports.evaluation_html import at_age, render_evaluation, table_section, write_evaluation_html
 from services.reports.evaluation_schema import EvaluationReport
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 from services.reports.figures import NOTHING_THERE, hidden_pictures

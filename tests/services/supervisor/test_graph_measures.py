@@ -8,10 +8,10 @@ import numpy as np
 from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.registry import Collector
 
+from services.api.observability import GraphFamilies, StreamMeasures
 from services.bus.messages import BOUNDS_S, Durations
 from services.display import KINDS
 from services.supervisor.launcher import cause_of
-from services.supervisor.metrics import GraphFamilies, StreamMeasures
 from services.supervisor.process import StreamEvent
 
 

@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_core.models.model import Model
-from gsplat_core.models.snapshots import SnapshotSlots
+from gsplat_core.models import Model, SnapshotSlots
 from gsplat_core.scene.cameras import Orbit
+from operators.display import COVERED
 from operators.layer_pictures import UNOBSERVED, UNOBSERVED_LINE, DepthColours
 from operators.messages import PictureState
 from operators.rasterize import displayed
-from operators.remembered import COVERED
 from services.supervisor.screen import LayerDrawing, LayerScene, label
 from tests.services.supervisor.test_model_show import uniform
 

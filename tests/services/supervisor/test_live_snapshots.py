@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from gsplat_core.io.bundle import load_bundle
-from gsplat_core.models.snapshots import SnapshotSlots
+from gsplat_core.models import SnapshotSlots
 from operators.reconstruct import ModelRequest
 from services.errors import BadMessage, CommandRefused
 from services.supervisor import engine

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from gsplat_core.io.bundle import save_bundle
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians

@@ -10,7 +10,7 @@ import torch
 import zmq.asyncio
 
 from gsplat_core.io.bundle import save_bundle
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 from services.bus.pictures import picture_from, subscribe

@@ -7,10 +7,10 @@ import logging
 import pytest
 
 from services.api.assembly import event_receiver
-from services.audit.system_events import SystemEvents
+from services.api.observability import StreamMeasures
+from services.audit.log import SystemEvents
 from services.supervisor import process as processes
 from services.supervisor.launcher import Direct, last_words
-from services.supervisor.metrics import StreamMeasures
 from services.supervisor.process import SOURCE_GONE, ManagedProcess
 from services.supervisor.worker import ProcessSpec, SourceSpec
 

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings.synthetic.light import USUAL_LAMP, Air, Lamp, Particles
-from gsplat_core.io.recordings.synthetic.paths import USUAL_SWAY, Sway, looking, rigid
-from gsplat_core.io.recordings.synthetic.random_scene import RandomScene
+from gsplat_core.io.recordings.synthetic.random_scene import USUAL_SWAY, RandomScene, Sway, looking, rigid
 from gsplat_core.io.recordings.synthetic.renderer import Eye, render_eye
 from gsplat_core.io.recordings.synthetic.sensor import RadialLens
 from gsplat_core.io.recordings.synthetic.tissue import NO_TUG, TISSUE_DISTANCE_MM, Colon, Tissue, Tug

@@ -45,7 +45,7 @@ from gsplat_core.io.recordings.synthetic.scene import CLEAR, Extras, SyntheticSc
 from gsplat_core.io.recordings.synthetic.sensor import RadialLens
 from gsplat_core.io.recordings.synthetic.tissue import TISSUE_DISTANCE_MM
 from gsplat_core.io.recordings.truth import VIEWS_FILE, VIEWS_FORMAT, VIEWS_VERSION
-from gsplat_core.memory import available_bytes, in_gib
+from gsplat_core.machine import available_bytes, in_gib
 from gsplat_core.scene.cameras import Camera
 
 HIDDEN_MM = 0.5

@@ -15,7 +15,7 @@ from gsplat_core.errors import ExportError, InvalidSetting
 from gsplat_core.io.exports.export import export_model
 from gsplat_core.io.exports.formats import FORMATS, ExportWish, format_named, format_of
 from gsplat_core.io.ply import load_ply
-from gsplat_core.models.model import Model
+from gsplat_core.models import Model
 from gsplat_core.ops.spherical_harmonics import spherical_harmonics
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_origin import DEPTH_ORIGINS

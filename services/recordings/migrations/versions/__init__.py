@@ -1,1 +1,0 @@
-"""Migrations, one file per schema change, in ascending order."""
