@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import cv2
 import numpy as np
 import pytest
@@ -275,3 +277,73 @@ def test_an_ellipse_needs_seven_tenths_of_the_outline(dented, is_round):
     hull = np.stack([160 + 100 * np.cos(angles), 128 + 100 * np.sin(angles)], 1)
     found = field_of_view._as_ellipse(hull, (HEIGHT, WIDTH))
     assert (found is hull) != is_round
+
+
+def box(left, right, top=0.0, bottom=1.0):
+    """Return an outline in shares of the picture."""
+    return np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
+
+
+def decided(monkeypatch, outlines):
+    """Return the columns of the mask after each window of one frame in which an outline is found."""
+    monkeypatch.setattr(field_of_view, "WINDOW_FRAMES", 1)
+    monkeypatch.setattr(field_of_view, "MARGIN_SHARE", 0.0)
+    left, view, found = list(outlines), FieldOfView(), []
+    monkeypatch.setattr(field_of_view, "find_outline", lambda *_: left.pop(0))
+    monkeypatch.setattr(view, "_shows_more", lambda grey: False)
+    for _ in outlines:
+        mask = view.observe(np.full((80, 160, 3), 90, np.uint8))
+        columns = np.arange(160) if mask is None else np.flatnonzero(mask[40])
+        found.append((columns[0], columns[-1]))
+    return found, view
+
+
+WIDE, NARROW, OTHER = box(0.1, 0.9), box(0.2, 0.8), box(0.3, 0.7)
+
+
+@pytest.mark.parametrize(
+    ("outlines", "taken"),
+    [
+        ([WIDE, NARROW, NARROW, NARROW], [WIDE, WIDE, WIDE, NARROW]),
+        ([WIDE, NARROW, NARROW, WIDE, NARROW, NARROW, NARROW], [WIDE] * 6 + [NARROW]),
+        ([WIDE, NARROW, OTHER, NARROW, OTHER, OTHER, OTHER], [WIDE] * 6 + [OTHER]),
+        ([NARROW, WIDE, NARROW], [NARROW, WIDE, WIDE]),
+        ([NARROW, box(0.1, 0.6)], [NARROW, box(0.1, 0.8)]),
+        ([WIDE, None, None, None], [WIDE, WIDE, WIDE, None]),
+        ([None, WIDE, WIDE, WIDE], [None, None, None, WIDE]),
+        ([WIDE, box(0.1, 0.894), box(0.1, 0.888)], [WIDE] * 3),
+        ([WIDE, box(0.1, 0.902)], [WIDE] * 2),
+    ],
+    ids=["smaller", "interrupted", "inconsistent", "larger", "joined", "gone", "appears", "nearly the same", "hardly larger"],
+)  # fmt: skip
+def test_a_field_grows_at_once_and_shrinks_after_three_consistent_windows(monkeypatch, outlines, taken):
+    found, view = decided(monkeypatch, outlines)
+    expected = [(0, 159) if each is None else (round(160 * each[0, 0]), round(160 * each[1, 0]) - 1) for each in taken]
+    assert np.abs(np.array(found) - expected).max() <= 1
+    changes = 1 + sum(before is not after for before, after in itertools.pairwise(taken))
+    assert view.changes == changes
+
+
+@pytest.mark.parametrize(
+    ("level", "share", "is_more"), [(52, 0.5, False), (53, 0.5, True), (200, 0.24, False), (200, 0.26, True)]
+)
+def test_a_picture_that_is_lit_outside_shows_more(level, share, is_more):
+    view = FieldOfView()
+    view._reduced = np.zeros((10, 100), bool)
+    view._reduced[5:] = True
+    grey = np.full((10, 100), 5, np.uint8)
+    grey[:5, : round(100 * share)] = level
+    assert view._shows_more(grey) == is_more
+    view._reduced[:] = True
+    assert not view._shows_more(grey)
+
+
+@pytest.mark.parametrize(("size", "margin"), [((160, 320), 3), ((40, 45), 0), ((60, 80), 1)])
+def test_a_hundredth_of_the_longer_side_is_left_out_except_at_the_pictures_edge(monkeypatch, size, margin):
+    view = FieldOfView()
+    monkeypatch.setattr(field_of_view, "find_outline", lambda *_: box(0.25, 1.0))
+    mask = view.observe(np.full((*size, 3), 90, np.uint8))
+    expected = np.zeros(size, np.uint8)
+    expected[:, round(0.25 * size[1]) + margin :] = 1
+    assert np.abs(mask.astype(int) - expected).sum() <= size[0] and mask[:, -1].all() and mask[[0, -1], -5:].all()
+    assert not mask[:, : round(0.25 * size[1]) + margin - 1].any()
