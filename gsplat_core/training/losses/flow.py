@@ -63,7 +63,7 @@ class FlowLoss:
         if len(self._neighbours) != scene.count or turn % SEARCH_EVERY == 0:
             self._neighbours = nearest_splats(first)
         rendered = render_flow(first, scene, before, after, neighbours=self._neighbours)
-        known = target.isfinite().all(-1) & rendered.observed
+        known = target[..., 0].isfinite() & rendered.observed  # both components are NaN where flow is unreliable
         off = torch.where(known[..., None], rendered.flow - target, 0)
         lengths = (off.square().sum(-1) + SMOOTH_PX**2).sqrt() - SMOOTH_PX
         return lengths.sum() / known.sum().clamp(min=1)

@@ -317,3 +317,17 @@ def test_only_offline_training_knows_all_frames(monkeypatch, make_frame, camera)
     Reconstructor(config, camera).fit([frame], 1)
     Reconstructor(config, camera).observe(frame)
     assert weights == pytest.approx([10, 1])
+
+
+def test_queued_steps_are_checked_before_the_scene_is_read_or_left(make_frame, camera, monkeypatch):
+    """On a GPU they may have to be repeated."""
+    learning = learn([make_frame(0)], camera)
+    step, settled = learning._step, []
+    monkeypatch.setattr(learning._schedule, "settle", settled.append)
+    calls = [
+        learning.snapshot, lambda: learning.picture(make_frame(0)), lambda: learning.take_depth(make_frame(0)),
+        lambda: learning.observe(make_frame(1), train=False), lambda: learning.begin_scene(make_frame(2)),
+    ]  # fmt: skip
+    for count, call in enumerate(calls, 1):
+        call()
+        assert settled == [step] * count

@@ -1,0 +1,136 @@
+"""Order of growth and maintenance of a live scene, with parts that note their calls."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.training import upkeep
+from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.upkeep import REVEALED_SHARE, PostponedGrowth
+
+CAMERA = Camera.from_focal(60.0, 200, 100)
+CONFIG = ReconstructorConfig(gaussians=10, max_gaussians=20, preallocate=True, history_s=1.0)
+
+
+class Parts:
+    """Notes calls in order. `revealed_px` is by how far the motion has moved the scene away from an edge."""
+
+    def __init__(self) -> None:
+        self.calls: list[Any] = []
+        self.revealed_px = 0.0
+
+    def cover(self, *given: Any) -> None:
+        self.calls.append("cover")
+
+    def cover_revealed(self) -> None:
+        self.calls.append("revealed")
+
+    def has_revealed(self, least_px: float) -> bool:
+        return self.revealed_px >= least_px
+
+
+@pytest.fixture
+def parts(monkeypatch: pytest.MonkeyPatch) -> Parts:
+    made = Parts()
+
+    class Upkeep:
+        def __init__(self, camera: Camera, config: ReconstructorConfig) -> None:
+            made.calls.append(("upkeep of", camera))
+
+        def __call__(self, step: Any, seen: Any, last_seen: Any) -> None:
+            made.calls.append(("upkeep", last_seen))
+
+        def once(self, step: Any, seen: Any, last_seen: Any) -> None:
+            made.calls.append(("once", last_seen))
+
+    class OutOfView:
+        last_seen, archive = "last seen", [1, 2, 3]
+
+        def __init__(self, capacity: int, device: Any) -> None:
+            made.calls.append(("archive of", capacity))
+
+        def restart(self) -> None:
+            made.calls.append("restart")
+
+        def follow(self, step: Any, seen: Any) -> None:
+            made.calls.append("archive")
+
+        def unseen_s(self, count: int) -> str:
+            return f"unseen {count}"
+
+    monkeypatch.setattr(upkeep, "Upkeep", Upkeep)
+    monkeypatch.setattr(upkeep, "OutOfView", OutOfView)
+    monkeypatch.setattr(
+        upkeep, "fill_new_tissue", lambda step, frame, seen, before, *_: made.calls.append(("fill", before))
+    )
+    monkeypatch.setattr(upkeep, "has_moved", lambda camera, before, distance: abs(camera.position[0]) > 5)
+    return made
+
+
+def growth_of(parts: Parts, **changed: Any) -> PostponedGrowth:
+    made = PostponedGrowth(replace(CONFIG, **changed), torch.device("cpu"), parts)
+    made.begin(CAMERA)
+    return made
+
+
+def seen_from(x: float) -> Any:
+    pose = np.eye(4)
+    pose[0, 3] = -x
+    return SimpleNamespace(camera=CAMERA.with_pose(pose))
+
+
+STEP = SimpleNamespace(distance=lambda camera: 60.0)
+
+
+def test_a_frame_is_finished_by_archive_upkeep_and_covering(parts: Parts) -> None:
+    growth = growth_of(parts)
+    assert parts.calls == [("archive of", 20), "restart", ("upkeep of", CAMERA)]
+    parts.calls.clear()
+    growth.finish(STEP, None, seen_from(0), parts)
+    assert parts.calls == ["archive", ("upkeep", "last seen"), "cover", "revealed"]
+    parts.calls.clear()
+    growth.once(STEP, seen_from(0))
+    assert parts.calls == [("once", "last seen")]
+    assert growth.archived == 3 and growth.unseen_s(7) == "unseen 7"
+
+
+def test_without_fixed_rows_nothing_is_archived_and_without_a_history_nothing_maintained(parts: Parts) -> None:
+    growth = growth_of(parts, preallocate=False)
+    growth.finish(STEP, None, seen_from(0), parts)
+    assert parts.calls == [("upkeep of", CAMERA), ("upkeep", None), "cover", "revealed"]
+    assert growth.archived == 0 and growth.unseen_s(7) is None
+    parts.calls.clear()
+    growth = growth_of(parts, preallocate=False, history_s=None)
+    growth.finish(STEP, None, seen_from(0), parts)
+    growth.once(STEP, seen_from(0))
+    assert parts.calls == ["cover", "revealed"]
+
+
+def test_new_tissue_is_filled_when_the_camera_has_moved_since_the_last_search(parts: Parts) -> None:
+    growth = growth_of(parts)
+    parts.calls.clear()
+    first, near, far = seen_from(0), seen_from(3), seen_from(9)
+    for seen in (first, first, near, far, far):
+        growth.prepare(STEP, None, seen, parts)
+    assert parts.calls == [("fill", first.camera)]
+    growth.forget()
+    growth.prepare(STEP, None, seen_from(30), parts)
+    assert len(parts.calls) == 1, "another scene begins with its own camera"
+
+
+@pytest.mark.parametrize(("share", "is_covered"), [(0.99, False), (1.0, True)])
+def test_a_strip_that_motion_reveals_is_covered_before_the_first_step(
+    parts: Parts, share: float, is_covered: bool
+) -> None:
+    growth = growth_of(parts)
+    parts.calls.clear()
+    parts.revealed_px = share * REVEALED_SHARE * 200
+    growth.prepare(STEP, None, seen_from(0), parts)
+    assert parts.calls == (["cover", "revealed"] if is_covered else [])
