@@ -392,8 +392,7 @@ class Snapshot:
         with self.reading():
             seen = self._unseen_s.clone()
             if seen.is_cuda:
-                # This tensor is in no slot. The publisher may free it before this stream has read
-                # it.
+                # This tensor is in no slot. The publisher may free it before this stream has read it.
                 self._unseen_s.record_stream(torch.cuda.current_stream(self.device))
             return seen
 

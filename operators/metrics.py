@@ -31,17 +31,13 @@ class ScoredFrame:
 
     rendered: RenderedFrame
     quality: FrameQuality
-    """Scores of the picture. For a frame trained on before display they measure the training
-    error.
-    """
+    """Scores of the picture. For a frame trained on before display they measure the training error."""
     previous_frame_db: float
     """Tissue PSNR in dB of the previous raw frame as a prediction (trivial baseline). NaN for the first frame and after
     a change of size.
     """
     next_frame_db: float = math.nan
-    """Tissue PSNR in dB of the prediction made before training on this frame; NaN without a
-    prediction.
-    """
+    """Tissue PSNR in dB of the prediction made before training on this frame; NaN without a prediction."""
 
     def as_json(self) -> LogLine:
         """Return one entry of the report's series, with None for missing measures."""
@@ -110,9 +106,7 @@ class QualityResult:
     held_out: QualityTracker
     """Frames displayed and never trained on."""
     series: tuple[LogLine, ...]
-    """One entry per displayed frame in order, or per bin of frames in a long run (see
-    `frame_log.series`).
-    """
+    """One entry per displayed frame in order, or per bin of frames in a long run (see `frame_log.series`)."""
     frames_per_entry: int
     frames_sha256: str
     frames: int
@@ -147,13 +141,9 @@ class OnScreenResult:
     worst_seq: int | None
     """Sequence number of the frame with the PSNR `worst_db`."""
     previous_frame_db: float | None
-    """Mean tissue PSNR in dB of the previous raw frame after the first second (trivial
-    baseline).
-    """
+    """Mean tissue PSNR in dB of the previous raw frame after the first second (trivial baseline)."""
     previous_frame_throughout_db: float | None
-    """Mean tissue PSNR in dB of the previous raw frame over all scored frames (trivial
-    baseline).
-    """
+    """Mean tissue PSNR in dB of the previous raw frame over all scored frames (trivial baseline)."""
     frames: int
     """Number of frames scored against a displayed picture."""
     not_on_screen: int
@@ -339,9 +329,7 @@ class MetricsOp(Operator):
         self._predicted: OrderedDict[int, float] = OrderedDict()
         """Tissue PSNR in dB of predictions whose frame is not scored yet, by sequence number."""
         self._waiting_db: OrderedDict[int, float] = OrderedDict()
-        """Tissue PSNR in dB of the previous raw frame, for frames whose prediction has not
-        arrived.
-        """
+        """Tissue PSNR in dB of the previous raw frame, for frames whose prediction has not arrived."""
         self._previous = None
         self._first_s: float | None = None
         self._trimmed_s = time.monotonic()
@@ -368,8 +356,7 @@ class MetricsOp(Operator):
         prediction: Prediction | None
         while (prediction := op_input.receive("predicted")) is not None:
             self._take(prediction)
-        # Pictures lag behind frames, so a frame is scored once the two following frames have
-        # arrived.
+        # Pictures lag behind frames, so a frame is scored once the two following frames have arrived.
         for frame, shown, until_ns in self._screen.pairs(waiting=2):
             if (scored := self._score_shown(frame, shown, until_ns)) is not None:
                 op_output.emit(scored, "scored")

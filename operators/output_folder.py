@@ -347,8 +347,7 @@ def _has_sidecar(folder: Path, name: str) -> bool:
         return False
     if any((folder / description).exists() for description in DESCRIPTIONS):
         return True
-    # Next to a video or pictures, sub-folders of unspecific names are not read by the recording's
-    # loader.
+    # Next to a video or pictures, sub-folders of unspecific names are not read by the recording's loader.
     return name not in _UNSPECIFIC and (_holds_pictures(folder / "images") or _holds_pictures(folder))
 
 

@@ -37,9 +37,7 @@ from operators.sinks.session_recorder import SessionRecorder
 REHEARSED_AT_ONCE = 3
 """Rehearsal steps on a GPU between two checks for a new frame. On the slower CPU it is one step."""
 GROWN_AT_LATEST = 10
-"""Maximum number of trained frames between two growth steps; beyond it growth runs even without
-spare time.
-"""
+"""Maximum number of trained frames between two growth steps; beyond it growth runs even without spare time."""
 
 
 @dataclass
@@ -359,9 +357,7 @@ class UntilDisplay(Training):
 
 
 class RecordedCalls(Training):
-    """Repeats the recorded calls of a live session. Frames that the session dropped are not
-    displayed.
-    """
+    """Repeats the recorded calls of a live session. Frames that the session dropped are not displayed."""
 
     def __init__(
         self,

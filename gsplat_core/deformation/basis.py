@@ -410,8 +410,7 @@ class CapturedBasisTraining:
         return self._field.frame_deltas(gaussians)(time)
 
     def update(self, gradient: Tensor, time: Tensor, rates: Tensor, step: Tensor, status: Tensor) -> None:
-        # An overflowed frame has a gradient of zero, and Gaussians without gradient keep their
-        # bumps.
+        # An overflowed frame has a gradient of zero, and Gaussians without gradient keep their bumps.
         self._field.adam_step_at(time, gradient, rates)
 
     def add_colours(self, change: Tensor, time: Tensor) -> None:

@@ -289,7 +289,6 @@ def _share_beyond_noise(rest: Plane, weight: Plane, least: float) -> Plane:
     """
     sigma = max(1.0, WINDOW * rest.shape[1] / 2)
     mean = lambda plane: cv2.GaussianBlur(plane.astype(np.float32), (0, 0), sigma, borderType=cv2.BORDER_CONSTANT)
-    # Weights are `least` / variance, so weight times squared noise has the mean `least` at every
-    # known pixel.
+    # Weights are `least` / variance, so weight times squared noise has the mean `least` at every known pixel.
     found, noise = mean(weight * rest * rest), least * mean((weight > 0).astype(np.float32))
     return np.asarray(np.clip(1 - noise / np.maximum(found, 1e-12), 0, 1), np.float32)

@@ -672,7 +672,9 @@ def _off_along_rows(rows: NDArray[np.float64], height: int, width: int, device: 
 
 
 def _with_rows_of_left(right: NDArray[np.uint8], rows: NDArray[np.float64], disparity_px: float) -> NDArray[np.uint8]:
-    """Warp the right picture so that each point is in the same row as in the left one; `rows` as in `PairLook`."""
+    """Warp the right picture so that points with this disparity are in the same row as in the left one. No change if
+    the absolute values of `rows` (as in `PairLook`) sum up to less than `ROWS_FROM_PX`.
+    """
     if np.abs(rows).sum() < ROWS_FROM_PX:
         return right
     height, width = right.shape

@@ -63,8 +63,7 @@ class View:
     def detail(self) -> NDArray[np.float32]:
         """Structure without slow shading; 0 in dark regions."""
         if self._detail is None:
-            # Exclude the rim, so that the edge of the field of view or of a letterbox is not
-            # structure.
+            # Exclude the rim, so that the edge of the field of view or of a letterbox is not structure.
             rim = cv2.getStructuringElement(cv2.MORPH_RECT, (2 * RIM_PX + 1, 2 * RIM_PX + 1))
             weight = cv2.erode(self.bright.astype(np.uint8), rim, borderValue=1).astype(np.float32)
             grey = cv2.GaussianBlur(self.logs.mean(axis=0), (0, 0), 1) * weight

@@ -284,8 +284,8 @@ class Turns:
         self._due_ns = [pts_ns + self._every_ns * (k + 1) // self._looks for k in range(self._looks)]
 
     def due(self, pts_ns: int) -> frozenset[int]:
-        """Return the numbers of the checks due at this time and count them as done."""
-        # Use the picture nearest to the due time, assuming a constant interval.
+        """Return the numbers of the checks due by half a frame interval after this time, and schedule them again."""
+        # This picture is the nearest to their due time if the interval is constant.
         reached_ns = pts_ns + max(0, pts_ns - self._last_ns) // 2
         self._last_ns = pts_ns
         due = frozenset(k for k, due_ns in enumerate(self._due_ns) if due_ns <= reached_ns)

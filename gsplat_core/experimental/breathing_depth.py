@@ -254,7 +254,7 @@ def _found(pictures: list[TexturedPicture], times_s: Array) -> _Window | str:
 
 
 def _share(window: _Window, time_s: float) -> float:
-    """Return the weight of a window at a time, from 1 in its middle to almost 0 at its ends."""
+    """Return the weight of a window at a time: 1 in its middle, falling linearly to 0.02 at its ends and beyond."""
     half = 0.5 * float(np.ptp(window.tracks.times_s))
     return max(0.02, 1 - abs(time_s - window.middle_s) / half)
 

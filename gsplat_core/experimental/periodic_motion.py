@@ -259,8 +259,8 @@ class _Fit:
 
 
 def _at_one_distance(tracks: GridTracks) -> Array:
-    """Return positions [N, 3] on the rays of first observation at one common distance, the one that
-    best explains the later observations.
+    """Return world positions [N, 3] on the rays of first observation, all at the same depth (z in that camera), the one
+    that best explains the later observations.
     """
     first = tracks.seen.argmax(0)
     number = np.arange(len(first))

@@ -158,8 +158,7 @@ class _Instances:
         dx, dy = (means - pixels[:, None]).unbind(-1)
         a, b, c = conics.unbind(-1)
         sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
-        # Not clamp, whose gradient is zero at the bound. Sigma reaches the bound 0 for a mean at the pixel's
-        # centre.
+        # Not clamp, whose gradient is zero at the bound. Sigma reaches the bound 0 for a mean at the pixel's centre.
         falloff = torch.exp(-torch.where(sigma >= 0, sigma, 0))
         alpha = (opacities * falloff).clamp(max=self.max_alpha)
         alpha = torch.where((sigma >= 0) & (alpha >= ALPHA_MIN), alpha, 0)

@@ -96,8 +96,7 @@ def fully_fused_projection(
     batch_dims = check_projection_tensors(means, covars, quats, scales, opacities, viewmats, Ks)
     check_projection_options(width, height, camera_model, compensation_floor)
     check_sparse_gradient(sparse_grad, packed, batch_dims)
-    # Replace unusable Gaussians before any arithmetic, because a masked NaN would reach the
-    # gradient.
+    # Replace unusable Gaussians before any arithmetic, because a masked NaN would reach the gradient.
     usable = _usable(means, covars, quats, scales, opacities)
     covariance = _covariance(usable, covars, quats, scales)
     means = torch.where(usable[..., None], means, torch.zeros_like(means))

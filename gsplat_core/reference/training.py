@@ -98,9 +98,7 @@ def second_difference_in_time(plane: Tensor) -> Tensor:
 
 
 def distance_from_one(plane: Tensor) -> Tensor:
-    """Return the mean of |1 - plane|; a time plane of ones has no effect on its
-    features (eq. 7).
-    """
+    """Return the mean of |1 - plane|; a time plane of ones has no effect on its features (eq. 7)."""
     return (1 - plane).abs().mean()
 
 

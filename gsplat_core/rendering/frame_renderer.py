@@ -197,8 +197,7 @@ class FrameStatusCopy:
         self._values = torch.zeros(4, dtype=torch.int32, pin_memory=True)
 
     def __del__(self) -> None:
-        # torch does not track writes of a graph and would free the memory while a copy is in
-        # flight.
+        # torch does not track writes of a graph and would free the memory while a copy is in flight.
         self._arrived.synchronize()
 
     def queue(self, status: Tensor) -> None:

@@ -220,9 +220,7 @@ def _distances_of_centres(means: Tensor, viewmats: Tensor) -> Tensor:
 
 
 def isect_ids_of(flatten_ids: Tensor, isect_offsets: Tensor, depths: Tensor, tiles_of_image: int) -> Tensor:
-    """Return gsplat's int64 key of each tile-list entry: image | tile | 32 bits of
-    float32 depth.
-    """
+    """Return gsplat's int64 key of each tile-list entry: image | tile | 32 bits of float32 depth."""
     starts, length = isect_offsets.reshape(-1), flatten_ids.shape[0]
     counts = torch.diff(starts, append=starts.new_full((1,), length))
     tiles = torch.arange(len(starts), device=starts.device)

@@ -74,7 +74,7 @@ class Rays(NamedTuple):
     origins: Tensor
     """Start of each ray [..., C, M, 3]; zero for all models but "ortho"."""
     directions: Tensor
-    """Unit directions [..., C, M, 3]."""
+    """Unit directions [..., C, M, 3]; arbitrary where not `valid`."""
     valid: Tensor
     """Mask [..., C, M] of pixels that the lens sees."""
 

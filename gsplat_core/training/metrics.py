@@ -75,8 +75,7 @@ class _MaskedPair:
     def mean_ssim(self) -> float:
         """Return the mean similarity over all pixels and channels."""
         image, target = (torch.from_numpy(unit_image(values)) for values in self.masked())
-        # OpenCV accumulates in float64 directly; torch would first copy the map to float64, which
-        # is much slower.
+        # OpenCV accumulates in float64 directly; torch would first copy the map to float64, which is much slower.
         return sum(cv2.mean(ssim_map(image, target).numpy())[:3]) / 3
 
 

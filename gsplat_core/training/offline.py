@@ -193,8 +193,7 @@ class OfflineTraining:
         """Observations of both eyes."""
         self._most_gaussians, self._seed = most_gaussians, seed
         steady = steadiness(observations)
-        # `steadiness` is a ratio of squares; differences between neighbouring motions scale with
-        # its root.
+        # `steadiness` is a ratio of squares; differences between neighbouring motions scale with its root.
         self._smoothing, self._rigidity = SMOOTHING * steady, RIGIDITY * math.sqrt(steady)
         self._correction = CORRECTION if steady == 1 and step.has_colours_in_time else 0.0
         self._random = np.random.default_rng(seed)

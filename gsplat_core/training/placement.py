@@ -299,8 +299,7 @@ def _place(step: TrainingStep, motion: EditableMotion, frame: Frame, observation
     known = inside & (there > 0)
     if not bool(known.any()):
         return False
-    # Gaussians without depth take the factor of their neighbours. Those outside the picture take the
-    # median factor.
+    # Gaussians without depth take the factor of their neighbours. Those outside the picture take the median factor.
     everywhere = late.everywhere
     if everywhere is None:
         everywhere = tensor_of(tissue_depth(frame, float(now.median())), now.device)

@@ -414,8 +414,7 @@ class WindowSchedule(Schedule):
         if first_loss is None:
             return ObserveReport(observation.seq, 0, None, step.gaussians.count, spending.ending)
         extra = 0
-        # Read the loss only after all steps are queued. The host would otherwise wait with an empty GPU
-        # queue.
+        # Read the loss only after all steps are queued. The host would otherwise wait with an empty GPU queue.
         if not budget.is_timed and self._is_jump(first_loss, first):
             extra = spending.made * JUMP_EXTRA
         for turn in range(extra):

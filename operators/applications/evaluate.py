@@ -416,7 +416,7 @@ class _Work:
         return lambda frame, eye=None: pictures(shown, frame, eye)
 
     def _require_memory_of_picture(self) -> None:
-        """Raise MemoryTooSmall if rendering one picture does not fit into memory."""
+        """Raise MemoryTooSmall if rendering one picture on the CPU does not fit into memory; nothing is checked on CUDA."""
         camera = self.camera
         if self.settings.device == "cpu":
             needed = render_bytes(camera.width_px, camera.height_px, self.model.parameter_count)

@@ -60,9 +60,7 @@ class ReplaySettings(ReplayOptions):
     """Settings of a replay. Raises InvalidSetting for a value out of range."""
 
     recording: Path | str
-    """Path of a recording, or address of a finite source, `scheme://address` (see
-    `open_source`).
-    """
+    """Path of a recording, or address of a finite source, `scheme://address` (see `open_source`)."""
     out: Path
 
     def __post_init__(self) -> None:

@@ -416,7 +416,7 @@ class Progress:
     previous_frame_db: float | None = None
     """Tissue PSNR in dB of the previous raw frame (trivial baseline)."""
     next_frame_db: float | None = None
-    """Tissue PSNR in dB of the frame's prediction before training on it."""
+    """Tissue PSNR in dB of the newest frame's prediction, rendered before training on it."""
     trained: bool = True
     """True if the newest displayed frame was trained on before display."""
 

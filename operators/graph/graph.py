@@ -326,8 +326,7 @@ class OperatorTask:
             if edge.ended and len(queue) < need:
                 return True
         if self.in_edges and not self._needs:
-            # Without gating inputs the operator is finished when all inputs have ended and are
-            # empty.
+            # Without gating inputs the operator is finished when all inputs have ended and are empty.
             for edge in self.in_edges:
                 if not edge.ended or edge.queue:
                     break

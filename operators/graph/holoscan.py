@@ -191,8 +191,7 @@ class Bridge(_Operator):
         kind = _PortCondition.DOWNSTREAM_MESSAGE_AFFORDABLE
         for edge in self.out_edges:
             port = spec.output(edge.port).connector(_QUEUE, capacity=edge.capacity)
-            # One of several edges may close while full. The SDK would wait for it forever, so the
-            # gate decides.
+            # One of several edges may close while full. The SDK would wait for it forever, so the gate decides.
             room = self.task.leaves_room(edge) if len(self.out_edges) == 1 else 0
             _ = port.condition(kind, min_size=room) if room else port.condition(_PortCondition.NONE)
 

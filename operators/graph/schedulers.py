@@ -118,8 +118,7 @@ class MultiThreadScheduler:
         self.clock: Clock = clock or RealtimeClock()
         self.name = name
         self.stop_timeout_s = stop_timeout_s
-        # Reentrant, because a condition may be changed, and so call `wake`, while it is being
-        # checked.
+        # Reentrant, because a condition may be changed, and so call `wake`, while it is being checked.
         self._lock = threading.RLock()
         self._over = threading.Event()
         self._wakers: dict[OperatorTask, threading.Condition] = {}

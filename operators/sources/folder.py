@@ -60,8 +60,7 @@ class NewFiles:
         if now_s - self._scanned_s < SHARE * self._scan_took_s:
             return
         changed_ns = os.stat(self.folder).st_mtime_ns
-        # File system timestamps are coarse: a recent change may be followed by another with the
-        # same timestamp.
+        # File system timestamps are coarse: a recent change may be followed by another with the same timestamp.
         if changed_ns == self._changed_ns and time.time_ns() - changed_ns > 1_000_000_000:
             return
         with os.scandir(self.folder) as entries:

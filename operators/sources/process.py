@@ -459,8 +459,7 @@ class ProcessSource(LiveSource):
             SourceUnavailable: the source cannot be opened; has the message of the process.
         """
         options = options or SourceOptions()
-        # The process detects and counts stalls of its source; `state` detects stalls of the
-        # process.
+        # The process detects and counts stalls of its source; `state` detects stalls of the process.
         super().__init__(waiting=options.waiting, stalled_after_s=math.inf, order=FrameOrder(trusted=True))
         self._opening = Opening(opener, address, options)
         self._may_return = may_return

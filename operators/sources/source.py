@@ -218,8 +218,7 @@ class ThreadedSource:
         """Start reading. After `close` it restarts with the first frame."""
         if self._thread is not None:
             return
-        # A reader that outlived `close` keeps its own event, so it never writes into a later run's
-        # queue.
+        # A reader that outlived `close` keeps its own event, so it never writes into a later run's queue.
         self._stop = threading.Event()
         self._ready.clear()
         self._done, self._error, self._last_s = False, None, time.monotonic()

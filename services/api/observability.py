@@ -241,8 +241,7 @@ class GraphFamilies:
         if shown.get("show") == "model":
             self._model.add_metric([stream, "model", str(model.get("name", "")), str(model.get("version", ""))], 1)
         elif shown.get("show") == "live":
-            # The live model's version changes with every frame, and each value would create a new
-            # time series.
+            # The live model's version changes with every frame, and each value would create a new time series.
             self._model.add_metric([stream, "live", "", ""], 1)
 
 

@@ -170,8 +170,7 @@ async def replay_result(request: Request, caller: CallerOf, job_id: JobId, file:
 async def keep_model(
     request: Request, response: Response, caller: CallerOf, job_id: JobId, wanted: ModelTarget
 ) -> VersionView:
-    """Store a replay's model in the registry as the next version of a model. It is checked like an
-    upload."""
+    """Store a replay's model in the registry as the next version of a model. It is checked like an upload."""
     jobs, registry = jobs_of(request), registry_of(request)
     async with recorded(request, caller, "replay.keep", f"{wanted.model}/{job_id}") as said:
         job = await asyncio.to_thread(jobs.get, job_id)

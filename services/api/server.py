@@ -260,8 +260,7 @@ def serve(
         raise CannotServe(f"TLS: {error}; check server.certfile and server.keyfile") from error
     if certificate is not None and config.ssl is not None:
         certificate.attach(config.ssl)
-    # uvicorn re-raises the signal for the previous handler after shutdown. A drained server must
-    # exit normally instead.
+    # uvicorn re-raises the signal for the previous handler after shutdown. A drained server must exit normally instead.
     signal.signal(signal.SIGTERM, _done)
     signal.signal(signal.SIGINT, _done)
     control: ControlState = app.state.control
@@ -430,9 +429,8 @@ def bind(settings: ServiceSettings) -> socket.socket:
         raise CannotServe(
             f"cannot listen on {server.host} port {server.port}: {error.strerror}; give another server.host or server.port"
         ) from error
-    # Accepted connections inherit these options. asyncio disables Nagle's algorithm only for
-    # sockets with an explicit protocol, which this one lacks. An answer's body would otherwise wait
-    # 40 ms for the acknowledgement of its head.
+    # Accepted connections inherit these options. asyncio disables Nagle's algorithm only for sockets with an explicit
+    # protocol, which this one lacks. An answer's body would otherwise wait 40 ms for the acknowledgement of its head.
     listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     # The kernel would buffer up to 4 MB per slow viewer, which is seconds of outdated pictures.
     listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, MOST_UNSENT_BYTES)

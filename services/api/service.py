@@ -69,8 +69,7 @@ router = new_router("health", prefix="")
 @router.get("/livez")
 @requires("public")
 async def live() -> Alive:
-    """Confirm that the process answers. Nothing else is checked: a lost camera does not justify a
-    restart."""
+    """Confirm that the process answers. Nothing else is checked: a lost camera does not justify a restart."""
     return Alive()
 
 
@@ -95,8 +94,7 @@ async def ready(
 @router.get("/metrics", response_class=Response, responses={200: {"content": {"text/plain": {}}}})
 @requires("viewer")
 async def metrics(request: Request) -> Response:
-    """Return the metrics. Give Prometheus a key with the role viewer (`authorization:
-    credentials_file`)."""
+    """Return the metrics. Give Prometheus a key with the role viewer (`authorization: credentials_file`)."""
     encode, content_type = choose_encoder(request.headers.get("accept", ""))
     body = await asyncio.to_thread(encode, control_of(request).measures.registry)
     return Response(body, headers={"Content-Type": content_type})

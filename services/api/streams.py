@@ -65,8 +65,7 @@ def _check_one(address: str, rules: SourceRules) -> None:
     if scheme in OF_NETWORKS:
         _check_host(address, rules)
     elif scheme in OF_FOLDERS:
-        # Some sources treat `?` as the start of options, others as part of the path; both
-        # readings must be allowed.
+        # Some sources treat `?` as the start of options, others as part of the path; both readings must be allowed.
         for path in (place, place.partition("?")[0]):
             _check_path(path, rules.folders, "sources.folders")
     elif scheme in OF_DEVICES:

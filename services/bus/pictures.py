@@ -164,8 +164,7 @@ class WatchedPublisher(PicturePublisher):
     def watched(self) -> bool:
         """True while at least one living reader is connected."""
         while self._socket.poll(0):
-            # Each message is one byte and the topic: 1 for the first reader, 0 after the last one
-            # left.
+            # Each message is one byte and the topic: 1 for the first reader, 0 after the last one left.
             self._watched = self._socket.recv()[:1] == b"\x01"
         return self._watched
 

@@ -99,8 +99,7 @@ def _of_the_machine(error: BaseException, arguments: Iterable[str]) -> str | Non
 def _is_out_of_memory(error: BaseException) -> bool:
     if isinstance(error, MemoryError):
         return True
-    # torch raises RuntimeError and OpenCV its own error; neither has an out-of-memory class on the
-    # CPU.
+    # torch raises RuntimeError and OpenCV its own error; neither has an out-of-memory class on the CPU.
     kinds = {kind.__name__ for kind in type(error).__mro__}
     text = str(error).lower()
     return bool(kinds & {"RuntimeError", "error"}) and any(words in text for words in _MEMORY_WORDS)

@@ -69,7 +69,7 @@ tracking noise."""
 
 
 def poses_command(recording: Path, out: Path, max_frames: int | None, *, overwrite: bool, as_json: bool) -> int:
-    """Estimate the poses of a recording, write them and print their reliability."""
+    """Estimate the poses (without calibration also the focal length), write the poses and print their reliability."""
     if out.suffix != ".npy":
         raise OutputError(f"{out} does not end in .npy; give a name that does, such as {POSES_FILE}")
     check_file_path(out, [recording], overwrite=overwrite, into_recording=out.name == POSES_FILE)

@@ -116,8 +116,7 @@ class Requests:
             base_url=self.url,
             headers={"Authorization": f"Bearer {self._key}"},
             timeout=timeout_s,
-            # Loading the system's authorities takes longer than a plain HTTP request, which does
-            # not need them.
+            # Loading the system's authorities takes longer than a plain HTTP request, which does not need them.
             verify=tls_context(verify) if self.url.startswith("https:") or isinstance(verify, str) else False,
         )
 

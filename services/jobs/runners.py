@@ -44,8 +44,7 @@ ORPHANED = 3
 
 def load() -> None:
     """Import everything that attempts need. Call before the first fork, in a single-threaded process."""
-    # The NVML check detects GPUs without initialising CUDA; after initialisation no forked process
-    # could use CUDA.
+    # The NVML check detects GPUs without initialising CUDA; after initialisation no forked process could use CUDA.
     os.environ["PYTORCH_NVML_BASED_CUDA_CHECK"] = "1"
     import services.jobs.work  # noqa: F401
 

@@ -551,8 +551,7 @@ class ModelRegistry:
         except Conflict:
             self._blobs.remove(blob)
             raise
-        # After StoreUnavailable the row may or may not exist: `recover` removes the file if there
-        # is no row.
+        # After StoreUnavailable the row may or may not exist: `recover` removes the file if there is no row.
         self._reached("upload committed")
         return record
 

@@ -23,8 +23,7 @@ from services.errors import NotFound
 
 
 class State(StrEnum):
-    """State of a version: uploaded → validated → ready → active → retired, or rejected with a
-    reason."""
+    """State of a version: uploaded → validated → ready → active → retired, or rejected with a reason."""
 
     UPLOADED = "uploaded"
     """File stored, content not checked yet."""

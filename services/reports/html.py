@@ -108,8 +108,7 @@ def pictures_section(keyframes: Sequence[KeyframePictures], worst_seq: int | Non
         if seq == worst_seq:
             tags += '<span class="tag worst">lowest PSNR</span>'
         near_far = pictures.depth_range
-        # Without recorded depth the scale is unknown: the model's depth is relative, not in
-        # millimetres.
+        # Without recorded depth the scale is unknown: the model's depth is relative, not in millimetres.
         unit = " mm" if rendered.frame.depth_is_metric else ", scale not known"
         depth = f"depth {near_far[0]:.1f} to {near_far[1]:.1f}{unit}" if near_far else "no depth"
         cells.append(

@@ -238,8 +238,7 @@ class Capture:
 
     def _options(self) -> SourceOptions:
         spec = self.spec
-        # This process runs only the source. If the source hangs or dies, the supervisor restarts
-        # the process.
+        # This process runs only the source. If the source hangs or dies, the supervisor restarts the process.
         return SourceOptions(scale=spec.given_scale, fps=spec.fps, loop=spec.loop, realtime=True, process=False)
 
     def _publish(self, source: FrameSource, worker: Worker, publisher: PicturePublisher, backoff: Backoff) -> None:

@@ -468,8 +468,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--supervisor", type=json.loads, help="process id and start time of the supervisor, as JSON")
     given = parser.parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
-    # The NVML check detects GPUs without initialising CUDA; after initialisation no forked engine
-    # could use CUDA.
+    # The NVML check detects GPUs without initialising CUDA; after initialisation no forked engine could use CUDA.
     os.environ["PYTORCH_NVML_BASED_CUDA_CHECK"] = "1"
     try:
         folder = RuntimeFolder(Path(given.folder))

@@ -23,8 +23,7 @@ def _pinhole(p: Tensor, Ks: Tensor, width: int, height: int) -> tuple[Tensor, Te
     x, y, z = p.unbind(-1)
     fx, fy, cx, cy = (Ks[..., row, column, None] for row, column in ((0, 0), (1, 1), (0, 2), (1, 2)))
     margin_x, margin_y = FOV_MARGIN * 0.5 * width / fx, FOV_MARGIN * 0.5 * height / fy
-    # The linearisation diverges far off axis, so it is evaluated at the border of a slightly larger
-    # view.
+    # The linearisation diverges far off axis, so it is evaluated at the border of a slightly larger view.
     slope_x = torch.minimum(torch.maximum(x / z, -(cx / fx + margin_x)), (width - cx) / fx + margin_x)
     slope_y = torch.minimum(torch.maximum(y / z, -(cy / fy + margin_y)), (height - cy) / fy + margin_y)
     zero = torch.zeros_like(x)

@@ -285,8 +285,7 @@ class FlowPrior:
             if last is not None and learns:
                 self._damping.learn(last.arrived(points) / last_interval_s, ahead / self._interval_s)
             if self._starts_there:
-                # Replace the field's extrapolation at `time_s` by the state at `before_s` moved by
-                # the flow.
+                # Replace the field's extrapolation at `time_s` by the state at `before_s` moved by the flow.
                 held[:, POSITION] += ahead
                 motion_of(step).move_to(time_s, held)
 
@@ -456,8 +455,7 @@ def newest_state(step: TrainingStep, prior: MotionPrior, learned_s: float) -> tu
         continuation = Continuation(step.gaussians.count, step.gaussians.device)
         continuation.write(still if velocity is None else velocity, learned_s, prior.horizon_s)
         now = displaced(step.gaussians, deltas)
-        # The field does not change opacities, so the displaced scene shares them with training and
-        # they must be copied.
+        # The field does not change opacities, so the displaced scene shares them with training and they must be copied.
         right = None if now.right_sh is None else now.right_sh.clone()
         extra = {name: tensor.clone() for name, tensor in now.extra.items()}
         own = replace(now, logit_opacities=now.logit_opacities.clone(), right_sh=right, extra=extra)

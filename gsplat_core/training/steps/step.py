@@ -159,8 +159,7 @@ class TrainingStep:
         self._rates = config.rates
         self._has_no_end = config.history_s is not None
         self._mm_per_px = mm_per_px(gaussians, camera)
-        # Inverse depth times distance has no unit, so the weight is independent of the unit of
-        # length.
+        # Inverse depth times distance has no unit, so the weight is independent of the unit of length.
         depth_weight = config.depth_weight * self.distance(camera) if config.depth_weight else 0.0
         self._weights = LossWeights(config.ssim_weight, depth_weight, config.squared_error)
         strategy = STRATEGIES[config.strategy]

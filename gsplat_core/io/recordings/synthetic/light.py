@@ -159,8 +159,7 @@ class Air:
         """
         if self.smoke:
             clear = self._transmitted(camera, ray_x, ray_y, depth, time_s)[..., None]
-            # Illuminate smoke like a white surface half-way to the tissue, scaled down because smoke
-            # is thin.
+            # Illuminate smoke like a white surface half-way to the tissue, scaled down because smoke is thin.
             half = np.stack([ray_x, ray_y, np.ones_like(ray_x)], axis=-1) * (0.5 * depth)[..., None]
             arriving = sum(power for _, power in lamp.rays_to(half, nearest_mm2=400))
             lit = np.minimum(np.float32(0.25) * arriving, np.float32(0.8))[..., None]
