@@ -156,3 +156,18 @@ def test_what_does_not_match_is_refused():
         FusedAdam({"a": torch.zeros(2), "b": torch.zeros(3)}, {"a": 1.0, "b": 1.0})
     with pytest.raises(InvalidInput, match="sh"):
         FusedAdam(values, RATES).step({"means": values["means"]}, {})
+
+
+@pytest.mark.parametrize(
+    ("shape", "kept"), [((5, 3), 5), ((8, 3), 5), ((4, 3), 0), ((5, 4), 0), ((8, 4), 0), ((5, 3, 2), 0)]
+)
+def test_moments_of_a_replaced_tensor_stay_only_if_rows_were_added(shape, kept):
+    optimiser = FusedAdam({"a": torch.zeros(5, 3), "b": torch.zeros(2)}, rows=False)
+    for moments in (optimiser.first_moments, optimiser.second_moments):
+        for moment in moments.values():
+            moment.fill_(7.0)
+    before = optimiser.first_moments["b"]
+    optimiser.follow({"a": torch.zeros(shape), "b": torch.ones(2)})
+    for moments in (optimiser.first_moments, optimiser.second_moments):
+        assert moments["a"].shape == shape and (moments["a"][:kept] == 7).all() and not moments["a"][kept:].any()
+    assert optimiser.first_moments["b"] is before and (before == 7).all()

@@ -5,11 +5,13 @@ from __future__ import annotations
 import io
 import logging
 import sys
+import threading
 from collections.abc import Iterator
 
 import pytest
 
-from services.api.observability import TextFormatter, facts, log_to_stderr
+from services.api import observability
+from services.api.observability import TextFormatter, _log_uncaught, facts, log_to_stderr
 from services.settings.sections import LogSettings
 
 
@@ -52,3 +54,33 @@ def test_text_hides_passwords_and_cannot_be_made_to_hold_a_second_line() -> None
     line = TextFormatter().format(record)
 
     assert "secret" not in line and "\n" not in line
+
+
+@pytest.mark.parametrize(
+    ("kind", "error", "is_logged"),
+    [(ValueError, ValueError("broken"), True), (KeyboardInterrupt, KeyboardInterrupt(), True), (SystemExit, SystemExit(2), False), (ValueError, None, False)],
+)  # fmt: skip
+def test_errors_that_nothing_catches_are_logged_except_an_ordinary_end(
+    caplog: pytest.LogCaptureFixture, kind: type[BaseException], error: BaseException | None, is_logged: bool
+) -> None:
+    _log_uncaught(kind, error, None)
+    assert [record.levelname for record in caplog.records] == ["CRITICAL"] * is_logged
+    if is_logged:
+        assert caplog.records[0].exc_info is not None and caplog.records[0].exc_info[1] is error
+
+
+def test_threads_and_the_main_thread_log_what_nothing_catches(monkeypatch: pytest.MonkeyPatch) -> None:
+    logged: list[object] = []
+    monkeypatch.setattr(sys, "excepthook", None)
+    monkeypatch.setattr(threading, "excepthook", None)
+    monkeypatch.setattr(observability, "_log_uncaught", lambda *given: logged.append(given))
+    access, error = logging.getLogger("uvicorn.access"), logging.getLogger("uvicorn.error")
+    monkeypatch.setattr(access, "disabled", False)
+    monkeypatch.setattr(error, "filters", [])
+    log_to_stderr(LogSettings.model_validate({"level": "warning"}))
+    assert sys.excepthook is observability._log_uncaught
+    raised = ValueError("broken")
+    threading.excepthook(threading.ExceptHookArgs((ValueError, raised, None, None)))
+    assert logged == [(ValueError, raised, None)]
+    assert access.disabled and len(error.filters) == 1 and logging.getLogger().level == logging.WARNING
+    assert logging.getLogger("alembic").level == logging.getLogger("websockets").level == logging.WARNING

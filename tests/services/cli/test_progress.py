@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import io
+import sys
+from types import SimpleNamespace
+
 from operators.applications.session import Progress
 from services.cli.terminal import ProgressPrinter
 
@@ -41,3 +45,27 @@ def test_the_error_of_a_held_out_frame_is_called_that(capsys):
         "replay 1/1  33.00 dB (held out, previous frame 36.00 dB)",
         "evaluate 1/1  33.00 dB (training error)",
     ]
+
+
+def test_on_a_terminal_each_stage_has_a_bar_with_its_rate_and_quality(monkeypatch):
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    now = iter([0.0, 4.0, 5.0, 10.0, 11.0])
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    printer = ProgressPrinter()
+    with printer:
+        monkeypatch.setattr("services.cli.terminal.time", SimpleNamespace(monotonic=lambda: next(now)))
+        assert printer._bar.live.is_started
+        printer(Progress("replay", 0, 10))
+        printer(Progress("replay", 1, 10))
+        printer(Progress("replay", 2, 10))
+        printer(Progress("replay", 7, 10, psnr_tissue_db=38.126))
+        printer(Progress("evaluate", 1, 5))
+        first, second = printer._bar.tasks
+        assert (first.description, first.completed, first.total) == ("replay", 7, 10)
+        assert first.fields == {"rate": "1.0 frames/s", "quality": "38.13 dB (training error)"}
+        assert (second.description, second.completed, second.total) == ("evaluate", 1, 5)
+        assert second.fields["rate"] == ""
+    assert not printer._bar.live.is_started

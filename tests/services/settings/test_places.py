@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -72,3 +73,22 @@ def test_only_our_variables_of_sections_are_looked_at(
 )  # fmt: skip
 def test_only_sections_have_keys(location: tuple[str, ...], keys: str | None) -> None:
     assert _keys(location) == [] if keys is None else keys in _keys(location)
+
+
+def test_data_and_sockets_are_where_the_settings_or_the_desktop_say(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("XDG_DATA_HOME", "XDG_RUNTIME_DIR"):
+        monkeypatch.setenv(name, "")
+    monkeypatch.setattr(Path, "home", lambda: tmp_path)
+    usual = load_settings(None, {})
+    assert usual.data_dir == tmp_path / ".local" / "share" / "intrasplat" and str(os.getuid()) in usual.runtime_dir.name
+    for name in ("XDG_DATA_HOME", "XDG_RUNTIME_DIR"):
+        monkeypatch.setenv(name, f"/{name}")
+    desktop = load_settings(None, {})
+    assert desktop.data_dir == Path("/XDG_DATA_HOME/intrasplat")
+    assert desktop.runtime_dir == Path("/XDG_RUNTIME_DIR/intrasplat")
+    given = load_settings(None, {"paths.data": "/data", "paths.runtime": "/run/own"})
+    assert (given.data_dir, given.runtime_dir) == (Path("/data"), Path("/run/own"))
+    assert given.admin_key_file == Path("/data/admin.key")
+    assert load_settings(None, {"auth.admin_key_file": "/keys/admin"}).admin_key_file == Path("/keys/admin")
