@@ -70,7 +70,7 @@ class Model:
     time_window_s: tuple[float, float]
     """First and last observed time in seconds; other times are clamped."""
     training_digest: str | None = None
-    """SHA-256 of the training recording, if known."""
+    """SHA-256 of the training recording; None if unknown."""
     unseen_s: Tensor | None = None
     """Time since each Gaussian was last visible, float64 [N], in seconds of the stream.
 
@@ -386,7 +386,7 @@ class Snapshot:
             return gaussians.map(lambda tensor: tensor[: self.gaussian_count].clone())
 
     def unseen_s(self) -> Tensor | None:
-        """Copy of the time since each Gaussian was last visible; see `Model.unseen_s`."""
+        """Copy of the time since each Gaussian was last visible, or None; see `Model.unseen_s`."""
         if self._unseen_s is None:
             return None
         with self.reading():

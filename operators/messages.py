@@ -35,9 +35,9 @@ class Reconstruction:
     """Live runs: newest frame the model was trained on, which determines the picture's age. None means `frame` itself.
     """
     taken_ns: int | None = None
-    """Live runs: time at which training dequeued the frame, by `time.monotonic_ns`."""
+    """Time at which training dequeued the frame, by `time.monotonic_ns`; None except in live runs."""
     published_ns: int | None = None
-    """Live runs: time at which the model was published, by `time.monotonic_ns`."""
+    """Time at which the model was published, by `time.monotonic_ns`; None except in live runs."""
 
     def __post_init__(self) -> None:
         if self.steps < 0:
@@ -107,9 +107,9 @@ class RenderedFrame:
     itself.
     """
     taken_ns: int | None = None
-    """Time at which training dequeued the frame, by `time.monotonic_ns`; live runs only."""
+    """Time at which training dequeued the frame, by `time.monotonic_ns`; None except in live runs."""
     published_ns: int | None = None
-    """Time at which the model was published, by `time.monotonic_ns`; live runs only."""
+    """Time at which the model was published, by `time.monotonic_ns`; None except in live runs."""
     outputs: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
     """Further outputs of the renderer by name, float32 [H, W] or [H, W, C]."""
 

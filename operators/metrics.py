@@ -65,9 +65,9 @@ class NextFrameResult:
     """
 
     psnr_tissue_db: float | None
-    """Mean tissue PSNR of the predictions, in dB."""
+    """Mean tissue PSNR of the predictions, in dB; None if `frames` is 0."""
     previous_frame_db: float | None
-    """Mean tissue PSNR in dB of the previous raw frame over the same frames (trivial baseline)."""
+    """Mean tissue PSNR in dB of the previous raw frame over the same frames (trivial baseline); None if `frames` is 0."""
     frames: int
     """Number of frames that have both a prediction score and a baseline score."""
 
@@ -271,7 +271,7 @@ class MetricsOp(Operator):
     """
 
     _previous: Frame | None
-    """Newest raw frame; the trivial baseline for the prediction of the next frame."""
+    """Newest raw frame, the trivial baseline for the prediction of the next frame; None at the start of a stream."""
 
     def __init__(
         self,

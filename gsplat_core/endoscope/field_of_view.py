@@ -68,7 +68,7 @@ class FieldOfView:
         self._candidates: list[Outline | None] = []
 
     def observe(self, image: NDArray[np.uint8]) -> NDArray[np.uint8] | None:
-        """Process a usable frame, RGB uint8 [H, W, 3], and return `mask`."""
+        """Process a usable frame, RGB uint8 [H, W, 3], and return `mask` (None: the whole picture)."""
         if image.shape != self._shape:
             self._start(image.shape)
         scale = LONG_SIDE_PX / max(image.shape[:2])

@@ -170,7 +170,7 @@ class PictureSettings(BaseModel):
     channels: Literal["rgb", "bgr"] = "rgb"
     """Channel order of the network's input."""
     size: tuple[Side, Side] | None = None
-    """Input height and width in pixels if the network has no fixed size."""
+    """Input height and width in pixels if the network has no fixed size; None to derive them from the picture's size."""
     output: str | None = None
     """Name of the output; None for the first one."""
     threads: Annotated[int, Field(ge=1, le=64)] = 1

@@ -66,7 +66,7 @@ class StripDetector:
         self._before: NDArray[np.bool_] | None = None
 
     def observe(self, image: NDArray[np.uint8]) -> NDArray[np.uint8] | None:
-        """Process a usable frame, RGB uint8 [H, W, 3], and return `mask`."""
+        """Process a usable frame, RGB uint8 [H, W, 3], and return `mask` (None: nothing was found)."""
         if image.shape != self._shape:
             self._start(image.shape)
         if self._bands:

@@ -162,7 +162,7 @@ class ViewSums:
         Args:
             frame: frame of the training camera.
             own: camera of the frame in model space.
-            depth: depth [H, W] rendered by the model from `own`, if already available.
+            depth: depth [H, W] rendered by the model from `own`; None to render it if needed.
         """
         true = self._truth.depth_of(frame)
         for name, camera, view in _views_of(frame, self._truth):
@@ -178,7 +178,7 @@ class ViewSums:
     def _distance(
         self, frame: Frame, own: Camera, true: NDArray[Any] | None, depth: NDArray[Any] | None
     ) -> float | None:
-        """Return the median tissue distance, from true depth if known, otherwise from the model's depth."""
+        """Return the median tissue distance, from true depth if known, otherwise from the model's; None without both."""
         known = np.zeros(0) if true is None else true[(true > 0) & (True if frame.mask is None else frame.mask != 0)]
         if not known.size:
             shows = self._shown(own, frame).depth if depth is None else depth

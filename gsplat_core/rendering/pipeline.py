@@ -605,7 +605,7 @@ class Stepped(NamedTuple):
     """Colours and depth [..., C, H, W, X]."""
     splats: RenderedSplats
     extra: Tensor | None
-    """Images of `extra_signals`, blended like colours."""
+    """Images of `extra_signals`, blended like colours; None without `extra_signals`."""
     normals: Tensor | None
 
 

@@ -74,7 +74,9 @@ def rasterization(*arguments: Any, **options: Any) -> tuple[Tensor, Tensor, dict
 
 
 def _wrong_names(positional: int, named: Collection[str]) -> str | None:
-    """Return a sentence about arguments of `rasterization` that are unknown, too many, given twice or missing."""
+    """Return a sentence about arguments of `rasterization` that are unknown, too many, given twice or missing; None if
+    there are none.
+    """
     for name in named:
         if name not in _PARAMETERS:
             close = difflib.get_close_matches(name, _PARAMETERS, n=3, cutoff=0.5)

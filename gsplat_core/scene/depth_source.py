@@ -52,10 +52,8 @@ class DepthSource:
 
     @staticmethod
     def after(source: DepthSource | None, frame: Frame) -> DepthSource | None:
-        """Return the depth source after another frame. Depth without a metric scale in any frame makes the model
-        non-metric.
-
-        A scene initialised on a plane never becomes metric.
+        """Return the source after another frame: unchanged (also None), but not metric if the frame's depth is not. A
+        scene initialised on a plane never becomes metric.
         """
         relative = frame.depth is not None and not frame.depth_is_metric
         return replace(source, metric=False) if source is not None and relative else source

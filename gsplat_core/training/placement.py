@@ -281,7 +281,7 @@ class Placement:
     def _correct(
         self, step: TrainingStep, motion: EditableMotion, observation: Observation, depth: Tensor, shown_s: float
     ) -> None:
-        """Move the scene at one time towards a frame's depth [H, W] (0 = unknown)."""
+        """Move the scene at `shown_s` towards a frame's depth [H, W] (0 = unknown), on CUDA if possible as a CUDA graph."""
         rows, captured = step.fixed_rows, step.capabilities.captured_motion
         if rows is None or rows.device.type != "cuda" or captured is None or not step.is_trained_by_alpha:
             _correct_at(step, motion, observation, depth, shown_s)

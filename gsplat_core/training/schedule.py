@@ -221,8 +221,8 @@ class StepsInFlight:
         self._events: deque[torch.cuda.Event] = deque()
 
     def queued(self) -> int:
-        """Register a step queued on the current stream and wait until at most `most` are
-        unfinished. Returns the number of unfinished steps.
+        """Register a step queued on the current stream and wait until at most `most` are unfinished. Returns the number of
+        unfinished steps; on the CPU always 0.
         """
         if self._device.type != "cuda":
             return 0

@@ -303,7 +303,8 @@ def camera_at_scale(model: Model, scale: float, device: str) -> Camera:
     """Return the model's own camera with its picture resized.
 
     Raises:
-        InvalidSetting: if the picture is too large, or there is not enough memory to render it.
+        InvalidSetting: if the picture is too large.
+        MemoryTooSmall: if rendering it on the CPU does not fit into memory.
     """
     check_shown_size(model.camera.width_px, model.camera.height_px, scale)
     camera = model.camera.scaled(scale)

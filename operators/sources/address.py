@@ -43,7 +43,7 @@ class SourceOptions:
     speed: float = 1.0
     """Playback speed of a recording. `math.inf`: each frame when the previous one is taken, without drops."""
     fps: float | None = None
-    """Frame rate that replaces the recording's own, in frames/s."""
+    """Frame rate that replaces the recording's own, in frames/s; None keeps that."""
     waiting: int = 2
     """Capacity of the queue for the reader, in frames; if it is full, the oldest is dropped."""
     stereo: StereoLayout | None = None
@@ -89,7 +89,7 @@ class Address:
         return cls(scheme, place, options)
 
     def text(self, name: str, default: str | None = None) -> str | None:
-        """Return the text of an option of the address, or `default`."""
+        """Return the text of an option of the address, or `default` if it is missing."""
         self._asked.add(name)
         return self.options.get(name, default)
 

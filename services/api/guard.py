@@ -41,7 +41,7 @@ class Rule:
     ticket: bool = False
     """Accept a ticket in the URL in place of a key."""
     takes: str | None = None
-    """Content type of the body; JSON if the route declares a body."""
+    """Content type of the body. None: JSON if the route declares a body, otherwise any."""
     most: BodyLimit = "body_bytes"
     scope: Scope = "all"
 

@@ -233,7 +233,7 @@ class ControlState:
     viewers: ViewerCount
     storage: Storage
     persons: OpenIdPersons | None = None
-    """OpenID Connect provider, if the settings configure one."""
+    """OpenID Connect provider; None if the settings configure none."""
     uploads_of: Counter[str] = field(default_factory=Counter)
     """Number of running uploads by key id."""
     draining: asyncio.Event = field(default_factory=asyncio.Event)

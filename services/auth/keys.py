@@ -110,7 +110,7 @@ class KeyStore:
         return None if key is None or key.has_expired() else key
 
     def expired(self, token: str) -> ApiKey | None:
-        """Return the key of a token if it has expired, for an error message with the expiry."""
+        """Return the key of a token if it has expired, otherwise None; for an error message with the expiry."""
         key = self._match(token)
         return key if key is not None and key.has_expired() else None
 

@@ -780,7 +780,7 @@ def _filled(client: Client, wanted: Mapping[str, Any], count: int) -> AuditPage:
 
 
 def moment(text: str | None) -> datetime | None:
-    """Parse a time: ISO 8601, in this machine's zone by default, or a span such as 2h before now.
+    """Parse a time: ISO 8601, in this machine's zone by default, or a span such as 2h before now; None for None.
 
     Raises:
         InvalidSetting: if the text is neither.

@@ -192,7 +192,7 @@ def run_program(
 
 @contextlib.contextmanager
 def _started(command: list[str], said: Any, device: str) -> Iterator[subprocess.Popen[bytes]]:
-    """Start the process and kill it at the end of the block."""
+    """Start the process, without GPUs if `device` is cpu, and kill it at the end of the block."""
     environment = {name: os.environ[name] for name in _PASSED_ON if name in os.environ}
     if device == "cpu":
         environment["CUDA_VISIBLE_DEVICES"] = ""

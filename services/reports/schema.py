@@ -45,7 +45,7 @@ class RecordingFacts(Part):
     height_px: Annotated[int, Field(ge=1)]
     fps: Annotated[float, Field(gt=0)]
     digest: str | None = None
-    """SHA-256 over the recording's files."""
+    """SHA-256 over the recording's files; null for other sources."""
 
     @classmethod
     def of(cls, description: SourceDescription) -> RecordingFacts:
@@ -143,7 +143,9 @@ class Quality(Part):
 
 
 class NextFrameQuality(Part):
-    """Prediction scores: each frame is rendered at its time and pose and scored before the model is trained on it."""
+    """Prediction scores: each frame is rendered at its time and pose and scored before the model is trained on it.
+    Scores are in dB.
+    """
 
     psnr_tissue_db: float | None
     """Mean tissue PSNR of the predictions. In a live run: after the first second, of every fourth
@@ -154,7 +156,7 @@ class NextFrameQuality(Part):
 
 
 class BaselineQuality(Part):
-    """Tissue PSNR of trivial baselines on the same recording."""
+    """Tissue PSNR in dB of trivial baselines on the same recording; null if not measured."""
 
     previous_frame_db: float | None
     """Previous raw frame, from the second frame on."""
@@ -177,10 +179,10 @@ class DepthErrors(Part):
 
 
 class TruthFacts(Part):
-    """Scores of content hidden from the camera, against the ground truth of a synthetic recording."""
+    """Scores against the ground truth of a synthetic recording; null where the recording has none."""
 
     behind_tools_psnr_db: float | None
-    """PSNR over pixels that are behind a tool and were visible in an earlier frame, against the true picture
+    """PSNR in dB over pixels that are behind a tool and were visible in an earlier frame, against the true picture
     without the tool."""
     last_seen_psnr_db: float | None
     """Trivial baseline of `behind_tools_psnr_db`: each pixel with its last visible value."""
@@ -203,7 +205,7 @@ class QualityReport(Part):
     """Scores of frames without training; null without `--heldout`."""
     baselines: BaselineQuality
     truth: TruthFacts | None = None
-    """Scores of content hidden from the camera. Null if the recording has no ground truth behind its tools."""
+    """Scores against ground truth. Null if the recording has none of depth or of the tissue behind its tools."""
     training: Quality | None = None
     """Training error of an offline reconstruction: training frames after all training. Null for a replay."""
 
@@ -216,12 +218,12 @@ class ModelFacts(Part):
 
 
 class LiveFacts(Part):
-    """Throughput and picture ages of a live run."""
+    """Throughput, scores and picture ages of a live run; scores are null if no frame was scored."""
 
     settled_psnr_tissue_db: float | None
-    """Training error: mean after the first second, of the displayed picture when the next frame arrived."""
+    """Training error: mean tissue PSNR in dB after the first second, of the picture displayed when the next frame came."""
     worst_psnr_tissue_db: float | None
-    """Lowest score of a frame after the first second, in dB."""
+    """Lowest tissue PSNR of a frame after the first second, in dB."""
     previous_frame_db: float | None
     """Trivial baseline: mean tissue PSNR in dB of the previous raw frame, after the first second."""
     pictures: Count
@@ -236,9 +238,7 @@ class LiveFacts(Part):
     reports and shorter runs.
     """
     used_age_p99_ms: float | None = None
-    """99th percentile after the first second without pictures of withheld and damaged frames, which show the content of
-    an earlier frame.
-    """
+    """`settled_age_p99_ms` without pictures of withheld and damaged frames, which show the content of an earlier frame."""
     first_picture_ms: float | None
     states: dict[str, Count]
     """Number of transitions into each display state."""
@@ -261,24 +261,24 @@ class LiveFacts(Part):
 
 
 class FrameEntry(Part):
-    """Scores of one displayed frame."""
+    """Scores of one displayed frame; null where it has none."""
 
     seq: Count
     time_s: float
     trained: bool
     model_version: Count
     psnr_tissue_db: float | None
-    """Score of the displayed picture; a training error if the frame was `trained` on."""
+    """Tissue PSNR in dB of the displayed picture; a training error if the frame was `trained` on."""
     psnr_frame_db: float | None
     ssim: float | None
     previous_frame_db: float | None
     """Trivial baseline: tissue PSNR in dB of the previous raw frame."""
     next_frame_db: float | None = None
-    """Score of the model's prediction of this frame before training on it; null without a prediction."""
+    """Tissue PSNR in dB of the model's prediction of this frame before training on it."""
     age_ms: float | None = None
-    """Age of the displayed picture at display, in milliseconds; only in live runs."""
+    """Age of the displayed picture at display, in milliseconds; null except in live runs."""
     steps: Count | None = None
-    """Number of optimiser steps on the frame of the displayed picture, which may be an older frame."""
+    """Number of optimiser steps on the frame of the displayed picture, which may be an older frame; as `age_ms`."""
 
 
 class BinEntry(FrameEntry):

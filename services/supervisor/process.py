@@ -120,7 +120,7 @@ class ProcessState:
     heard_s: float | None
     """Seconds since the last heartbeat; None if the process does not run or has not sent one."""
     rate_hz: float | None = None
-    """Captured frames or new pictures per second over the last `RATE_S`."""
+    """Captured frames or new pictures per second over the last `RATE_S` seconds; None until 0.5 s are measured."""
     lost: bool = False
     """True if the source of a capture process gave no frames for `LOST_AFTER_S`."""
 

@@ -162,7 +162,7 @@ class LayerScene:
     metric: bool = False
     """True if the scene's unit is known to be the millimetre."""
     planes: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None
-    """Depth and opacity [H, W] from the camera, if rendered with the picture."""
+    """Depth and opacity [H, W] from the camera, rendered with the picture; None to render them when needed."""
 
 
 class LayerDrawing:

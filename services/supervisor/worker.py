@@ -84,7 +84,7 @@ class ProcessSpec(_Strict):
     engine: EngineSpec | None = None
     limits: ProcessLimits = ProcessLimits()
     supervisor: dict[str, int | str] | None = None
-    """Identity of the process that wrote the file; set by `write`."""
+    """Identity of the process that wrote the file; None until `write` sets it in the file."""
 
     @model_validator(mode="after")
     def _for_one_role(self) -> ProcessSpec:

@@ -172,7 +172,7 @@ class Contents:
     as they are.
     """
     undistortion: Undistortion | None = None
-    """Maps of a distorted lens; `calibration` is then that of the camera without distortion."""
+    """Maps of a distorted lens; `calibration` is then that of the camera without distortion. None if no map is used."""
     other_files: tuple[Path, ...] = ()
     """Further files of the recording, with its calibration and description."""
 

@@ -331,9 +331,10 @@ def _with_sidecars(
     findings: Findings,
     right_eye: FrameImages | None = None,
 ) -> Contents | None:
-    """Add the sidecar files to the images.
+    """Add the sidecar files to the images. Missing sidecars are skipped; a present but unusable one is a problem.
 
-    Missing sidecars are skipped. A present but unusable sidecar is a problem.
+    Returns:
+        The contents; None without images or after a problem.
     """
     if images is None:
         return None

@@ -50,7 +50,7 @@ class Recording(Protocol):
     fields: frozenset[str]
     """Optional frame fields that are present: any of mask, depth, right_image, pose, labels and ranges."""
     stereo_baseline_mm: float | None
-    """Distance of the right eye along the camera's x axis in mm, if known."""
+    """Distance of the right eye along the camera's x axis in mm; None if unknown."""
 
     @property
     def digest(self) -> str:

@@ -283,7 +283,7 @@ class GroundTruth:
     behind: TissueBehindTools | None = None
 
     def depth_of(self, frame: Frame) -> NDArray[np.float32] | None:
-        """Return the true depth at the frame's size, or the frame's own depth if the recording has no other."""
+        """Return the true depth at the frame's size, or the frame's own depth (may be None) if the recording has none."""
         if self.true_depth is None or frame.seq >= len(self.true_depth.files):
             return frame.depth
         depth = self.true_depth.read(frame.seq, Findings(strict=True))

@@ -355,7 +355,7 @@ def _rotation(path: Path, container: Container) -> int:
 def _with_first_frame(
     path: Path, container: Container, index: VideoIndex, fps: float, findings: Findings
 ) -> VideoFrames | None:
-    """Return the video if its first frame is intact, because it initialises the scene."""
+    """Return the video; None after a problem with its first frame, which must be intact to initialise the scene."""
     video = VideoFrames(path, container, index, fps, _rotation(path, container))
     first = video.look_at_first()
     if first is None:

@@ -87,7 +87,7 @@ class AdamOnDevice(NamedTuple):
     step: Tensor
     """Number of the optimiser step, counted from 1, int64 [1]."""
     status: Tensor | None = None
-    """Status int32 [4] of the rendered frame; if its tile lists overflowed, the step changes nothing."""
+    """Status int32 [4] of the rendered frame; if its tile lists overflowed, the step changes nothing. None: no check."""
     betas: tuple[float, float] = (0.9, 0.999)
     epsilon: float = 1e-8
 

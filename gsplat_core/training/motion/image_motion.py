@@ -75,8 +75,8 @@ class ImageMotion:
         return smoothed(flow, tissue)
 
     def _pixel_flow(self, image: NDArray[np.uint8]) -> NDArray[np.float32] | None:
-        """Return the raw flow [h, w, 2] in pixels of the full picture. h and w are half the picture's size if it was
-        halved.
+        """Return the raw flow [h, w, 2] from the previous picture in pixels of the full picture; h and w are half its
+        size if it was halved. None for the first picture, a new size or a tiny picture.
         """
         grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
         height, width = grey.shape
