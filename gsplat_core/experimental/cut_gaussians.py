@@ -90,7 +90,7 @@ class _Side(torch.autograd.Function):
         # Smallest shift to first order of one coordinate of one control point that moves the curve to the point.
         flat = slopes.flatten(-2)
         largest, which = flat.abs().max(-1)
-        shift = -value / torch.where(largest > 0, flat.gather(-1, which[..., None])[..., 0], torch.inf)
+        shift = torch.where(largest > 0, -value / flat.gather(-1, which[..., None])[..., 0], torch.inf)
         ctx.save_for_backward(inside, which, shift)
         ctx.shape = curves.shape
         return inside.to(points.dtype)
