@@ -112,7 +112,7 @@ STRATEGIES: Registry[StrategyKind] = Registry(
     "strategy",
     {
         "streaming": "gsplat_core.training.strategies.streaming:KIND",
-        "birth_death": "gsplat_core.training.strategies.birth_death:KIND",
+        "birth_death": "gsplat_core.training.strategies.mcmc:BIRTH_DEATH",
         "adc": "gsplat_core.training.strategies.adc:KIND",
         "mcmc": "gsplat_core.training.strategies.mcmc:KIND",
     },

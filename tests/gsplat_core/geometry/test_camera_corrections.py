@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from gsplat_core import InvalidInput, rasterization
-from gsplat_core.poses.camera_corrections import CameraCorrections
-from gsplat_core.poses.se3 import exp, inverse, log
+from gsplat_core.poses.se3 import CameraCorrections, exp, inverse, log
 from tests.gsplat_core.rendering.test_unscented import H, W, scene
 
 SIGMAS = {"translation_sigma": 0.05, "rotation_sigma": 0.02}

@@ -16,7 +16,7 @@ from gsplat_core.training.growth.initialisation import gaussians_from_frame
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.steps.step import TrainingStep
-from gsplat_core.training.strategies.birth_death import birth_death, relocated
+from gsplat_core.training.strategies.mcmc import birth_death, relocated
 from gsplat_core.training.strategies.streaming import UNSEEN_PX, Shares, densify, halves, shares_of
 
 

@@ -11,7 +11,7 @@ from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.metrics import psnr_tissue_db
-from gsplat_core.training.motion.surface_tracks import steady_course
+from gsplat_core.training.offline import steady_course
 from gsplat_core.training.reconstructor import Reconstructor
 from tests.gsplat_core.training.two_eyes import LEFT, stereo_frame
 

@@ -17,8 +17,8 @@ from gsplat_core.scene.frames import Frame
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.growth.initialisation import gaussians_from_frame
 from gsplat_core.training.motion.image_motion import Seen
-from gsplat_core.training.motion.surface_tracks import SurfaceDepth, SurfaceTracks, between_known, steady_course
 from gsplat_core.training.observations import Observation
+from gsplat_core.training.offline import SurfaceDepth, SurfaceTracks, between_known, steady_course
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.steps.step import TrainingStep
 
