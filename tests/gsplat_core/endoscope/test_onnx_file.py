@@ -178,3 +178,50 @@ def test_messages_that_end_within_a_field_are_refused(data):
 
 def test_values_in_the_tensor_are_not_external():
     assert not has_external_data(tagged(7, tagged(5, bytes([14 << 3, 0]))))
+
+
+def encoded(number: int, length: int = 0) -> bytes:
+    """Return a variable-length integer of at least `length` bytes."""
+    parts = []
+    while number > 0x7F or len(parts) + 1 < length:
+        parts.append(number & 0x7F | 0x80)
+        number >>= 7
+    return bytes([*parts, number])
+
+
+@pytest.mark.parametrize("number", [0, 1, 127, 128, 300, 2**35 + 5, 2**63, 2**64 - 1])
+def test_integers_of_variable_length_have_64_bits_at_most(number):
+    assert onnx.varint(memoryview(b"x" + encoded(number) + b"y"), 1) == (number, 1 + len(encoded(number)))
+    assert onnx.varint(memoryview(encoded(number, 10)), 0) == (number, 10)
+    with pytest.raises(ValueError, match="more than 64 bits"):
+        onnx.varint(memoryview(encoded(number, 11)), 0)
+    with pytest.raises(ValueError, match="ends too early"):
+        onnx.varint(memoryview(encoded(number, 5)[:-1]), 0)
+
+
+def test_fields_of_all_wire_types_are_read_in_order():
+    message = b"".join(
+        (
+            encoded(3 << 3 | 0), encoded(300), encoded(4 << 3 | 1), b"8 bytes!", encoded(5 << 3 | 2), encoded(4), b"text",
+            encoded(200 << 3 | 5), b"4 by",
+        )
+    )  # fmt: skip
+    found = list(onnx.fields(memoryview(message)))
+    assert [(number, value if isinstance(value, int) else bytes(value)) for number, value in found] == [
+        (3, 300), (4, b"8 bytes!"), (5, b"text"), (200, b"4 by"),
+    ]  # fmt: skip
+    assert isinstance(found[2][1], memoryview)
+    for end in (len(message) - 1, len(message) - 5, 10):
+        with pytest.raises(ValueError, match="ends too early"):
+            list(onnx.fields(memoryview(message[:end])))
+    with pytest.raises(ValueError, match="wire type 3"):
+        list(onnx.fields(memoryview(encoded(3 << 3 | 3))))
+    with pytest.raises(ValueError, match="ends too early"):
+        list(onnx.fields(memoryview(encoded(0 << 3 | 2) + encoded(0))))  # there is no field 0
+
+
+def test_values_are_those_of_all_messages_on_a_path():
+    inner = encoded(1 << 3) + encoded(5) + encoded(1 << 3) + encoded(6) + encoded(2 << 3) + encoded(9)
+    outer = (encoded(7 << 3 | 2) + encoded(len(inner)) + inner) * 2
+    assert onnx.values(memoryview(outer), 7, 1) == [5, 6, 5, 6]
+    assert onnx.values(memoryview(outer), 7, 3) == onnx.values(memoryview(outer), 6, 1) == []
