@@ -321,7 +321,9 @@ def _copy_database(source: Path, target: Path) -> None:
 
 
 def _copy_audit(source: Path, data: Path) -> None:
-    """Copy the audit log, its head first. Entries written meanwhile are cut off the copy."""
+    """Copy the audit log, its head first, until a copy is intact, at most `TRIES` times. Entries written meanwhile are
+    cut off the copy.
+    """
     for _ in range(TRIES):
         for left in data.glob("audit.*"):
             left.unlink()

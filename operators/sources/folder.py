@@ -180,7 +180,7 @@ class FolderSource(StreamSource):
         return files
 
     def _next(self) -> Picture | None:
-        """Return the next image; None if there is none or it is incomplete."""
+        """Return the next readable image; None if there is none, or the next file may be incomplete."""
         while (path := self._files.next()) is not None:
             try:
                 if path.is_symlink():

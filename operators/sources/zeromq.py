@@ -29,7 +29,7 @@ from operators.sources.live import StreamSource
 
 
 def is_of_this_machine(endpoint: str) -> bool:
-    """Return True if the endpoint is on this machine."""
+    """Return True for an `ipc` endpoint, a loopback address or `localhost`."""
     scheme, _, place = endpoint.partition("://")
     if scheme == "ipc":
         return True
@@ -234,7 +234,7 @@ class ZeroMqSource(StreamSource):
         raise SourceUnavailable(f"{self._name} cannot be opened: {what}. Start what sends to it, and check the keys.")
 
     def _next(self, look_ms: int = LOOK_MS) -> Frame | None:
-        """Receive the next frame; None if none arrived within `look_ms` milliseconds."""
+        """Receive the next frame; None after a malformed message, or if none arrived within `look_ms` milliseconds."""
         assert self._socket is not None and self._monitor is not None
         found = dict(self._poller.poll(look_ms))
         now_s = time.monotonic()

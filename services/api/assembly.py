@@ -124,7 +124,7 @@ class ArchiveMeasures(Collector):
         self._recordings, self._store = recordings, store
 
     def collect(self) -> Iterable[Metric]:
-        """Export the counts at scrape time; see `Collector`."""
+        """Export the counts at scrape time (none if the database is unavailable); see `Collector`."""
         replays = GaugeMetricFamily("intrasplat_replays", "Replays in each state.", labels=["state"])
         recordings = GaugeMetricFamily("intrasplat_recordings", "Uploaded recordings in each state.", labels=["state"])
         kept = GaugeMetricFamily("intrasplat_recordings_bytes", "What uploaded recordings take on the disk.")

@@ -69,7 +69,9 @@ class _Walk:
     """Last entries of removed ranges, as named by the entries `audit.retired`."""
 
     def read(self, path: Path, name: str) -> None:
-        """Verify the lines of a file. `name` is the segment's name for findings, empty for the current file."""
+        """Verify the lines of a file. `name` is the segment's name for findings, empty for the current file, whose last
+        line may be unfinished.
+        """
         self.last_line = 0
         for number, line in enumerate(_lines(path), start=1):
             if not line.endswith(b"\n") and len(line) <= MOST_LINE_BYTES and not name:

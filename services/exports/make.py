@@ -29,7 +29,7 @@ REFUSED = 2
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Create one export file. Return the exit code."""
+    """Create one export file. Return the exit code: 0, or `REFUSED` after a UserError."""
     keep_files_private()
     parser = argparse.ArgumentParser(prog="python -m services.exports.make", description="Export an unpacked model.")
     parser.add_argument("folder", type=Path, metavar="FOLDER")

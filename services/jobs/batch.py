@@ -193,8 +193,8 @@ def _removed_on_failure(out: Path) -> Iterator[None]:
 
 
 def fingerprint_of(recording: Path) -> str:
-    """Return a digest of the names, sizes, first and last bytes of a recording's files. Much faster
-    than hashing all content."""
+    """Return a digest of the names, sizes, first and last bytes of a recording's files (of an unreadable file: name and
+    error number). Much faster than hashing all content."""
     digest = hashlib.sha256()
     for path in sorted(each for each in recording.rglob("*") if each.is_file()) if recording.is_dir() else [recording]:
         try:

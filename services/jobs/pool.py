@@ -221,7 +221,7 @@ def main() -> int:
     """Run the pool until standard input closes, a signal arrives, or no job has run for `idle_s`.
 
     Returns:
-        The exit code.
+        Exit code: 0, or 2 if the database is unavailable.
     """
     keep_files_private()
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")

@@ -46,11 +46,7 @@ class Unusable(Exception):
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Check one folder and print the result.
-
-    Returns:
-        The exit code.
-    """
+    """Check one folder and print the result. Return the exit code: 0, or 1 if the machine prevented the check."""
     keep_files_private()
     options = _options(arguments)
     say = _say_json if options.json else _say_words

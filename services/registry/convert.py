@@ -26,11 +26,7 @@ from services.registry.records import CHECK_MEMORY_BYTES, MOST_GAUSSIANS, limit_
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Convert one file and print the result.
-
-    Returns:
-        The exit code.
-    """
+    """Convert one file and print the result. Return the exit code: 0, or 1 if the machine prevented the conversion."""
     keep_files_private()
     parser = argparse.ArgumentParser(prog="python -m services.registry.convert", description="Convert a splat file.")
     parser.add_argument("file", type=Path, metavar="FILE")

@@ -275,11 +275,7 @@ def _sentence(source: FrameSource) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the capture process until a stop is requested.
-
-    Returns:
-        The exit code.
-    """
+    """Run the capture process until a stop is requested. Return the exit code: 0, or `NO_USE` after a UserError."""
     keep_files_private()
     parser = argparse.ArgumentParser(description="Capture process of a stream.")
     parser.add_argument("--spec", required=True, help="file with the specification")

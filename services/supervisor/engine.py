@@ -332,11 +332,7 @@ def graph_figures(graph: Pipeline) -> dict[str, object]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the engine process until a stop is requested.
-
-    Returns:
-        The exit code.
-    """
+    """Run the engine process until a stop is requested. Return the exit code: 0, or `NO_USE` after a UserError."""
     keep_files_private()
     parser = argparse.ArgumentParser(description="Engine process of a stream.")
     parser.add_argument("--spec", required=True, help="file with the specification")

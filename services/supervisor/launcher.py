@@ -456,11 +456,7 @@ def _become(module: str, arguments: Sequence[str], environment: Mapping[str, str
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the launcher until a stop is requested.
-
-    Returns:
-        The exit code.
-    """
+    """Run the launcher until a stop is requested. Return the exit code: 0, or 2 if the folder is unusable or in use."""
     keep_files_private()
     parser = argparse.ArgumentParser(description="Forks the processes of streams.")
     parser.add_argument("--folder", required=True, help="runtime folder")

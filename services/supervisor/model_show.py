@@ -149,7 +149,7 @@ class ModelShow:
         self._thread: threading.Thread | None = None
 
     def begin(self) -> None:
-        """Restore the model that the previous engine process displayed."""
+        """Display the model that the previous engine process displayed, if any; discard its record if it is unusable."""
         try:
             said = read_json(self._file)
             self.show(said)

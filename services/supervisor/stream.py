@@ -52,8 +52,8 @@ class Stream:
             settings: settings of the stream.
             specs: specifications of its processes.
             runtime: runtime folder of the service.
-            start: process starter. `ByLauncher` restarts engines quickly and is shared by the
-                streams of a runtime folder.
+            start: process starter; None for `Direct`. `ByLauncher` restarts engines quickly and is shared by the streams of
+                a runtime folder.
             on_event: called for each state change of a process.
         """
         self.settings, self.specs = settings, specs

@@ -226,7 +226,7 @@ def scratch_folder() -> Iterator[Path]:
 
 
 def remove_dead() -> list[Path]:
-    """Delete this user's scratch folders whose process has ended.
+    """Delete this user's scratch folders that are older than `NEW_S` and whose process has ended.
 
     Returns:
         The deleted folders.

@@ -69,7 +69,9 @@ class _Made(Generic[T]):
         self._error: BaseException | None = None
 
     def fill(self, items: Generator[T, None, None]) -> None:
-        """Produce the items in the background thread until the iterator ends or `stop` is called."""
+        """Produce the items in the background thread until the iterator ends, raises (kept for the consumer), or `stop`
+        is called.
+        """
         error: BaseException | None = None
         try:
             try:

@@ -442,7 +442,7 @@ def _calibrated(
 def _undistorted(
     root: Path, found: Calibration, baseline_mm: float | None, stereo: bool, findings: Findings
 ) -> _Calibrated:
-    """Return the calibration without distortion, and the maps to its pictures."""
+    """Return the calibration without distortion, and the maps to its pictures; the given one without maps after a problem."""
     if stereo:
         findings.problem(
             root,

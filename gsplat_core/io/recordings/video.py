@@ -58,7 +58,7 @@ def open_container(file: BinaryIO, container: Container) -> av.container.InputCo
 
 
 def read_index(opened: av.container.InputContainer, stream: av.VideoStream, container: Container) -> VideoIndex:
-    """Read all packets of a stream once to build the index."""
+    """Read the packets of a stream once, up to the first error of the container, to build the index."""
     times: list[int | None] = []
     shown = bytearray()
     keys = bytearray()
@@ -264,7 +264,7 @@ def _opened(path: Path, container: Container) -> Iterator[tuple[av.container.Inp
 
 
 def _numbered(container: av.container.InputContainer, stream: av.VideoStream) -> Iterator[tuple[int, av.Packet | None]]:
-    """Yield the packets with data, numbered as in the index, then None to flush the decoder."""
+    """Yield the packets with data up to an error, numbered as in the index, then None to flush the decoder."""
     number = 0
     packets = iter(container.demux(stream))
     while True:
@@ -343,7 +343,7 @@ def _is_edited(index: VideoIndex) -> bool:
 
 
 def _rotation(path: Path, container: Container) -> int:
-    """Return the counter-clockwise display rotation in degrees stated by the container."""
+    """Return the counter-clockwise display rotation in degrees stated by the container; 0 if no frame can be decoded."""
     with _opened(path, container) as (opened, stream), captured_log():
         try:
             frame = next(opened.decode(stream), None)

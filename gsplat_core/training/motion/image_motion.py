@@ -128,7 +128,7 @@ def consistent_flow(
         first: RGB uint8 [H, W, 3].
         second: RGB uint8 [H, W, 3].
         first_mask: [H, W], non-zero on tissue, or None for all.
-        second_mask: mask of the second picture.
+        second_mask: the same for the second picture.
     """
     height, width = first.shape[:2]
     nothing = np.full((height, width, 2), np.nan, np.float32)

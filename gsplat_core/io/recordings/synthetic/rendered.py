@@ -215,7 +215,7 @@ def _keep(recording: RenderedRecording, path: Path, most_bytes: int) -> None:
 
 
 def _make_room(folder: Path, most_bytes: int) -> None:
-    """Evict files until the rest fits into `most_bytes`; other processes may do so concurrently."""
+    """Delete the least recently used files until the rest fits into `most_bytes`; other processes may do so concurrently."""
     files = []
     for path in folder.glob(f"*{SUFFIX}"):
         with contextlib.suppress(FileNotFoundError):
