@@ -128,13 +128,13 @@ def _cost(
 
 
 SMALL_STEP = 0.02
-"""Penalty P1 of semi-global matching for a difference of one label between neighbours."""
+"""Penalty P1 of semi-global matching for a difference of one label between neighbours; a pixel's cost is 0 to 1."""
 LARGE_STEP = 0.1
-"""Penalty P2 for a difference of several labels between neighbours."""
+"""Penalty P2 of semi-global matching for a difference of several labels between neighbours."""
 
 
 def aggregated(cost: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Aggregate matching costs [H, W, D] over paths from four directions."""
+    """Return the sum of the path costs of semi-global matching from four directions, for matching costs [H, W, D]."""
     total = np.zeros_like(cost)
     _add_paths(cost, total)
     sideways, across = (
@@ -146,7 +146,7 @@ def aggregated(cost: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _add_paths(cost: NDArray[np.float32], total: NDArray[np.float32]) -> None:
-    """Accumulate path costs along the first axis in both directions."""
+    """Add the path costs along the first axis, in both directions, to `total`."""
     for rows in (range(len(cost)), range(len(cost) - 1, -1, -1)):
         before: NDArray[np.float32] | None = None
         for row in rows:

@@ -266,8 +266,8 @@ def _smooth(grey: NDArray[np.uint8], judged: NDArray[np.bool_]) -> float:
 
 
 def _straight(image: NDArray[np.uint8], lit: NDArray[np.bool_]) -> float:
-    """Return the agreement of edge directions inside the lit area [h, w] without its border, which often belongs to a
-    round or square view; 0 with too few edges.
+    """Return the agreement of edge directions, 1 if all are parallel or perpendicular, 0 for none or too few edges. The
+    border of the lit area [h, w], which often belongs to a round or square view, is left out.
     """
     size = _size(image, EDGES_SIDE_PX)
     grey = luma(averaged(image, size))

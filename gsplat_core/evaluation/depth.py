@@ -144,7 +144,7 @@ class DepthSums:
         """Compare rendered depth z [H, W], 0 = unknown, with the frame's depth.
 
         Returns:
-            Mean absolute error, NaN if nothing is comparable.
+            Mean absolute error in the unit of the frame's depth, NaN if nothing is comparable.
         """
         if frame.depth is None:
             return math.nan

@@ -178,7 +178,7 @@ class ViewSums:
     def _distance(
         self, frame: Frame, own: Camera, true: NDArray[Any] | None, depth: NDArray[Any] | None
     ) -> float | None:
-        """Return the median tissue distance, from true depth if known, otherwise from the model's; None without both."""
+        """Return the median tissue depth in the recording's unit: true if known, otherwise the model's; None without both."""
         known = np.zeros(0) if true is None else true[(true > 0) & (True if frame.mask is None else frame.mask != 0)]
         if not known.size:
             shows = self._shown(own, frame).depth if depth is None else depth

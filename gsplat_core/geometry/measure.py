@@ -45,7 +45,7 @@ class SurfacePoint:
     position: tuple[float, float, float]
     """Position of the surface point in world coordinates."""
     depth: float
-    """z in camera coordinates."""
+    """z in camera coordinates, in the scene's unit."""
     depth_error: float
     """Standard error of `depth`, in its unit. The point is exactly on the pixel's ray."""
     source_error: float
@@ -57,7 +57,7 @@ class SurfacePoint:
 
     @property
     def position_error(self) -> float:
-        """Standard error of the position along the ray."""
+        """Standard error of the position along the ray, in the scene's unit."""
         return self.depth_error * math.hypot(*self.along_ray)
 
 

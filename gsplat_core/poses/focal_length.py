@@ -138,7 +138,7 @@ def _search(start: Bundle, side_px: float) -> FocalLength:
 
 
 def _refine(tries: dict[float, _Try], tried: Callable[[float, _Try], _Try]) -> None:
-    """Refine by golden-section search between the neighbours of the best candidate, on a logarithmic scale."""
+    """Add candidates to `tries` by golden-section search between the neighbours of the best one, on a logarithmic scale."""
     ordered = sorted(tries)
     at = min(range(len(ordered)), key=lambda number: tries[ordered[number]].cost)
     low, high = ordered[max(at - 1, 0)], ordered[min(at + 1, len(ordered) - 1)]

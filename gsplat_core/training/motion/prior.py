@@ -128,8 +128,8 @@ class DepthFromMotion:
     def _distance(
         self, pixels: Tensor, target: Tensor, motion: SurfaceMotion, known: Tensor, information: Tensor
     ) -> float | None:
-        """Return the distance of the plane that explains most of the motion. Returns None with too little parallax or
-        if no plane explains enough.
+        """Return the depth of the plane parallel to the picture that explains most of the motion. None with too little
+        parallax, or if no such plane explains enough.
         """
         c, d = parallax_terms(pixels, target, motion.before, motion.after)
         focal = float(motion.after.K[0, 0])

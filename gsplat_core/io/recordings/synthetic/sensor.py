@@ -121,7 +121,7 @@ class Sensor:
     read_noise: float = 0.0
     """Standard deviation of the noise in the dark, in radiance."""
     sharpening: float = 0.0
-    """Strength of the camera's unsharp mask."""
+    """Strength of the camera's unsharp mask: factor on the difference from a blurred picture, which is added."""
     quality: int | None = None
     """JPEG quality of the compression; None for none."""
 
