@@ -31,7 +31,7 @@ LEAST_SURROUND = 0.015
 LEAST_FIELD = 0.15
 """Smallest share of the picture covered by the field."""
 ELLIPSE_SHARE = 0.7
-"""Share of the outline that must be on the fitted ellipse for the ellipse to replace it."""
+"""Share of the outline off the picture's border that must be on the fitted ellipse for the ellipse to replace it."""
 ELLIPSE_DISTANCE = 0.015
 """Largest distance from the ellipse, towards its centre or away from it, at which a point of the outline counts as on the
 ellipse. As a share of the ellipse's diameter in that direction.

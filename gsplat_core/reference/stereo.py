@@ -24,7 +24,7 @@ UNKNOWN = torch.iinfo(torch.int32).min
 
 
 def match_disparities(left: Tensor, right: Tensor, lowest: int, count: int) -> tuple[Tensor, Tensor]:
-    """Match rectified grey pictures, uint8 [H, W].
+    """Match rectified grey pictures, uint8 [H, W], at `count` disparities in pixels from `lowest` on.
 
     Returns:
         Disparities in 1/16 px, int32 [H, W], and a mask [H, W] of pixels without jump or hole nearby.

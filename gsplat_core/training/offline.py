@@ -102,8 +102,8 @@ class SurfaceTracks:
         return torch.stack([_world(pixels[k], depth[:, k], one) for k, one in enumerate(self._seen)], dim=1)
 
     def _across(self, points: Tensor, number: int) -> Tensor:
-        """Return trajectories with motion across the picture only. Depth differences of static tissue are errors. They
-        would move points in front of other points.
+        """Return the trajectories of points seen in frame `number`, with motion across the picture only. Depth differences
+        of static tissue are errors and would move points in front of other points.
         """
         cameras = [one.camera for one in self._seen]
         after = _path(points, self._flows_ahead[number:], cameras[number:])

@@ -246,7 +246,9 @@ class _Fitting:
         """Time before the first step of the last training, in seconds."""
 
     def done(self, steps: int | None) -> Fitted:
-        """Train with a number of steps; None chooses the number and the inputs first."""
+        """Train with a number of steps. None first chooses the number and the inputs (poses, depth, right eye) that are
+        best for validation frames.
+        """
         settings = self._settings
         with seeded(settings.seed, settings.device):
             inputs = _Inputs(self._source, settings)
