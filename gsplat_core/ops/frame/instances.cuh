@@ -60,7 +60,7 @@ __device__ inline TileEllipse ellipse_of_record(const float4& xyab, float c, flo
   return tile_ellipse(xyab.x, xyab.y, -xyab.z, -0.5f * xyab.w, -c, l + (7e-4f - kLog2AlphaCutoff));
 }
 
-// Return the tiles that the ellipse of `box` touches; {0, 0} if there are none.
+// Return the tiles that the ellipse of `box` touches, or the box itself if it has more than 32 tiles; {0, 0} if none.
 __device__ inline Footprint footprint_of(const TileBox& box) {
   const int width = box.right - box.left, height = box.bottom - box.top;
   if (width <= 0 || height <= 0) return {0, 0};

@@ -176,8 +176,8 @@ struct Lane {
   float u, v, z, conic[3], half[2], determinant, opacity, plane[3], reach;
 };
 
-// Compute the box of the sub-pixels whose centres are at most half[0] and half[1] from the splat's centre. False if it
-// is empty.
+// Compute the box of the picture's sub-pixels whose centres are at most half[0] and half[1] from the splat's centre, with
+// a small margin. False if it is empty.
 GSPLAT_INLINE bool box_of(const Request& view, const Lane& lane, Splat& out, int64_t& fragments) {
   const float s = float(view.supersampling);
   const float centre[2] = {lane.u, lane.v};
