@@ -5,12 +5,15 @@ from __future__ import annotations
 import asyncio
 import tempfile
 from pathlib import Path
+from types import SimpleNamespace
+from typing import ClassVar
 
 import pytest
 
 from services.bus.runtime import RuntimeFolder
 from services.errors import Conflict, NotFound, Rejected
 from services.settings import StreamSettings
+from services.supervisor import stream as stream_module
 from services.supervisor.stream import SupervisedStreams
 
 
@@ -66,3 +69,105 @@ def test_what_cannot_be_is_refused_and_changes_nothing(streams):
             streams.create("too-many", stream())
 
     asyncio.run(run())
+
+
+class Process:
+    """Stand-in for a supervised process."""
+
+    made: ClassVar[list[Process]] = []
+
+    def __init__(self, spec, folder, start, on_event):
+        self.role, self.opened, self.closed = spec.role, 0, []
+        self.state = SimpleNamespace(state="running", reason="")
+        self.made.append(self)
+
+    def open(self):
+        self.opened += 1
+
+    async def close(self, reason):
+        self.closed.append(reason)
+
+
+class Hub:
+    def __init__(self, folder):
+        self.folder, self.closed = folder, 0
+
+    async def close(self):
+        self.closed += 1
+
+
+@pytest.fixture
+def processes(monkeypatch, streams):
+    monkeypatch.setattr(Process, "made", [])
+    monkeypatch.setattr(stream_module, "ManagedProcess", Process)
+    monkeypatch.setattr(stream_module, "DisplayHub", Hub)
+    monkeypatch.setattr(streams._launcher, "open", lambda: Process.made.append("launcher"))
+    return Process.made
+
+
+def test_a_stream_is_started_once_and_leaves_nothing_when_it_stops(streams, processes):
+    async def run():
+        streams.create("theatre-1", stream())
+        assert processes == []
+        await streams._stream("theatre-1").start()
+        await streams._stream("theatre-1").start()
+        assert sorted(process.role for process in processes) == ["capture", "engine"]
+        assert [process.opened for process in processes] == [1, 1]
+        assert streams.engine("theatre-1").role == "engine"
+        processes[1].state.state = processes[0].state.state = "starting"
+        with pytest.raises(Conflict, match="ask again when the stream is live"):
+            streams.engine("theatre-1")
+        made, hub = streams._stream("theatre-1"), streams._stream("theatre-1").hub
+        folder = made.folder.path
+        assert folder.exists()
+        await made.stop("why")
+        await made.stop("again")
+        assert [process.closed for process in processes] == [["why"], ["why"]] and hub.closed == 1
+        assert not folder.exists() and made.hub is None and made.processes == {}
+        with pytest.raises(Conflict, match="stopped"):
+            streams.engine("theatre-1")
+
+    asyncio.run(run())
+
+
+def test_a_launcher_is_there_before_the_first_stream_starts(streams, processes, monkeypatch):
+    monkeypatch.setattr(stream_module.Stream, "view", lambda self: self.name)
+
+    async def run():
+        streams.create("theatre-1", stream())
+        assert await streams.start("theatre-1") == "theatre-1"
+        assert processes[0] == "launcher" and len(processes) == 3
+
+    asyncio.run(run())
+
+
+def test_streams_of_the_settings_are_made_and_those_that_say_so_started(streams, processes, monkeypatch):
+    closed, removed = [], []
+
+    async def close(*, stop):
+        closed.append(stop)
+
+    monkeypatch.setattr(stream_module, "remove_dead", lambda: removed.append(None))
+    monkeypatch.setattr(stream_module.Stream, "view", lambda self: self.name)
+    monkeypatch.setattr(streams._launcher, "close", close)
+
+    async def run():
+        at_start = {"one": stream(), "two": stream().model_copy(update={"start": False})}
+        async with streams.running(at_start):
+            assert [each.name for each in streams.streams()] == ["one", "two"]
+            assert [each.hub is not None for each in streams.streams()] == [True, False]
+            assert len(removed) == 1 and closed == []
+        assert [process.closed for process in processes[1:]] == [["the server ends"]] * 2
+        assert closed == [True] and len(removed) == 2
+
+    asyncio.run(run())
+
+
+def test_a_stream_without_a_gpu_of_its_own_gets_another_one(streams, processes, monkeypatch):
+    monkeypatch.setattr(stream_module, "gpus", lambda: 2)
+    monkeypatch.setattr(stream_module.Stream, "view", lambda self: self.name)
+    gpus = []
+    for number in range(3):
+        streams.create(f"theatre-{number}", stream().model_copy(update={"device": "cuda"}))
+        gpus.append(streams._streams[f"theatre-{number}"].specs["engine"].engine.gpu)
+    assert gpus == [0, 1, 0]
