@@ -136,13 +136,12 @@ class Mesh:
     """Vertex indices [T, 3], counter-clockwise seen from the visible side; empty for a point cloud."""
 
 
-def mesh_of(model: Model, time_s: float, camera: Camera | None = None) -> Mesh:
-    """Mesh the surface that a camera sees at a time, with one vertex per pixel that shows tissue.
+def mesh_of(model: Model, time_s: float) -> Mesh:
+    """Mesh the surface that the model's camera sees at a time, with one vertex per pixel that shows tissue.
 
     Args:
         model: model to export.
         time_s: time in seconds.
-        camera: viewpoint; None for the model's own camera.
 
     Returns:
         The mesh in world coordinates.
@@ -150,7 +149,7 @@ def mesh_of(model: Model, time_s: float, camera: Camera | None = None) -> Mesh:
     Raises:
         ExportError: if no surface is visible.
     """
-    camera = camera or model.camera
+    camera = model.camera
     with torch.inference_mode():
         surface = model.surface(time_s, camera)
         image = model.render(time_s, camera, depth=False).image

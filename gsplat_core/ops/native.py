@@ -69,11 +69,11 @@ def cuda_build() -> str:
     return f"nvcc {version} for {', '.join(str(int(number) / 100) for number in architectures.split(','))}"
 
 
-def cuda_refusal(device: int = 0) -> str | None:
-    """Return CUDA's reason why the kernels cannot run on a GPU, or None. Initialises CUDA."""
+def cuda_refusal() -> str | None:
+    """Return CUDA's reason why the kernels cannot run on the first GPU, or None. Initialises CUDA."""
     refusal = ctypes.CDLL(str(CUDA_LIBRARY_PATH)).gsplat_core_cuda_refusal
     refusal.restype = ctypes.c_char_p
-    with torch.cuda.device(device):
+    with torch.cuda.device(0):
         torch.cuda.synchronize()
         said = refusal()
     return None if said is None else str(said.decode())

@@ -359,8 +359,7 @@ class Place:
 class Places:
     """Store of the scenes that the stream left most recently."""
 
-    def __init__(self, most: int = MOST_PLACES) -> None:
-        self._most = most
+    def __init__(self) -> None:
         self._left: list[Place] = []
 
     def __len__(self) -> int:
@@ -378,7 +377,7 @@ class Places:
         self.to_host()
         kept = gaussians.map(lambda tensor: tensor.detach().to(torch.float32, copy=True))
         place = Place(kept, camera, time_s, {} if seen is None else {camera: seen})
-        self._left = [*self._left, place][-self._most :] if self._most else []
+        self._left = [*self._left, place][-MOST_PLACES:]
 
     def to_host(self) -> None:
         """Move all scenes to host memory. The first picture of the next scene need not wait for that."""

@@ -178,21 +178,18 @@ class SplitSource(DerivedSource):
 class JoinedSource(LiveSource):
     """Pairs each frame of the left source with the frame of the right source closest in arrival time.
 
-    A left frame waits for its right one for at most `apart_s`, by default half a frame interval. Without one it is
+    A left frame waits for its right one for at most half a frame interval. Without one it is
     emitted alone and counted
     as `without_right`, so that a lost eye never interrupts the stream.
     """
 
-    def __init__(
-        self, left: FrameSource, right: FrameSource, *, waiting: int = 2, apart_s: float | None = None
-    ) -> None:
+    def __init__(self, left: FrameSource, right: FrameSource, *, waiting: int = 2) -> None:
         """Create a source of stereo frames from a source per eye.
 
         Args:
             left: source of the left eye.
             right: source of the right eye.
             waiting: capacity of the queue for `read`, in frames.
-            apart_s: largest difference of arrival times in a pair, in seconds; None: half a frame interval.
 
         Raises:
             InvalidSetting: the sizes differ.
@@ -205,7 +202,7 @@ class JoinedSource(LiveSource):
                 f"the left eye has {about.width_px}x{about.height_px} px and the right one {other.width_px}x{other.height_px}; "
                 "they must have one size"
             )
-        self._apart_ns = round((apart_s or 0.5 / about.fps) * 1e9)
+        self._apart_ns = round(0.5 / about.fps * 1e9)
         self.description = replace(
             about,
             name=f"{about.name} and {other.name}",

@@ -53,7 +53,6 @@ from services.registry.records import (
 )
 
 MODEL_NAME = re.compile(r"[a-z0-9](?:[a-z0-9._-]{0,62}[a-z0-9])?")
-LAST_NUMBER = (1 << 31) - 1
 MOST_BY = 200
 
 
@@ -79,22 +78,10 @@ def check_by(by: str) -> None:
         raise Rejected(f"`by` must be 1 to {MOST_BY} printable characters that say who asks, got {by[:80]!r}")
 
 
-def add_version(
-    connection: sa.Connection, name: str, wanted: int | None, upload: StagedUpload, blob: str, by: str
-) -> VersionRecord:
-    """Insert the row of a stored upload, and the model's row for its first version.
-
-    Args:
-        wanted: required version number; None takes the next number.
-
-    Raises:
-        Conflict: if the number was already used, or is above `LAST_NUMBER`.
-    """
+def add_version(connection: sa.Connection, name: str, upload: StagedUpload, blob: str, by: str) -> VersionRecord:
+    """Insert the row of a stored upload with the next version number, and the model's row for its first version."""
     at = now().isoformat()
-    last = _last_version(connection, name, at)
-    number = last + 1 if wanted is None else wanted
-    if not last < number <= LAST_NUMBER:
-        raise Conflict(f"version {number} of model {name!r} cannot be given; the next free number is {last + 1}")
+    number = _last_version(connection, name, at) + 1
     connection.execute(sa.update(MODELS).where(MODELS.c.name == name).values(last_version=number))
     connection.execute(
         sa.insert(VERSIONS).values(
@@ -304,9 +291,7 @@ class ModelRegistry:
         self._database = Database(database_url or f"sqlite:///{folder.absolute() / DATABASE_FILE}")
         self._database.migrate()
 
-    def upload(
-        self, name: str, file: Path, digest: str | None, by: str, *, version: int | None = None
-    ) -> VersionRecord:
+    def upload(self, name: str, file: Path, digest: str | None, by: str) -> VersionRecord:
         """Store a copy of an `.isplat` file as a new version in the state `uploaded`.
 
         Args:
@@ -314,11 +299,9 @@ class ModelRegistry:
             file: path of the upload; the file stays in place.
             digest: SHA-256 stated by the sender, in hex, or None.
             by: the caller, for the record.
-            version: required version number; None takes the next number.
 
         Raises:
             Rejected: if name, size, digest or format is invalid.
-            Conflict: if the version number was already used.
         """
         check_name(name)
         check_by(by)
@@ -329,7 +312,7 @@ class ModelRegistry:
             try:
                 self._blobs.publish(staged.path, blob)
                 self._reached("blob stored")
-                return self._add(name, version, staged, blob, by)
+                return self._add(name, staged, blob, by)
             finally:
                 staged.path.unlink(missing_ok=True)
 
@@ -543,14 +526,10 @@ class ModelRegistry:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _add(self, name: str, version: int | None, staged: StagedUpload, blob: str, by: str) -> VersionRecord:
-        try:
-            with self._database.writing() as connection:
-                record = add_version(connection, name, version, staged, blob, by)
-                self._reached("row written")
-        except Conflict:
-            self._blobs.remove(blob)
-            raise
+    def _add(self, name: str, staged: StagedUpload, blob: str, by: str) -> VersionRecord:
+        with self._database.writing() as connection:
+            record = add_version(connection, name, staged, blob, by)
+            self._reached("row written")
         # After StoreUnavailable the row may or may not exist: `recover` removes the file if there is no row.
         self._reached("upload committed")
         return record

@@ -13,7 +13,7 @@ import struct
 import threading
 import warnings
 import zlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -192,12 +192,10 @@ class DamagedFrames:
 
     MAX_RUNS = 20
 
-    def __init__(self, numbers: Iterable[int] = ()) -> None:
+    def __init__(self) -> None:
         self.count = 0
         self._runs: list[tuple[int, int]] = []
         self._more = False
-        for number in numbers:
-            self.add(number)
 
     def add(self, number: int) -> None:
         """Record a damaged frame; numbers must be increasing."""

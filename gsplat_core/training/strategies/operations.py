@@ -27,9 +27,9 @@ ROWS_AT_ONCE = 1 << 16
 """Gaussians whose sums are computed together, with three temporary values of 8 bytes per Gaussian and coefficient."""
 
 
-def binomials(count: int = MOST_COPIES) -> Tensor:
-    """Return binomial coefficients C(n, k) for n, k < `count`, float32 [count, count]; 0 for k > n."""
-    return torch.tensor([[float(math.comb(n, k)) for k in range(count)] for n in range(count)])
+def binomials() -> Tensor:
+    """Return binomial coefficients C(n, k) for n, k < `MOST_COPIES` as a float32 matrix; 0 for k > n."""
+    return torch.tensor([[float(math.comb(n, k)) for k in range(MOST_COPIES)] for n in range(MOST_COPIES)])
 
 
 @functools.cache
