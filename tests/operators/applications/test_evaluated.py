@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from gsplat_core.errors import InvalidSetting
+from gsplat_core.errors import InvalidSetting, RecordingInvalid
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from operators.applications import evaluated
@@ -136,3 +136,25 @@ def test_a_recorded_session_has_the_run_s_own_times(monkeypatch, tmp_path):
     monkeypatch.setattr(evaluated, "SessionReader", lambda folder: SimpleNamespace(frame_lines=lambda: iter(lines)))
     playback, notes = evaluated._session_playback(model(0.0, 0.2), tmp_path, about(count=3))
     assert playback == Playback(0.2) and notes == []
+
+
+@pytest.mark.parametrize("made", ["file", "none", "damaged", "no run", "own poses"])
+def test_poses_that_the_run_estimated_are_those_of_its_frames(tmp_path, made):
+    """Frames beyond the last pose, of a recording that was read longer, have the last one."""
+    poses = np.eye(4)[None].repeat(3, 0)
+    poses[:, 0, 3] = 1, 2, 3
+    if made in ("file", "own poses"):
+        np.save(tmp_path / evaluated.POSES_FILE, poses)
+    if made == "damaged":
+        (tmp_path / evaluated.POSES_FILE).write_bytes(b"nothing")
+    run = None if made == "no run" else SimpleNamespace(folder=tmp_path)
+    source = SimpleNamespace(description=SimpleNamespace(fields={"pose"} if made == "own poses" else set()))
+    if made == "damaged":
+        with pytest.raises(RecordingInvalid, match="has no poses"):
+            evaluated.with_poses_of_run(source, run)
+        return
+    if made != "file":
+        assert evaluated.with_poses_of_run(source, run) is source
+        return
+    found = evaluated.with_poses_of_run(SimpleNamespace(description=about()), run)
+    assert [found._pose_of(frame(seq))[0, 3] for seq in (0, 2, 7)] == [-1, -3, -3], "from camera to world in the file"
