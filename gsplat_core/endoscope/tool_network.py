@@ -109,7 +109,8 @@ class NetworkToolFinder:
         """Do nothing, since no state is kept between pictures."""
 
     def find(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Segment a picture, RGB uint8 [H, W, 3]. Returns uint8 [H, W], 1 = tissue, 0 = tool.
+        """Segment a picture, RGB uint8 [H, W, 3]. Returns uint8 [H, W], 1 = tissue, 0 = tool. A picture with a side below
+        `SMALLEST_PX` is all tissue.
 
         Raises:
             InvalidInput: for any other array.

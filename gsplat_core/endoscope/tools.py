@@ -266,7 +266,8 @@ class ToolFinder:
         self._held = 0
 
     def find(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Segment the stream's next picture, RGB uint8 [H, W, 3]. Returns uint8 [H, W], 1 = tissue, 0 = tool.
+        """Segment the stream's next picture, RGB uint8 [H, W, 3]. Returns uint8 [H, W], 1 = tissue, 0 = tool. A picture
+        with a side below `SMALLEST_PX` is all tissue.
 
         Raises:
             InvalidInput: for any other array.
@@ -285,7 +286,9 @@ class ToolFinder:
         return tissue
 
     def _find(self, view: View) -> Bytes:
-        """Return a mask of the tools at working size: 1 on tools, else 0."""
+        """Return a mask of the tools at working size: 1 on tools, else 0; no tools in a dark picture. While the tools' area
+        is suddenly much smaller, the previous mask is added, for at most `HELD_FRAMES` frames.
+        """
         least_lit = int(0.25 * mean_level(view.levels))
         if view.levels[least_lit + 1 :].sum() < SMALLEST_SHARE * view.redness.size:
             self.reset()

@@ -274,7 +274,7 @@ class FlowSums:
         """Motion of the model and true motion [P, 3], in left-camera axes."""
 
     def begin(self, frame: Frame, own: Camera, shown: NDArray[Any], tissue: NDArray[np.bool_]) -> None:
-        """Sample a frame for comparison with the next one.
+        """Sample a frame for comparison with the next one, if its true motion is known at any pixel of `tissue`.
 
         Args:
             frame: frame of the recording.

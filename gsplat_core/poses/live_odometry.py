@@ -240,8 +240,8 @@ class LiveOdometry:
         return True
 
     def _close_loop(self, picture: SmallPicture) -> None:
-        """Search the picture for an earlier key frame. If one is recognised, track its points from
-        here on and correct the poses since then.
+        """Search the picture for an earlier key frame. If one is recognised, track its points from here on and correct the
+        poses since then; if it is of an earlier map, continue that map.
         """
         found = self._seen_by_pose(picture)
         if found is None:

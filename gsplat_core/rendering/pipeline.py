@@ -721,7 +721,9 @@ def blended_along_rays(
 
 
 def _length_of_rays(K: Tensor, settings: RenderSettings, like: Tensor) -> Tensor:
-    """Return the length [H, W] of each pixel's ray per unit of the blended depth."""
+    """Return the length [H, W] of each pixel's ray per unit of the blended depth: above 1 off the axis of a pinhole camera,
+    whose depth is z, and 1 [] for other cameras, whose depth is the length.
+    """
     if settings.camera_model != "pinhole":
         return like.new_ones(())
     x = (torch.arange(settings.width, device=like.device, dtype=like.dtype) + 0.5 - K[0, 2]) / K[0, 0]

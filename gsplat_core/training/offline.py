@@ -86,7 +86,9 @@ class SurfaceTracks:
                 follow(rows, times, self.trajectories(points, number) - points[:, None])
 
     def trajectories(self, points: Tensor, number: int) -> Tensor:
-        """Return the positions in every frame [N, T, 3] of points [N, 3] on the surface shown by frame `number`."""
+        """Return the positions in every frame [N, T, 3] of points [N, 3] on the surface shown by frame `number`. Without
+        depth, or with the scope at rest, points only move across the picture.
+        """
         if self._at_rest or not self._have_depth:
             return self._across(points, number)
         pixels = self._pixels(points, number)

@@ -273,7 +273,7 @@ class LiveSource(ThreadedSource):
         return {reason: times for reason, times in counts.items() if times}
 
     def open(self) -> None:
-        """Start reading. After `close` it restarts with frame 0."""
+        """Start reading, unless it was started. After `close` it restarts with frame 0."""
         if self._thread is not None:
             return
         self._counts.clear()

@@ -215,7 +215,7 @@ class ThreadedSource:
             return SourceState.STALLED if late else SourceState.LIVE
 
     def open(self) -> None:
-        """Start reading. After `close` it restarts with the first frame."""
+        """Start reading, unless it was started. After `close` it restarts with the first frame."""
         if self._thread is not None:
             return
         # A reader that outlived `close` keeps its own event, so it never writes into a later run's queue.

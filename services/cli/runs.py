@@ -160,7 +160,7 @@ class LiveStatus:
             print(file=sys.stderr)  # noqa: T201 - ends the refreshed line
 
     def __call__(self, graph: Pipeline, scored: ScoredFrame) -> None:
-        """Update the status line after a scored frame."""
+        """Update the status line after a scored frame, at most once per period, unless quiet."""
         now_s = time.monotonic()
         if self._quiet or now_s - self._printed_s < self._period_s:
             return

@@ -372,7 +372,7 @@ class ProgressPrinter:
 
     def __call__(self, progress: Progress) -> None:
         """Update the bar on a terminal. Otherwise print a line at the start, after the first frame and at the end of a
-        stage, and every `PLAIN_PERIOD_S` in between."""
+        stage, and every `PLAIN_PERIOD_S` seconds in between. Nothing if quiet."""
         if self._quiet:
             return
         now_s = time.monotonic()
@@ -409,7 +409,7 @@ class ProgressPrinter:
 
 
 def _quality(progress: Progress) -> str:
-    """Return the PSNR of the newest frame with its kind of error and the trivial baseline."""
+    """Return the PSNR of the newest frame with its kind of error and the trivial baseline; empty without a score."""
     if progress.psnr_tissue_db is None:
         return ""
     kind = "training error" if progress.trained else "held out"

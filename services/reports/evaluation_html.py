@@ -234,7 +234,7 @@ def _degrees(angle: float) -> str:
 
 
 def geometry_section(report: EvaluationReport) -> str:
-    """Return the rows as a table of `evaluation.html`."""
+    """Return the rows of `geometry_rows` as a table of `evaluation.html`; empty without rows."""
     geometry = report.geometry
     rows = [] if geometry is None else geometry_rows(geometry)
     if geometry is None or not rows:
@@ -254,7 +254,7 @@ def geometry_section(report: EvaluationReport) -> str:
 
 
 def geometry_lines(report: EvaluationReport) -> list[str]:
-    """Return the rows as lines for a terminal."""
+    """Return the rows of `geometry_rows` as lines for a terminal."""
     geometry = report.geometry
     rows = [] if geometry is None else geometry_rows(geometry)
     if geometry is None or not rows:

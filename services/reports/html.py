@@ -142,7 +142,7 @@ def _finite(value: float, digits: int = 2) -> str:
 
 
 def quality_over_time_section(report: RunReport) -> str:
-    """Return the chart of tissue PSNR per frame, with the previous-frame baseline."""
+    """Return the chart of tissue PSNR per frame, with the previous-frame baseline; empty without a series."""
     trained = [entry for entry in report.series if entry.trained]
     held_out = [entry for entry in report.series if not entry.trained]
     if not report.series:
@@ -311,7 +311,7 @@ def latency_section(report: RunReport) -> str:
 
 
 def operators_section(report: RunReport) -> str:
-    """Return the table of operator run times."""
+    """Return the table of operator run times; empty without any."""
     if not report.operators:
         return ""
     rows = "".join(

@@ -172,7 +172,9 @@ def read_sensor(path: Path, findings: Findings) -> RangeSensor | None:
 
 
 def resized_scan(scan: RangeScan, width_px: int, scale: float) -> RangeScan:
-    """Return a scan for a resized picture. Columns are averaged over the columns that each new one covers."""
+    """Return a scan for a resized picture. Columns are averaged over the columns that each new one covers; the single
+    histogram of a sensor of form `image` is unchanged.
+    """
     sensor = scan.sensor
     if isinstance(sensor, OctLine):
         sensor = dataclasses.replace(sensor, thickness_px=max(1, round(sensor.thickness_px * scale)))

@@ -202,8 +202,8 @@ def colours_beside_tools(frame: Frame) -> NDArray[np.uint8]:
 
 
 def inpaint_quarter_size(image: NDArray[np.uint8], hole: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """In-paint non-zero pixels of `hole`. It works at a quarter of the size, because large holes
-    take seconds at full size.
+    """In-paint non-zero pixels of `hole`, at a quarter of the size, because large holes take seconds at full size. If the
+    hole covers all of the small picture, it gets the mean colour of the rest.
     """
     height, width = hole.shape
     small = (max(1, width // 4), max(1, height // 4))

@@ -256,7 +256,7 @@ class FlowPrior:
         return HORIZON_S
 
     def observe(self, frame: Frame, time_s: float, camera: Camera, step: TrainingStep) -> None:
-        """Measure the optical flow from the previous frame to `frame` and update the damping.
+        """Measure the optical flow from the previous frame to `frame` and update the damping, for pinhole cameras only.
 
         If the settings say so, also correct the depth of the Gaussians by the flow (`depth_from_motion`), and start the
         training at `time_s` from the scene moved by the flow (`start_from_motion`).

@@ -159,7 +159,9 @@ class SceneMcmc:
         self._state = self._strategy.initialize_state()
 
     def before_step(self, number: int, rate_scale: float) -> bool:
-        """Relocate, add and jitter Gaussians before a step of an offline training; see `SceneStrategy`."""
+        """Jitter Gaussians before a step of an offline training other than the first, and relocate and add some every
+        `refine_every` steps; see `SceneStrategy`.
+        """
         if number == 0:
             return False
         strategy, rate = self._strategy, self._step.means_rate * rate_scale
