@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import cv2
 import numpy as np
 
+from gsplat_core.geometry import grid_tracks
 from gsplat_core.geometry.grid_tracks import LONGEST_PX, TexturedPicture, follow_grids, seen_by
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
@@ -93,3 +96,30 @@ def test_a_grid_has_a_point_every_ten_pixels_that_is_seen_in_three_of_ten_pictur
     part = tracks.of(slice(0, 4), slice(1, 3))
     assert part.rays.shape == (2, 4, 2) and part.seen.shape == (2, 4) and part.poses.shape == (2, 4, 4)
     assert part.times_s.tolist() == [1.0, 2.0]
+
+
+def test_pictures_are_compared_with_the_key_from_the_nearest_on_in_both_directions(monkeypatch) -> None:
+    """Each flow starts from that of the picture before, so that it is found over large distances."""
+    pictures = [seen_by(shifted((0.5 * number, 0.0)), FIRST) for number in range(5)]
+    numbers, compared = {id(each.texture): number for number, each in enumerate(pictures)}, []
+
+    class Flow:
+        def calc(self, first, second, start):
+            compared.append((numbers[id(first)], numbers[id(second)], None if start is None else int(start[0, 0, 0])))
+            return np.full((*first.shape, 2), numbers[id(second)], np.float32)
+
+    monkeypatch.setattr(grid_tracks.cv2, "DISOpticalFlow", SimpleNamespace(create=lambda preset: Flow()))
+    start = np.array([[50.0, 40.0], [80.0, 60.0]], np.float32)
+    pixels, seen = grid_tracks._from_key(pictures, 2, start)
+    assert compared == [
+        (2, 3, None),
+        (3, 2, None),
+        (2, 4, 3),
+        (4, 2, 2),
+        (2, 1, None),
+        (1, 2, None),
+        (2, 0, 1),
+        (0, 2, 2),
+    ]
+    assert [float((at - start).mean()) for at in pixels] == [0, 1, 0, 3, 4]
+    assert seen[2].all()

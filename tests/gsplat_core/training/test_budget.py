@@ -288,3 +288,11 @@ def test_bounds_end_with_the_first_eye_too(clock, at_least, at_most, expected):
     deadline_s = clock.now_s if at_least > 1 else clock.now_s + 100
     budget = Budget.until(deadline_s, at_least=at_least, at_most=at_most, clock=clock)
     assert turns(budget, clock, 1.0) == expected
+
+
+@pytest.mark.parametrize(
+    ("left_s", "step_s", "planned"), [(0.3, 0.1, 3), (0.29, 0.1, 2), (0.7, 0.1, 7), (0.05, 0.1, 1)]
+)
+def test_steps_that_just_fit_before_a_deadline_are_planned(left_s, step_s, planned):
+    """0.3 / 0.1 is less than 3 in floating point."""
+    assert Spending(Budget(None, left_s, clock=lambda: 0.0), step_s).planned() == planned

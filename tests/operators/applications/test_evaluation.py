@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from gsplat_core.errors import InvalidSetting
+from gsplat_core.training.config import ReconstructorConfig
 from operators.applications import evaluate
 from operators.applications.evaluate import EvaluationSettings
 from operators.applications.evaluated import EvaluatedRun
@@ -137,3 +138,30 @@ def test_learning_protocols_are_measured_only_if_asked_for(tmp_path: Path) -> No
     assert not work(tmp_path, protocols=("retention",))._is_wanted("causal")
     assert work(tmp_path, protocols=("causal",))._is_wanted("causal")
     assert not work(tmp_path, protocols=("causal",))._is_wanted("retention")
+
+
+@pytest.mark.parametrize(("device", "is_checked"), [("cpu", True), ("cuda", False)])
+@pytest.mark.parametrize("prior", [None, "learned"])
+def test_the_causal_protocol_learns_with_as_many_gaussians_as_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, device: str, is_checked: bool, prior: str | None
+) -> None:
+    made, checked, sizes = work(tmp_path, run_of(tmp_path), device=device, motion_prior=prior), [], []
+    made.source, made.camera = SimpleNamespace(description=SimpleNamespace(width_px=80, height_px=60)), "camera"
+    config = ReconstructorConfig(steps_per_frame=12)
+    settings = SimpleNamespace(
+        device=device, seed=7, reconstructor_config=lambda pixels: sizes.append(pixels) or config
+    )
+    monkeypatch.setattr(made, "_learning_settings", lambda: settings)
+    monkeypatch.setattr(made, "_frames", lambda name: name)
+    monkeypatch.setattr(made, "_log", lambda name: nullcontext())
+    monkeypatch.setattr(evaluate, "replay_bytes", lambda description, config: 5)
+    monkeypatch.setattr(evaluate, "require_memory", lambda *given: checked.append(given[0]))
+    monkeypatch.setattr(evaluate, "Reconstructor", lambda config, camera, **_: config)
+    monkeypatch.setattr(evaluate, "PictureMaker", lambda *given: given)
+    monkeypatch.setattr(evaluate, "seeded", lambda seed, device: nullcontext())
+    monkeypatch.setattr(evaluate, "evaluate_causal", lambda frames, learning, pictures, record: learning)
+    found = made._causal()
+    assert sizes == [80 * 60] and checked == [5] * is_checked
+    learned = found.score
+    assert (learned.start_from_motion, learned.depth_from_motion) == ((True, True) if prior else (config.start_from_motion, config.depth_from_motion))  # fmt: skip
+    assert found.motion_prior == (prior or config.motion_prior) and (found.steps_per_frame, found.seed) == (12, 7)

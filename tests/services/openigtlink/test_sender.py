@@ -14,6 +14,7 @@ import pytest
 
 from gsplat_core.errors import InvalidSetting
 from operators.errors import OutputError
+from services import openigtlink
 from services.bus.pictures import PicturePublisher
 from services.openigtlink import MessageServer, StreamMessages, folder_of, ijk_to_camera, send
 
@@ -169,3 +170,23 @@ def test_a_closed_server_has_ended_its_thread(monkeypatch):
     server = MessageServer("127.0.0.1", 0)
     server.close()
     assert ended == [server]
+
+
+def test_a_client_that_takes_nothing_is_left_after_a_time(monkeypatch):
+    """Sending to it must not block a thread without end."""
+    calls = []
+
+    class Client:
+        def __getattr__(self, name):
+            return lambda *given: calls.append((name, *given))
+
+    server = openigtlink.MessageServer("127.0.0.1", 0)
+    try:
+        monkeypatch.setattr(server, "_newer_than", lambda sent, client: None)
+        client = Client()
+        server._clients.add(client)
+        server._serve(client)
+    finally:
+        server.close()
+    assert ("settimeout", openigtlink.STALLED_S) in calls and calls[-1] == ("close",)
+    assert ("setsockopt", socket.IPPROTO_TCP, socket.TCP_NODELAY, 1) in calls and client not in server._clients
