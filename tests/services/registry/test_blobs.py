@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import errno
+import hashlib
 from pathlib import Path
 
 import pytest
@@ -102,3 +103,37 @@ def test_a_bug_stays_one() -> None:
         raise KeyError("bug")
     with pytest.raises(StoreUnavailable, match="give s3://BUCKET/PREFIX"):
         open_blobs("nonsense://x", Path("unused"))
+
+
+@pytest.mark.parametrize(
+    ("change", "is_intact"),
+    [
+        ("none", True), ("linked folder", False), ("no folder", False), ("file", False), ("changed", False), ("missing", False),
+        ("linked file", False), ("folder for a file", False),
+    ],
+)  # fmt: skip
+def test_an_unpacked_model_is_intact_if_its_own_files_are_those_that_were_uploaded(tmp_path, change, is_intact):
+    """Links lead to files that may change."""
+    model = tmp_path / "model"
+    model.mkdir()
+    row = {}
+    for name, column in ((folder.MANIFEST, "manifest_sha256"), (folder.TENSORS, "tensors_sha256")):
+        (model / name).write_bytes(name.encode())
+        row[column] = hashlib.sha256(name.encode()).hexdigest()
+    tensors, asked = model / folder.TENSORS, model
+    if change == "linked folder":
+        asked = tmp_path / "link"
+        asked.symlink_to(model)
+    elif change in ("no folder", "file"):
+        asked = tmp_path / "other"
+        if change == "file":
+            asked.write_bytes(b"")
+    elif change == "changed":
+        tensors.write_bytes(b"changed")
+    elif change != "none":
+        tensors.rename(tmp_path / "tensors")
+        if change == "linked file":
+            tensors.symlink_to(tmp_path / "tensors")
+        if change == "folder for a file":
+            tensors.mkdir()
+    assert folder._is_intact(asked, row) == is_intact
