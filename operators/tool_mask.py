@@ -170,7 +170,9 @@ class FoundToolMaskOp(Operator):
         op_output.emit(frame, "frame")
 
     def _believed(self, frame: Frame, mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return the detected mask, or an all-tissue mask if no tissue was detected for too many frames."""
+        """Return the detected mask, or an all-tissue mask if hardly any tissue was detected for more than `BELIEVED_FRAMES`
+        frames and the frame is not withheld.
+        """
         if frame.withheld is not None or not self.doubts:
             return mask
         # A mask with less than this share of tissue counts as an all-tool mask.

@@ -513,8 +513,8 @@ class ParallaxDepth(Estimator):
         """Depth map estimated at time `_found_s`."""
 
     def estimate(self, frame: Frame, camera: Camera) -> DepthMap | None:
-        """Estimate the depth of a frame by parallax against the key frames; None within `EVERY_S` seconds of the last
-        map.
+        """Estimate the depth of a frame by parallax against the key frames; None for a frame without pose, for other cameras
+        than pinholes, and within `EVERY_S` seconds of the last map.
         """
         if frame.new_scene is not None:
             self._kept, self._found_s, self._look = [], None, None

@@ -374,7 +374,9 @@ class StereoDepth(Estimator):
         self._look_in = 0
 
     def estimate(self, frame: Frame, camera: Camera) -> DepthMap | None:
-        """Estimate the depth of a frame by matching its two pictures; None without a right picture."""
+        """Estimate the depth of a frame by matching its two pictures; None without a right picture. The map is rejected
+        (`doubt`) if the pictures are no usable rectified pair.
+        """
         if frame.right_image is None:
             return None
         shape = frame.image.shape[:2]

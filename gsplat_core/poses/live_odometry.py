@@ -299,7 +299,9 @@ class LiveOdometry:
         self._key_numbers, self._key_pixels = found.numbers, found.pixels
 
     def _is_key(self, off_px: float) -> bool:
-        """Return True if a new key frame is due."""
+        """Return True if a new key frame is due: the points fit badly, few points of the last one are still tracked, or they
+        have moved far in the picture.
+        """
         self._since_key += 1
         if off_px > OFF_PX and self._since_key >= OFF_EVERY:
             return True

@@ -341,7 +341,7 @@ class Edge:
         return len(self.queue)
 
     def push(self, message: Message) -> None:
-        """Append a message according to the policy. Raises QueueFull if a blocking edge is full."""
+        """Append a message according to the policy; a closed edge discards it. Raises QueueFull if a blocking edge is full."""
         self.sent += 1
         if self.closed:
             self._drop("closed")

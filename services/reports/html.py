@@ -27,7 +27,9 @@ def tile(name: str, value: str, unit: str, more: str) -> str:
 
 
 def against(psnr_db: float | None, baseline_db: float | None) -> str:
-    """Return HTML with the gain of a PSNR over the previous-frame baseline, and that baseline, in dB, if both are known."""
+    """Return HTML with the gain of a PSNR over the previous-frame baseline, and that baseline, in dB; "no baseline" if either
+    is None.
+    """
     if psnr_db is None or baseline_db is None:
         return "no baseline"
     gain = psnr_db - baseline_db
@@ -370,7 +372,7 @@ def notes_section(notes: Sequence[str]) -> str:
 
 
 def hidden_section(report: RunReport, pictures: HiddenPictures | None) -> str:
-    """Return pictures of the last frame, and scores if the recording has ground truth."""
+    """Return pictures of the last frame, and scores if the recording has ground truth; empty without both."""
     truth = report.quality.truth
     if pictures is None and truth is None:
         return ""

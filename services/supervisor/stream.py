@@ -435,7 +435,8 @@ class ShownModels:
             await asyncio.sleep(LOOK_S)
 
     async def look_at(self, stream: Stream) -> None:
-        """Send `show_model` to a stream's engine if it does not display the active version of the configured model.
+        """Send `show_model` to a running engine if it does not display the active version of the stream's configured model.
+        A version that it refused is sent again after `AGAIN_S` seconds.
 
         Raises:
             BusError: if the engine does not answer.

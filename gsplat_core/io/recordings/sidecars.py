@@ -94,7 +94,8 @@ class Beside:
         return MaskFiles(files) if files else None
 
     def depth(self, unit_mm: float | None) -> DepthFiles | None:
-        """Return the reader of the depth maps, or None. `unit_mm` is the length of one grey value, None if not stated."""
+        """Return the reader of the depth maps; None without them or after a problem. `unit_mm` is the length of one grey
+        value; None if not stated, which counts as 1 mm."""
         files = self._sequence("depth", "depth map")
         if not files:
             return None
@@ -107,14 +108,14 @@ class Beside:
         return DepthFiles(files, *self._size, unit_mm)
 
     def labels(self) -> LabelFiles | None:
-        """Return the reader of the labelled frames' classes, or None."""
+        """Return the reader of the labelled frames' classes; None without labels or after a problem."""
         found = self._some("labels", "label picture", IMAGE_SUFFIXES)
         if not found or check_sizes(list(found.values()), self._size, "label picture", self._findings) is None:
             return None
         return LabelFiles(found)
 
     def scans(self) -> ScanFiles | None:
-        """Return the reader of the scans of a range sensor, or None."""
+        """Return the reader of the scans of a range sensor; None without scans or after a problem."""
         found = self._some("scans", "scan", frozenset({".npy"}))
         if not found:
             return None

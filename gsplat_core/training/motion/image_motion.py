@@ -61,7 +61,7 @@ class ImageMotion:
             mask: [H, W], non-zero on tissue, or None for all. Other pixels get the flow of the surrounding tissue.
 
         Returns:
-            The flow, or None for the first picture and after a change of size.
+            The flow, or None for the first picture, after a change of size, and for tiny pictures.
         """
         shape, mask_before = image.shape[:2], self._mask_before
         flow = self._pixel_flow(image)

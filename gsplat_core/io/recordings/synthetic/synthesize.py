@@ -452,7 +452,7 @@ def check_arguments(frames: int, width_px: int, height_px: int, fps: float, seed
 
 
 def threads_that_fit(width_px: int, height_px: int) -> int:
-    """Return the number of frames to render concurrently within the available memory.
+    """Return the number of frames to render concurrently within the available memory, at most 8 or the number of CPUs.
 
     Raises:
         InvalidSetting: if the memory does not suffice for the scene and one frame.
