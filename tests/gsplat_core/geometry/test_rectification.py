@@ -124,3 +124,16 @@ def test_a_lens_may_not_see_the_corners_but_sees_the_middle_of_each_side(fold, i
     else:
         with pytest.raises(InvalidInput, match="folds the picture"):
             Undistortion(camera, coefficients)
+
+
+def test_an_undistorted_picture_ends_where_the_middle_of_each_side_of_the_distorted_one_is():
+    """With a barrel distortion the middle of a side is the nearest part of it, so that nothing outside is shown."""
+    camera, fold = Camera.from_focal(100.0, 240, 160), 2.5
+    found = Undistortion(camera, [-1 / (3 * fold**2), 0, 0, 0]).camera
+    for half, focal, centre, side in (
+        (1.2, found.K[0, 0], found.K[0, 2], 240),
+        (0.8, found.K[1, 1], found.K[1, 2], 160),
+    ):
+        radii = np.linspace(0, fold, 100_000)
+        ideal = radii[np.argmax(radii * (1 - radii**2 / (3 * fold**2)) >= half)]
+        assert (focal * ideal + centre, centre - focal * ideal) == pytest.approx((side, 0), abs=0.1)
