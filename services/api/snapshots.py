@@ -19,8 +19,7 @@ from services.api.models import Number, check_soon, registry_of
 from services.api.problems import Forbidden, Unprocessable, problem_answer
 from services.api.state import IdempotencyKey, control_of, part
 from services.api.streams import streams_of
-from services.exports.cache import ALL
-from services.exports.renderings import PICTURES
+from services.exports.cache import ALL, PICTURES
 from services.schemas import RenderRequest, SnapshotRequest, SnapshotView, VersionView
 from services.settings import ResourceName
 

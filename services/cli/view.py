@@ -22,9 +22,8 @@ from operators.applications.session import check_device
 from services.cli.exit_codes import OK
 from services.cli.terminal import InterruptRequest
 from services.display import KINDS
-from services.model_view import ModelView
+from services.model_view import ModelView, Pictures, PictureView
 from services.openigtlink import MessageServer, StreamMessages, folder_of, send
-from services.picture_view import Pictures, PictureView
 from services.registry.bundle_file import SUFFIX, unpack
 from services.settings import load_settings
 

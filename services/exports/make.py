@@ -18,8 +18,7 @@ from typing import Any
 from gsplat_core.errors import UserError
 from gsplat_core.io.exports.formats import ExportWish
 from operators.settings import RenderOptions
-from services.exports.cache import ALL, ISPLAT
-from services.exports.renderings import PICTURES, RenderWish
+from services.exports.cache import ALL, ISPLAT, PICTURES, RenderWish
 from services.private_files import keep_files_private
 from services.registry.bundle_file import pack
 

@@ -17,8 +17,7 @@ from gsplat_core.io.bundle import save_bundle
 from gsplat_core.io.exports.formats import FORMATS, ExportWish
 from operators.settings import RenderOptions
 from services.errors import ExportBusy, ExportFailed, ExportRefused
-from services.exports.cache import ExportCache, ExportPrograms
-from services.exports.renderings import PICTURES, RenderWish
+from services.exports.cache import PICTURES, ExportCache, ExportPrograms, RenderWish
 from tests.services.supervisor.test_model_show import uniform
 
 STUB = (sys.executable, str(Path(__file__).with_name("stub_make.py")))

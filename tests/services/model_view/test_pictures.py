@@ -18,7 +18,7 @@ from gsplat_core.models import TrainedBy
 from gsplat_core.rendering.renderer import PROGRESSIVE_SAMPLES, Capabilities, FinishedFrame, RendererOptions
 from services.cli.app import run
 from services.cli.exit_codes import BAD_INPUT
-from services.picture_view import Pictures, PictureView, Viewpoint
+from services.model_view import Pictures, PictureView, Viewpoint
 from tests.services.supervisor.test_model_show import uniform
 
 STILL = {"azimuth": 0, "elevation": 0, "distance": 1, "right": 0, "down": 0, "time": 1, "width": 64, "height": 48}
