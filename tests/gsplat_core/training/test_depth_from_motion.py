@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -12,7 +14,7 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.motion.image_motion import Seen, SurfaceMotion
-from gsplat_core.training.motion.prior import DepthFromMotion
+from gsplat_core.training.motion.prior import DepthFromMotion, inverse_depths
 from gsplat_core.training.steps.step import TrainingStep
 
 WIDTH, HEIGHT = 160, 128
@@ -113,3 +115,71 @@ def test_motion_that_no_distance_explains_places_nothing() -> None:
     assert torch.equal(step.gaussians.means, before)
     DepthFromMotion().apply(step, SurfaceMotion(flow * np.nan, FIRST, after), 0.5)
     assert step.gaussians.means.isfinite().all()
+
+
+def seen_after(after: Camera, depth: Tensor) -> tuple[Tensor, Tensor]:
+    pixels = grid_pixels()
+    return pixels, Seen(after, on_depth(pixels, depth)).pixels
+
+
+@pytest.mark.parametrize("after", [moved_camera(3.0), moved_camera(0.0, 4.0), moved_camera(2.0, 3.0, 0.03)])
+def test_inverse_depths_and_their_information_are_those_of_the_motion(after: Camera) -> None:
+    """Information is the square of the pixels by which the point moves per inverse depth."""
+    depth = torch.linspace(40, 90, len(grid_pixels()))
+    pixels, target = seen_after(after, depth)
+    inverse, information = inverse_depths(pixels, target, FIRST, after)
+    step = 1e-4
+    other = Seen(after, on_depth(pixels, 1 / (1 / depth + step))).pixels
+    moves = (other - target).square().sum(1) / step**2
+    good = moves > 0.01 * moves.median()
+    torch.testing.assert_close(inverse[good], 1 / depth[good], rtol=2e-3, atol=0)
+    # The equation is that of the point in units of its depth along the axis, which changes with the depth of the camera.
+    ratio = (information[good] / moves[good]).sqrt()
+    assert float(ratio.min()) > 0.85 and float(ratio.max()) < 1.2
+
+
+def distance_of(after: Camera, depth: Tensor, target: Tensor | None = None, known: float = 1 / 60) -> float | None:
+    pixels, seen = seen_after(after, depth)
+    target = seen if target is None else target
+    _, information = inverse_depths(pixels, target, FIRST, after)
+    motion = SimpleNamespace(before=FIRST, after=after)
+    return DepthFromMotion()._distance(pixels, target, motion, torch.full_like(depth, known), information)
+
+
+@pytest.mark.parametrize("known", [1 / 600, 1 / 60, 1 / 6])
+def test_the_distance_of_a_plane_does_not_depend_on_the_assumed_one(known: float) -> None:
+    depth = torch.full((len(grid_pixels()),), 50.0)
+    assert distance_of(moved_camera(3.0), depth, known=known) == pytest.approx(50, rel=1e-3)
+
+
+@pytest.mark.parametrize(("parallax_px", "is_found"), [(1.45, False), (1.55, True)])
+def test_a_parallax_of_one_and_a_half_pixels_is_enough(parallax_px: float, is_found: bool) -> None:
+    depth = torch.full((len(grid_pixels()),), 50.0)
+    found = distance_of(moved_camera(parallax_px * 50 / 140), depth)
+    assert found == (pytest.approx(50, rel=1e-3) if is_found else None)
+
+
+def test_points_that_move_by_themselves_count_little() -> None:
+    depth = torch.full((len(grid_pixels()),), 50.0)
+    _, target = seen_after(moved_camera(3.0), depth)
+    moved = target.clone()
+    moved[::5, 1] += 9.0
+    assert distance_of(moved_camera(3.0), depth, moved) == pytest.approx(50, rel=0.01)
+    opposite = target.clone()
+    opposite[::5, 0] += 9.0
+    assert distance_of(moved_camera(3.0), depth, opposite) == pytest.approx(50, rel=0.04)
+
+
+@pytest.mark.parametrize(("share", "is_found"), [(0.9, True), (1.1, False)])
+def test_a_plane_must_explain_half_of_the_motion(share: float, is_found: bool) -> None:
+    """Motion along the rows is that of the plane; as much across them is not."""
+    depth = torch.full((len(grid_pixels()),), 50.0)
+    _, target = seen_after(moved_camera(3.0), depth)
+    target[:, 1] += share * 3.0 * 140 / 50 * torch.where(torch.arange(len(target)) % 2 > 0, 1.0, -1.0)
+    assert (distance_of(moved_camera(3.0), depth, target) is not None) == is_found
+
+
+def test_a_scene_behind_the_camera_has_no_distance() -> None:
+    depth = torch.full((len(grid_pixels()),), 50.0)
+    pixels, target = seen_after(moved_camera(3.0), depth)
+    assert distance_of(moved_camera(3.0), depth, 2 * pixels - target) is None
