@@ -258,7 +258,7 @@ class BackgroundDepth:
 
 
 def share_of(cores: int) -> float:
-    """Return the largest share of one core's time for depth estimation in a process with `cores` cores."""
+    """Return the largest share of one core's time for depth estimation: `SHARE_OF_FEW` up to `FEW_CORES` cores, else 1."""
     return SHARE_OF_FEW if cores <= FEW_CORES else 1.0
 
 

@@ -182,17 +182,17 @@ class DisplayHub:
         return channel.add(quality)
 
     def viewers(self, kind: PictureKind) -> int:
-        """Return the number of viewers of a kind of picture."""
+        """Return the current number of viewers of a kind of picture."""
         channel = self._channels.get(kind)
         return 0 if channel is None else len(channel.viewers)
 
     def counts(self, kind: PictureKind) -> dict[str, int]:
-        """Return the number of pictures `encoded`, and of pictures dropped for viewers, by reason."""
+        """Return the number of pictures `encoded`, and of pictures dropped for viewers, by reason; empty before a viewer."""
         channel = self._channels.get(kind)
         return {} if channel is None else dict(channel.counts)
 
     def ages(self, kind: PictureKind) -> Mapping[str, Any]:
-        """Return the histogram of picture ages (time from frame arrival to encoding) as JSON values."""
+        """Return the histogram of picture ages (time from frame arrival to encoding) as JSON values; empty before a viewer."""
         channel = self._channels.get(kind)
         return {} if channel is None else channel.ages.as_json()
 

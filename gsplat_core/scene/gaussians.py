@@ -134,7 +134,7 @@ class Gaussians:
         return self.means, self.quats, self.log_scales, self.logit_opacities, self.sh
 
     def seen_by_right(self) -> Gaussians:
-        """Return the Gaussians with the right eye's colours in `sh`."""
+        """Return the Gaussians with the right eye's colours in `sh`; itself without `right_sh`."""
         return self if self.right_sh is None else replace(self, sh=self.sh + self.right_sh, right_sh=None)
 
     def with_right(self, wanted: bool = True) -> Gaussians:

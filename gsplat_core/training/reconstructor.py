@@ -108,7 +108,7 @@ class Reconstructor:
 
     @property
     def gaussians(self) -> int:
-        """Current number of Gaussians."""
+        """Current number of Gaussians; 0 before the first scene."""
         # Read once: another thread than the training one may ask, between two models too.
         step = self._step
         return 0 if step is None else step.gaussians.count

@@ -40,7 +40,7 @@ class DerivedSource:
 
     @property
     def state_sentence(self) -> str:
-        """State of the wrapped source as a sentence."""
+        """State of the wrapped source as a sentence; empty if it is no `ReportingSource`."""
         return self._source.state_sentence if isinstance(self._source, ReportingSource) else ""
 
     def counts(self) -> Mapping[str, int]:

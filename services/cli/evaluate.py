@@ -54,11 +54,7 @@ def _refuse(options: EvaluateOptions, names: tuple[str, ...], why: str) -> None:
 
 
 def evaluate_scene_command(model: Path, settings: SceneSettings, out: Path | None, *, as_json: bool) -> int:
-    """Evaluate a model on a scene, write the requested files and print the scores.
-
-    Returns:
-        The exit code.
-    """
+    """Evaluate a model on a scene, write the requested files, print the scores. Return the exit code: OK or INTERRUPTED."""
 
     def measure(folder: Path | None) -> SceneScore:
         with ProgressPrinter(quiet=as_json) as progress:
@@ -122,11 +118,7 @@ def _place(text: str) -> Visits:
 
 
 def evaluate_command(path: Path, settings: EvaluationSettings, out: Path | None, *, as_json: bool) -> int:
-    """Evaluate, write the requested reports and print the result.
-
-    Returns:
-        The exit code.
-    """
+    """Evaluate, write the requested reports and print the result. Return the exit code: OK or INTERRUPTED."""
     if is_scene_file(path):
         raise InvalidSetting(f"{path} comes from no recording; give a scene of COLMAP with --scene, or a model folder")
     model, run = load_evaluated(path)

@@ -110,20 +110,12 @@ def next_frame_line(report: RunReport) -> list[str]:
 
 
 def replay_command(settings: ReplaySettings, *, as_json: bool) -> int:
-    """Replay, write the reports and print their paths.
-
-    Returns:
-        The exit code.
-    """
+    """Replay, write the reports and print their paths. Return the exit code: OK or INTERRUPTED."""
     return report_run(lambda *callbacks: replay(settings, *callbacks), settings.out, as_json=as_json)
 
 
 def reconstruct_command(settings: ReconstructSettings, *, as_json: bool) -> int:
-    """Reconstruct offline, write the reports and print their paths.
-
-    Returns:
-        The exit code.
-    """
+    """Reconstruct offline, write the reports and print their paths. Return the exit code: OK or INTERRUPTED."""
     return report_run(
         lambda *callbacks: reconstruct(settings, settings.steps, *callbacks), settings.out, as_json=as_json
     )
@@ -293,11 +285,7 @@ def _summary(report: RunReport, facts: LiveFacts) -> str:
 
 
 def train_command(scene: Path, out: Path, options: TrainOptions, *, as_json: bool) -> int:
-    """Train a scene, publish the results in `out` and print the scores.
-
-    Returns:
-        The exit code.
-    """
+    """Train a scene, publish the results in `out` and print the scores. Return the exit code: OK or INTERRUPTED."""
     with InterruptRequest() as interrupt, OutputFolder(out, "train", [scene]) as output:
         try:
             with ProgressPrinter(quiet=as_json) as progress:

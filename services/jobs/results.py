@@ -168,7 +168,7 @@ class Task:
         _write(Path(self.folder) / OUTCOME, {"state": str(state), "reason": reason})
 
     def progress(self) -> JobProgress:
-        """Return the progress that the attempt reported."""
+        """Return the progress that the attempt reported last; 0 frames before its first report."""
         said = _read(Path(self.folder) / PROGRESS)
         return JobProgress(**said) if said else JobProgress(0, None, None)
 

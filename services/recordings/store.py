@@ -378,7 +378,7 @@ def _bytes_below(path: Path) -> int:
 
 
 def file_name(row: sa.RowMapping) -> str:
-    """Return the name of a checked recording in its folder."""
+    """Return the name under which a checked recording is stored: its own, of a video with the suffix."""
     return str(row["name"]) if row["kind"] == ARCHIVE else f"{row['name']}{row['kind']}"
 
 

@@ -152,7 +152,7 @@ def build_report(outcome: RunOutcome) -> RunReport:
 
 
 def displayed(outcome: RunOutcome) -> int:
-    """Return the number of frames that a run displayed; of a live run, the number of new pictures."""
+    """Return the number of frames that a run displayed; of a live run, the number of new pictures; 0 without results."""
     video, screen, quality = (outcome.find(kind) for kind in (DisplayResult, LiveDisplayResult, QualityResult))
     if isinstance(screen, LiveDisplayResult):
         return screen.pictures

@@ -363,7 +363,7 @@ def hold_section(report: EvaluationReport) -> str:
 
 
 def tiles_section(report: EvaluationReport) -> str:
-    """Return the tiles with the main scores of each protocol."""
+    """Return the tiles with the main scores of each protocol; empty without scores."""
     tiles = []
     for each in measured(report):
         more = each.what

@@ -254,7 +254,7 @@ def _unknown(location: Location) -> str:
 
 
 def _keys(location: Location) -> list[str]:
-    """Return the valid keys of the section at a location."""
+    """Return the valid keys of the section at a location; none if it is no section."""
     kind: Any = ServiceSettings
     for part in location:
         if isinstance(kind, type) and issubclass(kind, BaseModel):

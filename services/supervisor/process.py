@@ -209,7 +209,7 @@ class ManagedProcess:
 
     @property
     def measures(self) -> Mapping[str, Any]:
-        """Return the Prometheus measures of the newest heartbeat."""
+        """Return the Prometheus measures of the newest heartbeat; empty without any."""
         heartbeat = self._heartbeat
         measures = None if heartbeat is None else heartbeat.get("measures")
         return measures if isinstance(measures, dict) else {}

@@ -279,7 +279,7 @@ class SyntheticScene:
         return float(np.linalg.norm(at - self.camera_at(time_s).position))
 
     def tug(self, time_s: float) -> Tug:
-        """Return the tool's pull on the tissue at a time."""
+        """Return the tool's pull on the tissue at a time; `NO_TUG` without tools."""
         return self.motion.tug(time_s) if self.tissue.tools else NO_TUG
 
     def tools(self, time_s: float) -> list[tuple[list[Part], ToolLook]]:
