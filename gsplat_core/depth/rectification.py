@@ -40,7 +40,7 @@ class StereoCalibration:
     """(width, height) of the calibrated pictures, or None if not stated."""
 
     def wrong(self) -> str | None:
-        """Return the reason why the calibration is impossible, as a sentence, or None."""
+        """Return the reason why the calibration is impossible, as a sentence; None if it is possible."""
         sides = (("left", self.left_K, self.left_distortion), ("right", self.right_K, self.right_distortion))
         for eye, K, distortion in sides:
             if not np.isfinite(K).all() or min(K[0, 0], K[1, 1]) <= 1 or np.abs(K).max() > 1e6:

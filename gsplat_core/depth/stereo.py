@@ -569,7 +569,7 @@ def grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def _why_not_rectified(left: Camera, right: Camera | None) -> str | None:
-    """Return the reason why two cameras are not a rectified pair, as a sentence, or None."""
+    """Return the reason why two cameras are not a rectified pair, as a sentence; None if they are, or without `right`."""
     if right is None:
         return None
     pose = right.world_to_camera
@@ -585,7 +585,7 @@ def _why_not_rectified(left: Camera, right: Camera | None) -> str | None:
 
 
 def _why_implausible(look: PairLook, parallel_px: float, *, calibrated: bool) -> str | None:
-    """Return the reason why the disparities are impossible, as a sentence, or None."""
+    """Return the reason why the disparities are impossible, as a sentence; None if they are possible."""
     shift = look.disparities - parallel_px
     middle = float(np.median(shift))
     if abs(middle) < LEAST_DISPARITY_PX and float(np.ptp(shift)) < 4 * LEAST_DISPARITY_PX:

@@ -91,7 +91,7 @@ class Evidence:
 
     @property
     def outside(self) -> str | None:
-        """Kind of evidence of the outside as a short phrase, or None."""
+        """Kind of evidence of the outside as a short phrase; None if there is none."""
         if self.straight >= STRAIGHT and self.cool >= COOL_BESIDE_STRAIGHT:
             return "straight edges, little red"
         if self.even + self.smooth >= ROOM_LIGHT and self.cold >= COLD_BESIDE_LIGHT:

@@ -202,7 +202,7 @@ class Timing:
     pts_ns: int
     """Timestamp without clock jumps in nanoseconds; never decreases."""
     finding: str | None = None
-    """OUT_OF_ORDER, CLOCK_JUMP, GAP or REPEATED_TIME, or None."""
+    """OUT_OF_ORDER, CLOCK_JUMP, GAP or REPEATED_TIME; None for a time as expected."""
 
 
 class StreamClock:

@@ -185,7 +185,7 @@ class DenseProjection(NamedTuple):
     conics: Tensor
     """Inverse of the blurred 2D covariance as (xx, xy, yy), [..., C, N, 3]."""
     compensations: Tensor | None
-    """Antialiasing factor on the opacity [..., C, N], or None."""
+    """Antialiasing factor on the opacity [..., C, N]; None if it was not requested."""
 
 
 class PackedProjection(NamedTuple):

@@ -119,7 +119,7 @@ def _best(tries: Sequence[_Try]) -> _Try:
 
 
 def _breath_of(breaths: Sequence[_Try], length_s: float) -> _Try | None:
-    """Return the best local minimum over the breathing frequency with at least `LEAST_CYCLES`, or None."""
+    """Return the best local minimum over the breathing frequency with at least `LEAST_CYCLES`; None without one."""
     found = [each for each in _local_minima(breaths) if each.hz[0] * length_s >= LEAST_CYCLES]
     return _best(found) if found else None
 

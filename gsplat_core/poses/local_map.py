@@ -329,7 +329,7 @@ class PlaceRecognition:
     def _pose_by(
         self, key: KeyFrame, places: LocalMap, picture: SmallPicture, corners: Points, features: Any
     ) -> Pose | None:
-        """Return an approximate pose of the picture by feature matches with a key frame, or None."""
+        """Return an approximate pose of the picture by feature matches with a key frame; None with too few matches."""
         if key.features is None:
             key.features = self._features(key.picture)
         before, kept = key.features

@@ -223,7 +223,7 @@ class Placement:
         self.begin(None)
 
     def begin(self, first: Frame | None) -> None:
-        """Start another scene from the frame `first`, or None."""
+        """Start another scene from the frame `first`; None counts as a frame without depth."""
         self._first = first
         self.is_placed = _has_depth(first)
         """True once the scene was placed by a depth."""

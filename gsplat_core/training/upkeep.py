@@ -460,7 +460,7 @@ class LeftScenes:
         return place is not None
 
     def recognised(self, seq: int) -> Gaussians | None:
-        """Return the Gaussians of the earlier scene that frame `seq` was found to show, or None."""
+        """Return the Gaussians of the earlier scene that frame `seq` was found to show; None if it shows no earlier one."""
         return self._recognised[1].gaussians if self._recognised and self._recognised[0] == seq else None
 
     def keep_memory(self, step: TrainingStep | None) -> None:

@@ -313,7 +313,7 @@ class ByLauncher:
 
 
 def recorded_launcher(folder: RuntimeFolder) -> ProcessIdentity | None:
-    """Return the identity of the running launcher of a runtime folder, or None."""
+    """Return the identity of the running launcher of a runtime folder; None if none runs."""
     try:
         content = read_json(folder.path / RECORD)
     except (FileNotFoundError, BadMessage):

@@ -243,7 +243,7 @@ def invert_poses(camera_to_world: NDArray[np.float64], path: Path, findings: Fin
 
 
 def number(value: object) -> float | None:
-    """Return a finite number from JSON, or None."""
+    """Return a number from JSON as a float; None if it is not finite or no number."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
     try:

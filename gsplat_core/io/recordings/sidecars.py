@@ -74,7 +74,7 @@ class Beside:
         return (_read_description(path, self._size, self._findings) if path else None) or {}
 
     def poses(self) -> Calibration | None:
-        """Return the calibration stored in `poses_bounds.npy`, or None."""
+        """Return the calibration stored in `poses_bounds.npy`; None without the file or after a problem."""
         path = self._file("poses_bounds.npy")
         return read_poses_bounds(path, self._images.frame_count, *self._size, self._findings) if path else None
 
@@ -84,12 +84,12 @@ class Beside:
         return read_poses(path, self._images.frame_count, self._findings) if path else None
 
     def right(self) -> ImageFiles | None:
-        """Return the reader of the right eye's images, or None."""
+        """Return the reader of the right eye's images; None without them or after a problem."""
         files = self._sequence("images_right", "right image")
         return ImageFiles(files, *self._size) if files else None
 
     def masks(self) -> MaskFiles | None:
-        """Return the reader of the tool masks, or None."""
+        """Return the reader of the tool masks; None without masks or after a problem."""
         files = self._sequence("masks", "mask")
         return MaskFiles(files) if files else None
 

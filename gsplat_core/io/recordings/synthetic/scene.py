@@ -290,9 +290,9 @@ class SyntheticScene:
         return [(motion.parts(self.tissue, time_s, tug), motion.plan.look) for motion in (self.motion, *self.others)]
 
     def track(self, time_s: float) -> NDArray[np.float32]:
-        """Return a grid of material points in the world [63, 3] in mm."""
+        """Return the positions in the world, [63, 3] in mm, of a grid of tissue points at a time."""
         u, v = np.meshgrid(np.linspace(-32, 32, 9, dtype=np.float32), np.linspace(-24, 24, 7, dtype=np.float32))
-        if self.drawn is not None and self.drawn.scene == "open":  # the same part of the picture
+        if self.drawn is not None and self.drawn.scene == "open":  # same part of the picture for all lenses
             share = self.tissue.focal_factor / self.drawn.focal * self.drawn.shape.distance_mm / TISSUE_DISTANCE_MM
             u, v = np.float32(share) * u, np.float32(share) * v
         points = self.tissue.points(u.ravel(), v.ravel(), time_s, self.tug(time_s))
