@@ -46,7 +46,7 @@ class DepthMap:
     error: float | None = None
     """Typical standard error of the confident depth, relative to it; None for the one assumed for its origin."""
     doubt: str | None = None
-    """Reason why the whole map is rejected, as a sentence, or None. A rejected map has zero confidence everywhere."""
+    """Reason why the whole map is rejected, as a sentence; None if it is not. A rejected map has no confidence anywhere."""
 
     remark: str | None = None
     """Information for the user about the whole map, as a sentence, or None. Like `doubt`, its text

@@ -64,7 +64,7 @@ class CheckedDepth:
     depth: NDArray[np.float32] | None
     """float32 [H, W] in millimetres, 0 = unknown; the given array if it is valid. None if discarded."""
     finding: str | None = None
-    """Finding "depth repaired", "depth not usable" or "depth at another scale", or None."""
+    """Finding "depth repaired", "depth not usable" or "depth at another scale"; None for valid depth."""
 
 
 class DepthCheck:

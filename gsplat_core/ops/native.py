@@ -70,7 +70,7 @@ def cuda_build() -> str:
 
 
 def cuda_refusal() -> str | None:
-    """Return CUDA's reason why the kernels cannot run on the first GPU, or None. Initialises CUDA."""
+    """Return CUDA's reason why the kernels cannot run on the first GPU; None if they can. Initialises CUDA."""
     refusal = ctypes.CDLL(str(CUDA_LIBRARY_PATH)).gsplat_core_cuda_refusal
     refusal.restype = ctypes.c_char_p
     with torch.cuda.device(0):

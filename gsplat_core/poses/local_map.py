@@ -306,7 +306,7 @@ class PlaceRecognition:
         self._turn = 0
 
     def find(self, picture: SmallPicture, kept: Sequence[tuple[KeyFrame, LocalMap]], most: int) -> Recognised | None:
-        """Return the first recognised of at most `most` key frames, or None. Candidates rotate from call to call."""
+        """Try at most `most` key frames and return the first recognised one, or None. The next call tries the following ones."""
         candidates = [kept[(self._turn + number) % len(kept)] for number in range(min(most, len(kept)))]
         self._turn += len(candidates)
         if not candidates:
