@@ -248,3 +248,38 @@ def test_poses_that_cannot_be_estimated_are_refused_before_the_first_frame(
         return
     with pytest.raises(InvalidSetting, match="this one is fisheye: undistort the pictures"):
         replay_module.prepare(wanted, [])
+
+
+@pytest.mark.parametrize("device", ["cpu", "cuda"])
+@pytest.mark.parametrize("offline", [False, True])
+def test_all_checks_are_made_before_the_first_frame(tmp_path, monkeypatch, device, offline):
+    made = []
+    description = SimpleNamespace(
+        name="clip", frame_count=9, width_px=80, height_px=60, fields={"depth"}, camera="camera", notes=("a note",)
+    )
+    source, config = SimpleNamespace(description=description), object()
+    settings = SimpleNamespace(
+        device=device, renderer="alpha", renderer_options="options", recording="recording", given_scale=0.5, max_frames=7,
+        losses=("flow",), poses="auto", out=tmp_path,
+        reconstructor_config=lambda pixels=None, offline=False: made.append(("config", pixels, offline)) or config,
+    )  # fmt: skip
+    for name in ("check_device", "check_renderer", "check_compared", "check_picture", "check_poses"):
+        monkeypatch.setattr(replay_module, name, lambda *given, name=name, **_: made.append((name, *given)))
+    monkeypatch.setattr(replay_module, "open_source", lambda address, options: made.append(options) or source)
+    monkeypatch.setattr(replay_module, "require_memory", lambda *given: made.append(("memory", given[0])))
+    monkeypatch.setattr(replay_module, "replay_bytes", lambda description, config, offline: (config, offline))
+    monkeypatch.setattr(replay_module, "lacking_depth", lambda settings, description, config: "no depth")
+    monkeypatch.setattr(replay_module.StorageReserve, "require", lambda self: made.append("storage"))
+    notes = []
+    assert replay_module.prepare(settings, notes, offline=offline) is source
+    assert notes == ["a note", "no depth"]
+    options = replay_module.SourceOptions(0.5, 7)
+    before = [
+        ("check_device", device), ("check_renderer", "alpha", device), ("config", None, offline), options,
+        ("check_compared", ("flow",), {"depth"}, "clip"), ("check_picture", "camera", 0.5), ("check_poses", "auto", "camera"),
+    ]  # fmt: skip
+    on_host = [("config", 4800, offline), ("memory", (config, offline))] if device == "cpu" else []
+    assert made == [*before, *on_host, "storage"]
+    description.frame_count = None
+    with pytest.raises(InvalidSetting, match="clip has no end"):
+        replay_module.prepare(settings, [])

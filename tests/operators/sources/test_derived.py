@@ -14,7 +14,7 @@ from gsplat_core.io.recordings import open_recording, synthesize
 from gsplat_core.io.recordings.calibration import default_camera
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame, FrameStatus
-from operators.sources.derived import JoinedSource, SplitSource
+from operators.sources.derived import JoinedSource, ScaledSource, SplitSource
 from operators.sources.live import LiveSource
 from operators.sources.registry import SourceOptions, open_source
 from operators.sources.source import FrameSource, ReportingSource, SourceDescription, SourceState
@@ -181,3 +181,45 @@ def test_the_right_picture_nearest_in_time_is_paired_and_earlier_ones_are_droppe
     assert (None if found.right_image is None else found.right_image[0, 0, 0]) == paired
     assert counted == ([] if paired else ["without_right"])
     assert [each.image[0, 0, 0] for each in (*kept, *rights)] == left_over
+
+
+def paired(at_ms, waiting_ms, comes_ms=(), **changed):
+    """Return what a left frame at a moment is paired with, and the right frames that are left."""
+    joined = object.__new__(JoinedSource)
+    counted, coming = [], [picture(moment) for moment in comes_ms]
+    joined._apart_ns, joined.count = 20_000_000, counted.append
+    joined._right = SimpleNamespace(read=lambda timeout_s: coming.pop(0) if coming else None)
+    kept = deque(picture(moment) for moment in waiting_ms)
+    found = joined._paired(picture(at_ms, **changed), kept)
+    right = None if found.right_image is None else int(found.right_image[0, 0, 0])
+    return right, [int(each.image[0, 0, 0]) for each in kept], counted
+
+
+def picture(moment_ms, **changed):
+    """Return a frame of one colour, which is the moment at which it came."""
+    return Frame(0, 0, np.full((4, 4, 3), moment_ms, np.uint8), arrived_ns=moment_ms * 1_000_000, **changed)
+
+
+@pytest.mark.parametrize(
+    ("at_ms", "waiting_ms", "comes_ms", "right", "left", "counted"),
+    [
+        (100, [60, 95, 130], [], 95, [130], []), (100, [60, 89, 108], [], 108, [], []), (100, [100], [200], 100, [], []),
+        (100, [], [70, 90, 104, 140], 104, [], []), (100, [80], [], 80, [], []), (100, [79], [], None, [79], ["without_right"]),
+        (100, [121, 140], [], None, [121, 140], ["without_right"]), (100, [], [], None, [], ["without_right"]),
+        (100, [90], [200], 90, [200], []),
+    ],
+)  # fmt: skip
+def test_a_frame_is_paired_with_the_nearest_one_of_the_other_eye(at_ms, waiting_ms, comes_ms, right, left, counted):
+    """Within half a frame interval. Earlier frames of the other eye are dropped with it, and no more than one later frame is read."""
+    found, kept, reasons = paired(at_ms, waiting_ms, comes_ms)
+    assert (found, kept, reasons) == (right, left, counted)
+
+
+def test_frames_of_another_size_than_described_are_scaled_by_the_same_factor():
+    description = SourceDescription("camera", 80, 60, 30.0, Camera.from_focal(50.0, 80, 60))
+    scaled = ScaledSource(SimpleNamespace(description=description), 0.5)
+    assert (scaled.description.width_px, scaled.description.height_px) == (40, 30)
+    for size, expected in (((80, 60), (40, 30)), ((100, 20), (50, 10)), ((160, 1), (80, 1))):
+        frame = Frame(0, 0, np.zeros((size[1], size[0], 3), np.uint8))
+        found = scaled._derived(frame)
+        assert (found.width_px, found.height_px) == expected
