@@ -87,7 +87,7 @@ class TrackErrors:
     within_mm: float
     """Share of positions nearer than 2 mm to the true one; mean of this and of the shares within 4, 8, 16 and 32 mm."""
     within_px: float
-    """As `within_mm`, for 4, 8, 16, 32 and 64 pixels."""
+    """Mean share of positions within 4, 8, 16, 32 and 64 pixels of the true one."""
 
 
 @dataclass(frozen=True)
