@@ -134,3 +134,33 @@ def test_a_strip_that_motion_reveals_is_covered_before_the_first_step(
     parts.revealed_px = share * REVEALED_SHARE * 200
     growth.prepare(STEP, None, seen_from(0), parts)
     assert parts.calls == (["cover", "revealed"] if is_covered else [])
+
+
+def test_a_scene_is_relaxed_and_renewed_when_so_many_steps_have_passed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Counted from the last time, at which steps may already have been many."""
+    calls: list[Any] = []
+    made = upkeep.Upkeep(CAMERA, CONFIG)
+
+    def relax(step: Any, seen: Any, camera: Any) -> None:
+        calls.append(("relax", step.steps))
+        made._relaxed_at = step.steps
+
+    def renew(step: Any, seen: Any, observation: Any, last_seen: Any, useless: Any) -> None:
+        calls.append(("renew", step.steps, last_seen, useless))
+        made._renewed_at = step.steps
+
+    monkeypatch.setattr(made, "_look", lambda step, observation: "seen")
+    monkeypatch.setattr(made, "_relax", relax)
+    monkeypatch.setattr(made, "_renew", renew)
+    monkeypatch.setattr(made, "_useless", lambda step, seen: "useless")
+    every, renewal = upkeep.RELAX_EVERY, upkeep.RENEW_EVERY
+    for steps in range(0, 2 * renewal + 1, every // 4):
+        made(SimpleNamespace(steps=steps), seen_from(0), "last seen")
+    assert [call[1] for call in calls if call[0] == "relax"] == list(range(every, 2 * renewal + 1, every))
+    assert [call[1:] for call in calls if call[0] == "renew"] == [
+        (steps, "last seen", "useless") for steps in (renewal, 2 * renewal)
+    ]
+    assert not made._has_moved
+    made(SimpleNamespace(steps=2 * renewal), seen_from(1), None)
+    made(SimpleNamespace(steps=2 * renewal), seen_from(0), None)
+    assert made._has_moved

@@ -10,6 +10,7 @@ from datetime import UTC, datetime, timedelta
 import pytest
 
 from services.audit import Wanted, log, verify
+from services.audit import log as audit_log
 
 
 @pytest.fixture
@@ -150,3 +151,20 @@ def test_reading_is_an_entry_once_a_minute_and_each_download_is_one(plane):
         ("audit.export", {"format": "csv"}),
         ("audit.export", {"format": "csv"}),
     ]
+
+
+@pytest.mark.parametrize("form", ["jsonl", "csv"])
+def test_a_download_is_sent_in_pieces_of_bounded_size(tmp_path, monkeypatch, form):
+    log = audit_log.AuditLog(tmp_path / "audit.jsonl")
+    for number in range(40):
+        log.append("model.activate", actor="console", subject=str(number))
+    whole = b"".join(log.exported(Wanted(), form))
+    assert whole.count(b"\n") == 40 + (form == "csv")
+    longest = max(map(len, whole.splitlines(keepends=True)))
+    monkeypatch.setattr(audit_log, "PIECE_BYTES", 3 * longest)
+    pieces = list(log.exported(Wanted(), form))
+    log.close()
+    assert b"".join(pieces) == whole
+    body = pieces[1:] if form == "csv" else pieces
+    assert len(body) > 5 and all(3 * longest <= len(piece) < 4 * longest for piece in body[:-1])
+    assert all(piece.endswith(b"\n") for piece in pieces) and 0 < len(body[-1]) < 4 * longest
