@@ -12,7 +12,8 @@ import zmq
 
 from gsplat_core.io.frame_codec import encode
 from gsplat_core.scene.frames import Frame
-from services.bus.pictures import HIGH_WATER, PicturePublisher, picture_from, subscribe
+from services.bus.messages import MOST_BYTES, packed_json, parsed_json
+from services.bus.pictures import HIGH_WATER, MAX_PARTS, PicturePublisher, picture_from, split, subscribe
 from services.errors import BadMessage
 
 
@@ -159,3 +160,32 @@ FRAME = [bytes(piece) for piece in encode(Frame(0, 0, np.zeros((2, 2, 3), np.uin
 def test_what_is_no_picture(parts):
     with pytest.raises(BadMessage):
         picture_from([zmq.Frame(part) for part in parts])
+
+
+@pytest.mark.parametrize(("more", "is_read"), [(0, True), (1, False)])
+def test_messages_and_headers_of_the_largest_size_are_sent_and_read(more, is_read):
+    """One byte more is refused by the sender and by the reader."""
+    text = {"text": "x" * (MOST_BYTES - len(packed_json({"text": ""})) + more)}
+    data = b'{"text":"' + b"x" * (MOST_BYTES - len(b'{"text":""}') + more) + b'"}'
+    assert len(data) == MOST_BYTES + more
+    parts = [zmq.Frame(data), zmq.Frame(b"pixels")]
+    if is_read:
+        assert len(packed_json(text)) == MOST_BYTES
+        assert parsed_json(data).keys() == split(parts)[0].keys() == {"text"}
+        return
+    for call, argument, said in (
+        (packed_json, text, "is not sent"), (parsed_json, data, "is not read"), (split, parts, "at most 65536 are read"),
+    ):  # fmt: skip
+        with pytest.raises(BadMessage, match=said):
+            call(argument)
+
+
+@pytest.mark.parametrize(("count", "is_read"), [(1, False), (2, True), (MAX_PARTS, True), (MAX_PARTS + 1, False)])
+def test_a_picture_has_a_header_and_some_parts(count, is_read):
+    parts = [zmq.Frame(b"{}"), *(zmq.Frame(b"x") for _ in range(count - 1))]
+    if is_read:
+        header, pixels = split(parts)
+        assert header == {} and len(pixels) == count - 1
+    else:
+        with pytest.raises(BadMessage, match=f"this message {count}"):
+            split(parts)
