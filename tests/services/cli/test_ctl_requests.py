@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import json
+import zipfile
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
@@ -277,3 +279,22 @@ def test_a_batch_and_json_are_printed(ctl: Ctl, service: Service) -> None:
     code, out, _ = ctl("replays", "--batch", "b", "--count", "3", "--json")
     assert code == OK and json.loads(out)[0]["recording"] == "case-1"
     assert service.requests[0][2]["params"] == {"count": 3, "batch": "b"}
+
+
+def test_a_folder_is_uploaded_as_an_archive_of_its_files(ctl: Ctl, service: Service, tmp_path: Path) -> None:
+    """Nothing is compressed, because pictures are already."""
+    folder = tmp_path / "case"
+    (folder / "images").mkdir(parents=True)
+    contents = {"images/0.png": b"first" * 50, "images/1.png": b"second", "camera.json": b"{}"}
+    for name, content in contents.items():
+        (folder / name).write_bytes(content)
+    (folder / "again.png").symlink_to(folder / "images" / "1.png")
+    service.answers["PUT", "/v1/recordings/case-7"] = service.answers["GET", "/v1/recordings/case-7"] = [RECORDING]
+    assert ctl("add-recording", "case-7", str(folder))[0] == OK
+    with zipfile.ZipFile(io.BytesIO(service.requests[0][2]["file"])) as archive:
+        assert {name: archive.read(name) for name in archive.namelist()} == {**contents, "again.png": b"second"}
+        assert {info.compress_type for info in archive.infolist()} == {zipfile.ZIP_STORED}
+    (tmp_path / "secret").write_bytes(b"secret")
+    (folder / "outside.png").symlink_to(tmp_path / "secret")
+    code, _, err = ctl("add-recording", "case-7", str(folder))
+    assert code == BAD_INPUT and "is a link to a file outside" in err and len(service.requests) == 2
