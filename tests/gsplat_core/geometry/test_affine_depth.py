@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from gsplat_core.depth import learned
 from gsplat_core.depth.learned import LEAST_VALUES, MOST_SPAN, fitted, is_constant, with_assumed_zero
 
 COUNT = 2000
@@ -78,3 +79,53 @@ def test_an_assumed_zero_bounds_how_deep_a_picture_is():
         moved = with_assumed_zero(np.linspace(low, high, 1001)).of(np.linspace(low, high, 1001))
         near, far = np.percentile(moved, (2, 98))
         assert near > 0 and far / near == pytest.approx(MOST_SPAN)
+
+
+@pytest.mark.parametrize(
+    ("given", "middle", "spread"),
+    [([1.0, 2, 3, 4, 100], 3, 1), ([-5.0, -5, -1, 3, 3], -1, 4), ([2.0, 2, 2, 2, 12], 2, 4.0), ([7.0] * 5, 7, 0)],
+)
+def test_the_middle_of_values_is_their_median_with_its_deviation(given, middle, spread):
+    """The standard deviation stands in where more than half of the values are the median itself."""
+    assert learned._middle(np.array(given)) == pytest.approx((middle, spread))
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_start_value_maps_one_median_and_deviation_to_the_other(sign):
+    values, known = np.array([1.0, 2, 3, 4, 100]), np.array([10.0, 16, 20, 24, -900])
+    found = learned._by_medians(values, known, sign)
+    assert found.factor == pytest.approx(sign * 6) and found.of(np.array([3.0]))[0] == pytest.approx(16)
+
+
+def test_weighted_spread_and_correlation_are_those_of_repeated_values(rng):
+    x, y, counts = rng.normal(2, 3, 30), rng.normal(-1, 2, 30), rng.integers(1, 5, 30)
+    y += 0.5 * x
+    many_x, many_y = np.repeat(x, counts), np.repeat(y, counts)
+    assert learned._spread(x, counts) == pytest.approx((many_x.mean(), many_x.std()))
+    assert learned._correlation(x, y, counts) == pytest.approx(np.corrcoef(many_x, many_y)[0, 1])
+    assert learned._correlation(x, 0 * y, counts) == learned._correlation(0 * x, y, counts) == 0
+
+
+@pytest.mark.parametrize(("count", "is_fitted"), [(LEAST_VALUES - 1, False), (LEAST_VALUES, True)])
+def test_so_many_values_are_enough(count, is_fitted):
+    values = np.linspace(1, 2, count)
+    assert (fitted(values, 2 * values) is not None) == is_fitted
+
+
+def test_exact_values_have_an_exact_map_at_any_size(rng):
+    """Differences of 0 give all values the same weight."""
+    values = rng.normal(size=200)
+    for size in (1e-6, 1.0, 1e6):
+        found = fitted(values, size * (3 * values - 1))
+        assert found is not None and found[:2] == pytest.approx((3 * size, -size)) and found.alike == pytest.approx(1)
+    zero = np.where(np.arange(200) < 100, 0.0, values)
+    assert fitted(zero, zero) is not None
+
+
+@pytest.mark.parametrize(("low", "high", "summand"), [(1.0, 5.0, 0.0), (1.0, 9.0, 1.0), (0.0, 4.0, 1.0), (-1.0, 3.0, 2.0), (2.0, 3.0, 0.0)])  # fmt: skip
+def test_an_assumed_zero_makes_the_far_end_five_times_the_near_one(low, high, summand):
+    values = np.concatenate([np.full(100, low), np.full(100, high)])
+    found = with_assumed_zero(values)
+    assert found == (1.0, pytest.approx(summand), 1.0)
+    ends = found.of(np.array([low, high]))
+    assert ends[1] <= MOST_SPAN * ends[0] * (1 + 1e-9)
