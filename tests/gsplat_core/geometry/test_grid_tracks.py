@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import cv2
 import numpy as np
+import pytest
 
 from gsplat_core.geometry import grid_tracks
 from gsplat_core.geometry.grid_tracks import LONGEST_PX, TexturedPicture, follow_grids, seen_by
@@ -123,3 +124,24 @@ def test_pictures_are_compared_with_the_key_from_the_nearest_on_in_both_directio
     ]
     assert [float((at - start).mean()) for at in pixels] == [0, 1, 0, 3, 4]
     assert seen[2].all()
+
+
+@pytest.mark.parametrize(
+    ("at", "misses_px", "is_found"),
+    [
+        ((30.0, 20.0), 0.98, True), ((30.0, 20.0), 1.02, False), ((0.0, 20.0), 0, True), ((-0.1, 20.0), 0, False),
+        ((30.0, 0.0), 0, True), ((30.0, -0.1), 0, False), ((59.9, 20.0), 0, True), ((60.0, 20.0), 0, False),
+        ((30.0, 39.9), 0, True), ((30.0, 40.0), 0, False), ((45.0, 20.0), 0, False),
+    ],
+)  # fmt: skip
+def test_a_point_is_found_inside_of_the_border_on_tissue_and_within_a_pixel_of_its_start(
+    at, misses_px, is_found
+) -> None:
+    """Positions are relative to the border that is left out. A tool is at columns 40 to 50."""
+    border = grid_tracks.BORDER_PX
+    usable = np.ones((40 + 2 * border, 60 + 2 * border), np.uint8)
+    usable[:, 40 + border : 50 + border] = 0
+    start = np.array([[20.0, 25.0]], np.float32)
+    pixels = np.array([at], np.float32) + border
+    back = np.broadcast_to(start[0] - pixels[0] + np.float32([misses_px, 0]), (*usable.shape, 2)).astype(np.float32)
+    assert grid_tracks._found(start, pixels, back, usable).tolist() == [is_found]

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import pytest
 
+from gsplat_core.geometry import stream_tracks
 from gsplat_core.geometry.stream_tracks import (
     MOST_POINTS,
     SIDE_PX,
@@ -185,3 +187,12 @@ def test_a_new_scene_begins_without_points():
     tracks.begin(SmallPictures(CAMERA).of(frame(seed=1)))
     assert len(tracks.numbers) == len(tracks.pixels) == len(tracks.first) == 0
     assert tracks.take_up().min() == last + 1
+
+
+@pytest.mark.parametrize(("misses_px", "is_trusted"), [(0.49, True), (0.51, False), (np.inf, False)])
+def test_a_way_back_that_misses_by_half_a_pixel_is_not_trusted(monkeypatch, misses_px, is_trusted):
+    picture = SmallPictures(WIDE).of(wide(1))
+    points = np.array([[60, 60]], np.float32)
+    monkeypatch.setattr(stream_tracks, "followed", lambda *_, **__: (points + 1, np.array([misses_px])))
+    there, trusted = found_again(picture, picture, points, points)
+    assert trusted.tolist() == [is_trusted] and there.tolist() == [[61, 61]]

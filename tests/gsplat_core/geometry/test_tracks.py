@@ -168,3 +168,8 @@ def test_a_picture_in_which_just_enough_points_survive_counts(monkeypatch, more,
     monkeypatch.setattr(tracks, "_moved", lambda *_: (tracks._points[:kept], tracks._numbers[:kept]))
     tracks.follow(np.zeros((HEIGHT, WIDTH, 3), np.uint8), None)
     assert (len(last(tracks)[0]) == 0) == left_out and len(tracks._points) == (count if left_out else kept)
+
+
+@pytest.mark.parametrize(("miss_px", "kept"), [(0.69, [0]), (0.71, [])])
+def test_a_point_whose_way_back_misses_by_seven_tenths_of_a_pixel_is_lost(monkeypatch, miss_px, kept):
+    assert found_at(monkeypatch, [[50, 50]], [miss_px]) == kept
