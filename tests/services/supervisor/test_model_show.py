@@ -18,7 +18,7 @@ from gsplat_core.scene.gaussians import Gaussians
 from operators.sources.source import SourceState
 from services.errors import BadMessage, CommandRefused
 from services.supervisor import model_show
-from services.supervisor.model_show import LATE_IN_A_ROW, FinishedModel, ModelShow, NotFinite
+from services.supervisor.model_show import LATE_IN_A_ROW, FinishedModel, ModelShow, NotFinite, Showing
 from services.supervisor.screen import Screen
 from services.supervisor.worker import EngineSpec
 
@@ -218,3 +218,24 @@ def test_wrong_arguments_are_refused(show, bundles, wrong):
 def test_times_go_round_the_window(bundles):
     model = FinishedModel(bundles / "1", "wall", 1, device="cpu", renderer="alpha")
     assert [model.at(time_s) for time_s in (0.0, 0.5, 2.0, 3.5, -1.0)] == [1.0, 1.5, 1.0, 2.5, 1.0]
+
+
+@pytest.mark.parametrize(
+    ("took_ms", "given_up"),
+    [
+        ([11, 11, 11, 11, 11], 1), ([11, 11, 11, 11, 10, 11, 11, 11, 11], 0), ([10.0] * 20, 0), ([10.01] * 4, 0), ([50, 50, 50, 50, 50], 1),
+    ],
+)  # fmt: skip
+def test_a_model_gives_way_after_five_late_pictures_in_a_row(monkeypatch, took_ms, given_up):
+    """A single late picture may be due to other load."""
+    show, reasons = object.__new__(ModelShow), []
+    show._late = 0
+    showing = Showing(SimpleNamespace(name="liver", version=3), {}, 10.0)
+    monkeypatch.setattr(show, "_give_way", lambda which, why: reasons.append((which, why)))
+    for each in took_ms:
+        show._check_time(showing, each)
+    assert len(reasons) == given_up and all(which is showing and "liver 3 took" in why for which, why in reasons)
+    unlimited = Showing(SimpleNamespace(name="liver", version=3), {}, None)
+    for _ in range(20):
+        show._check_time(unlimited, 1e6)
+    assert len(reasons) == given_up
