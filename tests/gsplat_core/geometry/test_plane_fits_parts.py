@@ -144,3 +144,15 @@ def test_a_plane_through_all_values_is_that_of_least_squares_and_level_where_few
     weight[10, 10:12] = 1
     found = plane_fits._whole_plane(values, weight)
     assert np.ptp(found) < 0.5 * np.ptp(values) and found[10, 10] == pytest.approx(values[10, 10], rel=0.05)
+
+
+def test_where_points_are_sparse_they_count_by_a_window_of_24_pixels():
+    """The mean error at a pixel tells the weights of the two points. Both are too far for the narrow window."""
+    pixels, errors = np.array([[25.0, 41.0], [105.0, 41.0]]), np.array([0.01, 0.05])
+    _, found, support = surface_through(pixels, np.array([50.0, 60.0]), errors, (82, 130))
+    weights = 1 / (errors**2 + 0.005**2)
+    for column in (60, 70, 80):
+        away = column + 0.5 - pixels[:, 0]
+        near = weights * np.exp(-0.5 * (away / 24) ** 2)
+        assert support[41, column] < 0.03
+        assert found[41, column] == pytest.approx(near @ errors / near.sum(), rel=0.06)

@@ -173,3 +173,20 @@ def test_a_picture_in_which_just_enough_points_survive_counts(monkeypatch, more,
 @pytest.mark.parametrize(("miss_px", "kept"), [(0.69, [0]), (0.71, [])])
 def test_a_point_whose_way_back_misses_by_seven_tenths_of_a_pixel_is_lost(monkeypatch, miss_px, kept):
     assert found_at(monkeypatch, [[50, 50]], [miss_px]) == kept
+
+
+@pytest.mark.parametrize("there", [[np.nan, 50.0], [50.0, np.inf], [np.nan, np.nan]])
+def test_a_point_without_a_finite_place_is_lost(monkeypatch, there):
+    """OpenCV may report such places as found."""
+    calls = []
+
+    def flow(first, second, points, guess, **_):
+        calls.append(points)
+        found = np.array([[50.0, 50.0], there], np.float32) if len(calls) == 1 else np.asarray(points, np.float32)
+        return found, np.ones((len(points), 1), np.uint8), None
+
+    monkeypatch.setattr(tracks_module.cv2, "calcOpticalFlowPyrLK", flow)
+    grey = np.zeros((HEIGHT, WIDTH), np.uint8)
+    points = np.full((2, 2), 50, np.float32)
+    _, misses = followed(grey, grey, points, window_px=21, levels=3)
+    assert misses[0] == 0 and misses[1] == np.inf
