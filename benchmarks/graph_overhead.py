@@ -170,7 +170,7 @@ def main() -> None:
         "embedded_multithread": lambda: chain_us(few, threads=True),
     }
     if options.holoscan:
-        from operators.graph.holoscan import load_sdk
+        from operators.graph.sdk import load_sdk
 
         load_sdk()
         cases["adapter_holoscan_greedy"] = lambda: chain_us(few, engine="holoscan")

@@ -83,7 +83,7 @@ def sdk() -> None:
     Without it the test is skipped, or fails if INTRASPLAT_REQUIRE_HOLOSCAN=1.
     """
     from operators.errors import EngineMissing
-    from operators.graph.holoscan import load_sdk
+    from operators.graph.sdk import load_sdk
 
     try:
         load_sdk()

@@ -7,7 +7,7 @@ import importlib.util
 import pytest
 
 from operators.errors import EngineMissing
-from operators.graph import holoscan
+from operators.graph import sdk
 
 
 def hide(monkeypatch, *hidden):
@@ -20,7 +20,7 @@ def hide(monkeypatch, *hidden):
 def test_a_missing_sdk_names_the_extra(monkeypatch):
     hide(monkeypatch, "holoscan")
     with pytest.raises(EngineMissing, match=r"not installed; install it with: pip install 'intrasplat\[holoscan\]'"):
-        holoscan.load_sdk()
+        sdk.load_sdk()
 
 
 def test_a_missing_cuda_runtime_names_the_library_and_the_extra(monkeypatch):
@@ -29,20 +29,20 @@ def test_a_missing_cuda_runtime_names_the_library_and_the_extra(monkeypatch):
     def cannot(name, mode=0):
         raise OSError(f"{name}: cannot open shared object file")
 
-    monkeypatch.setattr(holoscan.ctypes, "CDLL", cannot)
+    monkeypatch.setattr(sdk.ctypes, "CDLL", cannot)
     with pytest.raises(
         EngineMissing, match=r"libcudart.so.13 of the package nvidia-cuda-runtime.*intrasplat\[holoscan\]"
     ):
-        holoscan._preload_cudart()
+        sdk._preload_cudart()
 
 
 def test_a_broken_sdk_says_what_the_loader_said(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: object())
-    monkeypatch.setattr(holoscan, "_preload_cudart", lambda: None)
+    monkeypatch.setattr(sdk, "_preload_cudart", lambda: None)
 
     def broken(name):
         raise ImportError("libfoo.so: undefined symbol")
 
-    monkeypatch.setattr(holoscan.importlib, "import_module", broken)
+    monkeypatch.setattr(sdk.importlib, "import_module", broken)
     with pytest.raises(EngineMissing, match=r"cannot be loaded.*undefined symbol"):
-        holoscan.load_sdk()
+        sdk.load_sdk()
