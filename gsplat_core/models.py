@@ -427,7 +427,7 @@ class SnapshotSlots:
 
     @property
     def count(self) -> int:
-        """Number of slots allocated so far."""
+        """Number of allocated slots, in use or free. Each holds one snapshot; slots are reused and never freed."""
         return len(self._slots)
 
     def publish(

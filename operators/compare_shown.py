@@ -35,7 +35,7 @@ class CompareShownOp(Operator):
         rendered: `RenderedFrame`, in order of the sequence number.
 
     Params:
-        shown: factory called in `start()`; yields the recorded pictures in order.
+        shown: factory called in `start()`; yields the log lines of the recorded pictures, ordered by sequence number.
     """
 
     def __init__(self, fragment: Any, *args: Any, shown: Callable[[], Iterator[ShownLine]], **kwargs: Any) -> None:

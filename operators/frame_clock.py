@@ -166,7 +166,7 @@ class FrameClock:
 
     @property
     def show_after_ns(self) -> float:
-        """Display deadline after a frame's arrival, in nanoseconds."""
+        """Latest intended display of a frame after its arrival, in nanoseconds. Training normally ends before."""
         settings = self.settings
         if settings.budget_ms is not None:
             return settings.budget_ms * 1e6

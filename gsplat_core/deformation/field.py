@@ -65,7 +65,7 @@ class EditableMotion(Protocol):
         """
 
     def move_to(self, time_s: float, deltas: Tensor) -> None:
-        """Set the deltas at `time_s`, with little change at other times."""
+        """Change the field such that its deltas at `time_s` equal `deltas`, with little change at other times."""
 
     def scale_positions(self, factor: Tensor) -> None:
         """Multiply each Gaussian's position deltas by `factor` [N] at all times."""
@@ -114,11 +114,12 @@ class CapturedMotion(FrameDeltas, Protocol):
         """
 
     def move_to_at(self, tau: Tensor, deltas: Tensor) -> None:
-        """Set the deltas at a normalised time without synchronisation.
+        """Change the field such that it has the given deltas at one time; see `EditableMotion.move_to`. Does not
+        synchronise.
 
         Args:
             tau: normalised time [1] on the field's device.
-            deltas: [N, 16] as returned by the function of `frame_deltas`.
+            deltas: [N, 16] in the columns of the result of `frame_deltas`.
         """
 
 

@@ -46,7 +46,7 @@ BLURRED_BELOW = 0.75
 SHARP_ABOVE = 0.82
 """Ratio of the sharpness to the usual one from which a frame after a blurred one is sharp again."""
 SMOKE_CONTRAST = 0.75
-"""Ratio of the contrast to the usual one below which a frame may be smoky."""
+"""Ratio of the contrast to the usual one below which a frame may be smoky. Smoke also requires the next two limits."""
 SMOKE_SATURATION = 0.8
 """Ratio of the saturation to the usual one below which a frame may be smoky."""
 SMOKE_HAZE = 15.0

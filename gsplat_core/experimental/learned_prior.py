@@ -82,7 +82,9 @@ class LocalShares:
         self._products = products
 
     def whole(self) -> NDArray[np.float64]:
-        """Return the shares [K] that fit the whole picture; the initial ones before any observation."""
+        """Return the mixing weights [K] of the predictions, fitted over the whole picture; the initial ones before any
+        observation.
+        """
         settings, first = self._settings, np.asarray(self._settings.at_first)
         if self._products is None:
             return first

@@ -20,7 +20,7 @@ MOST_POINTS = 220
 APART = 0.03
 """Smallest distance between points when they are detected, as a share of the longer side."""
 LEAST_QUALITY = 0.005
-"""Quality of a corner relative to the picture's best one."""
+"""Smallest quality of a detected corner, relative to the best one of the picture."""
 PATCH_PX = 17
 """Side of the square patch that is tracked, in pixels."""
 LEVELS = 3

@@ -50,7 +50,7 @@ class Playback:
     """Mapping of a recording's timestamps to those of the stream that played it (see `RealtimeSource`)."""
 
     last_s: float
-    """Timestamp of the recording's last frame in the first round, in seconds."""
+    """Timestamp in the stream, in seconds, of the recording's last frame when it was first played."""
     stretch: float = 1.0
     """Factor on all timestamps: 0.5 for a recording of 30 frames/s played at 60."""
     round_s: float = math.inf

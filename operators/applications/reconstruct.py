@@ -204,7 +204,7 @@ class _Inputs:
         return new_reconstructor(self.settings, self.source, offline=True)
 
     def _frames(self) -> list[Frame]:
-        """Return the training frames with their depth."""
+        """Return the training frames, with depth where it can be found from the frame alone."""
         description, settings = self.source.description, self.settings
         if description.digest is None or description.frame_count is None:
             raise InvalidSetting(

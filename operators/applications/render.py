@@ -57,7 +57,10 @@ COVERED = 0.5
 
 @dataclass(frozen=True)
 class ViewWish:
-    """Requested view. Raises InvalidSetting for an invalid baseline."""
+    """Choice of the cameras of a video: a view by name, and the baseline of the view `stereo`.
+
+    Raises InvalidSetting for a baseline that is not positive and finite, or for one with another view.
+    """
 
     name: str = "recorded"
     """`recorded` (the model's own camera), `orbit`, `stereo` (side by side), or a camera path file

@@ -39,7 +39,7 @@ class Backoff:
         """Number of failed attempts in a row."""
 
     def failed(self) -> float:
-        """Record a failure. Return the delay in seconds."""
+        """Record a failed attempt. Return the delay before the next one, in seconds."""
         self.failures += 1
         return float(min(self._most_s, self._first_s * 2 ** min(self.failures - 1, 30)))
 

@@ -294,7 +294,7 @@ _TITLES = {
 
 
 def charts_section(report: EvaluationReport) -> str:
-    """Return the charts of tissue PSNR per frame, one per protocol."""
+    """Return the HTML of the charts of tissue PSNR over time, one for each protocol that was evaluated."""
     charts = "".join(_chart(report, name) for name in _LINES if report.series.get(name))
     return charts
 

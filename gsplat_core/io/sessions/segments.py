@@ -156,7 +156,7 @@ class SegmentReader:
         try:
             yield from read_log(self.folder / LOG_FILE)
         except (UnreadableFile, OSError):
-            return  # treat as a log truncated at its first byte
+            return  # a log that cannot be read counts as ending here, like a truncated one
 
     def there(self, line: PictureLine) -> bool:
         """Return True if all pictures of a line are complete in their files."""

@@ -53,9 +53,9 @@ struct Kernels {
   void (*backward)(const BasisBumps& field, const float* gradient, float* centers, float* log_widths, float* weights,
                    int64_t begin, int64_t end);
   void (*adam)(const BasisAdam& field, const float* gradient, int64_t begin, int64_t end);
-  // Changes the field's `weights` such that its deltas equal `target` [N, row].
+  // Changes the field's `weights` such that its deltas at the time `tau` equal `target` [N, row].
   void (*move_to)(const BasisBumps& field, float* weights, const float* target, int64_t begin, int64_t end);
-  // Changes the field's `weights` such that the colour deltas increase by `change` [N, 3].
+  // Changes the field's `weights` such that the colour deltas at the time `tau` increase by `change` [N, 3].
   void (*add_colours)(const BasisBumps& field, float* weights, const float* change, int64_t begin, int64_t end);
 };
 

@@ -46,7 +46,7 @@ __device__ inline void start_pixels(const Inputs& in, const PictureGradient& fro
   for (int p = 0; p < kPixelsEach; ++p) pixels[p].through = left[p], pixels[p].behind = left[p] * v_left[p];
 }
 
-// Return the row of an instance in this block's window, among the rows of all windows of its tile.
+// Return the row of an instance for this block's window. Each instance has one row per window of its tile, contiguous.
 __device__ inline int64_t row_of(const Inputs& in, int64_t position) {
   const int side = (in.tile_size + kWindow - 1) / kWindow, windows = side * side;
   return position * windows + blockIdx.x % windows;

@@ -140,7 +140,7 @@ __global__ void __launch_bounds__(kThreads, 2)
     }
 #pragma unroll
     for (int axis = 0; axis < 3; ++axis) v_x[axis] += v_place[axis] * places[axis].slope;
-    // Stores follow all loads of the level, because the compiler cannot move loads across a store.
+    // The fractions are stored after the level's loads: the compiler cannot move a load to before a store.
 #pragma unroll
     for (int p = 0; p < 3; ++p) {
       if (lane != p) continue;

@@ -46,8 +46,8 @@ struct Kernels {
   int64_t (*count_tissue)(const uint8_t* mask, int64_t pixels);
 };
 
-// CUDA task for all terms; every pointer is device memory. Pixels of `image` and `v_image` are `stride` floats apart;
-// the first `channels` floats are compared.
+// CUDA task for all terms; every pointer is device memory. Pixels of `image` and `v_image` are `stride` floats apart: the
+// `channels` colours, then the depth if `alphas` is given, then unused floats.
 struct DeviceImageLoss {
   const float* image;
   const float* target;          // [H, W, channels]; null if target_bytes is set

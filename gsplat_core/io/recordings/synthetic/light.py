@@ -27,7 +27,7 @@ SHADOW_MM = (0.0, -7.0, 0.0)
 
 @dataclass(frozen=True)
 class LampPlan:
-    """Positions of the fibres in mm around the centre of the scope's tip, and width of their beam."""
+    """Positions of the fibres in mm relative to the centre of the scope's tip, and how narrow their beam is."""
 
     lights_mm: tuple[tuple[float, float, float], tuple[float, float, float]] = LIGHTS_MM
     beam: float = 2.0

@@ -259,7 +259,9 @@ class TissueShape:
     bowl: float = 1.0
     """Factor on the curvature of the sheet towards the scope."""
     tilt: float = 0.10
-    """Largest slope of the tissue sheet along each axis."""
+    """Limit of the slope of the whole sheet along each axis, without hills and bowl. The slope is drawn at random from
+    -tilt to tilt.
+    """
     breath: float = 1.0
     """Factor on the amplitude of breathing."""
     pulse: float = 1.0
