@@ -159,8 +159,8 @@ MODULES: Mapping[str, Mapping[str, str]] = {
     },
     "gsplat.training": {"TwoStageScheduleStep": _SURGICAL, "TwoStageScheduler": _SURGICAL},
     "gsplat.utils": {
-        "depth_to_normal": "gsplat_core.rendering.surface",
-        "depth_to_points": "gsplat_core.rendering.surface",
+        "depth_to_normal": "gsplat_core.rendering.depth_maps",
+        "depth_to_points": "gsplat_core.rendering.depth_maps",
         "get_projection_matrix": _FUNCTIONS,
         "inverse_log_transform": _FUNCTIONS,
         "log_transform": _FUNCTIONS,

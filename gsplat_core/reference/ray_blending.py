@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.reference.compositing import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_STOP
-from gsplat_core.rendering.surface import normals_of_depth
+from gsplat_core.rendering.depth_maps import normals_of_depth
 
 Blended = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 

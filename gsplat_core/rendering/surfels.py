@@ -24,6 +24,7 @@ from gsplat_core.ops.arguments import (
 from gsplat_core.ops.surfel_blending import rasterize_to_pixels_2dgs
 from gsplat_core.ops.surfel_projection import fully_fused_projection_2dgs, sparse_gradients
 from gsplat_core.ops.tiles import bin_splats
+from gsplat_core.rendering.depth_maps import depth_to_normal
 from gsplat_core.rendering.pipeline import Meta, Signal, check_shapes, isect_ids_of, view_colors
 from gsplat_core.rendering.rasterization import step_by_step
 from gsplat_core.rendering.settings import (
@@ -37,7 +38,6 @@ from gsplat_core.rendering.settings import (
     RenderSettings,
     check_tensors,
 )
-from gsplat_core.rendering.surface import depth_to_normal
 
 SurfelMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 DepthMode = Literal["expected", "median"]

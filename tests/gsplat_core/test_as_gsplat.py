@@ -13,7 +13,7 @@ import torch
 import gsplat_core
 from gsplat_core.as_gsplat import finder, install
 from gsplat_core.as_gsplat import functions as utils
-from gsplat_core.rendering.surface import depth_to_normal, depth_to_points
+from gsplat_core.rendering.depth_maps import depth_to_normal, depth_to_points
 
 PROGRAM = """
 import sys

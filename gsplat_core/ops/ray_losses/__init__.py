@@ -51,7 +51,7 @@ def ray_normal_loss(
 
     Returns:
         Mean of alpha - normals · n, [], over tissue where the depths have a unit normal n
-        (`gsplat_core.rendering.surface.depth_normals`); 0 without compared pixels.
+        (`gsplat_core.rendering.depth_maps.depth_normals`); 0 without compared pixels.
 
     Raises:
         InvalidInput: for wrong shapes, dtypes or camera models; `gsplat_core.reference.ray_normal_loss` accepts float64.

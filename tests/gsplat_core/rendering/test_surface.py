@@ -13,6 +13,7 @@ from gsplat_core import Camera, Gaussians, InvalidInput, reference, render
 from gsplat_core.choices import OUTPUTS
 from gsplat_core.models import Model
 from gsplat_core.rendering.alpha import AlphaRenderer
+from gsplat_core.rendering.depth_maps import depth_normals
 from gsplat_core.rendering.renderer import SURFACE_OUTPUTS
 from gsplat_core.rendering.settings import EPS2D
 from gsplat_core.rendering.surface import (
@@ -20,7 +21,6 @@ from gsplat_core.rendering.surface import (
     Surface,
     certainty,
     contribution,
-    depth_normals,
     pruned,
     render_surface,
 )
