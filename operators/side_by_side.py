@@ -17,8 +17,9 @@ class SideBySideOp(Operator):
     """Runs several chains of operators on each frame in parallel, merges their results, and runs a final chain.
 
     Each operator of a chain reads a `Frame` at its input `frame` and emits it with more fields at its output `frame`.
-    The result is the frame of the chain `first`, with the tool mask and loss mask of the chain `beside`. If the gate
-    withholds the frame, the gate's frame is used instead.
+    The result is the frame of the chain `first`. It gets the tool mask of the chain `beside` if it has none, and its
+    loss mask is intersected with that of `beside`. If the gate withholds the frame, the gate's frame with the number
+    and timestamp of `first` is used instead; it passes through the final chain, too.
 
     The operators belong to no graph. This operator starts and stops them and forwards their contributions to the
     outcome.
@@ -33,7 +34,7 @@ class SideBySideOp(Operator):
         gate: chain that may withhold a frame from downstream; the other chains see its picture.
         first: chain whose frame is passed on.
         beside: chain that runs in parallel to `first`; only its tool mask and loss mask are used.
-        then: final chain, run on the merged frame.
+        then: final chain, run on the merged or withheld frame.
     """
 
     def __init__(

@@ -17,7 +17,9 @@ OTHERS = 0o077
 KEPT = frozenset(
     {"admin.key", "registry", "recordings", "replays", "snapshots", "uploads", "exports", "cache", "cuda-cache"}
 )
-"""Names in the data folder that belong to the service, in addition to `audit.…` and `keys.…`."""
+"""Names in the data folder that belong to the service, in addition to `audit.…` and `keys.…`. Only these are made
+private.
+"""
 
 
 class FolderNotPrivate(UserError):

@@ -359,7 +359,7 @@ class BumpTensors(ContinuedField):
         return copied.requires_grad_(False)
 
     def _held(self, time_s: float) -> Tensor:
-        """Return the deltas [N, 13] that new bumps continue, decayed where training is active."""
+        """Return the deltas [N, 13] that new bumps continue; decayed for Gaussians trained since the newest bump."""
         deltas = self.deltas(time_s).detach()
         if self._fading_s == math.inf or self._moments is None:
             return deltas

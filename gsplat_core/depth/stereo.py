@@ -339,8 +339,9 @@ SAID_FROM_PX = 1.0
 PLAUSIBLE_MM = (2.0, 1000.0)
 """Plausible median distances for a scope inside the body, in millimetres."""
 SAME_FOCAL, SAME_ROW_PX, SAME_AXES = 1e-3, SAID_FROM_PX, 1e-6
-"""Tolerances of a rectified pair: relative difference of focal lengths, row difference of principal
-points in pixels (row offsets are corrected), and deviation of the axes.
+"""Tolerances of a rectified pair: relative difference of focal lengths, row difference of principal points in pixels
+(row offsets are corrected), and largest deviation of an element of the rotation from the identity. The last one also
+limits the offset in y and z relative to that in x.
 """
 
 

@@ -37,8 +37,8 @@ EDGE_RADIUS_PX, EDGE_CONTRAST = 3, 0.01
 """Radius of the guided filter in pixels, and variance of `LOGARITHMS` in its window above which it keeps edges."""
 
 SMALLEST_INNER_REGION = 0.02
-"""Smallest area of a region that does not reach the border of the view, as a share of the picture. Tools enter from the border; clips,
-glare and cavities do not.
+"""Smallest area of a tool region that does not reach the border of the view, as a share of the picture; smaller ones
+are removed. Tools enter from the border; clips, glare and cavities do not.
 """
 BORDER: NDArray[np.uint8] = np.ones((7, 7), np.uint8)
 """Structuring element by which a view is eroded to find its border, three pixels wide."""

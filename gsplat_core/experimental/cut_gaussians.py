@@ -135,8 +135,8 @@ class CutKernel(GaussianKernel):
     extra = (CURVES,)
 
     def factors(self, offsets: Tensor, curves: Tensor | None) -> Tensor | None:
-        """Return the factors of alpha at offsets [T, P, L, 2] from the splats' means. `curves` are the projected
-        control points [T, L, M, 4, 2] relative to the means.
+        """Return the factors of alpha, 0 or 1, at offsets [T, P, L, 2] from the splats' means. `curves` are the
+        projected control points [T, L, M, 4, 2] relative to the means.
         """
         assert curves is not None
         return side(offsets[..., None, :], curves[:, None]).prod(-1)

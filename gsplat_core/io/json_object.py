@@ -43,7 +43,7 @@ class JsonObject:
         return int(self._checked(key, wanted))
 
     def number(self, key: str, wanted: NumberIn) -> float:
-        """Return a number in the range `wanted`."""
+        """Return the number stored under a key, in the range `wanted`."""
         return float(self._checked(key, wanted))
 
     def matrix(self, key: str, size: int, wanted: NumberIn) -> list[list[float]]:

@@ -216,7 +216,7 @@ def fit_disparities(
 
 
 def window(plane: Tensor) -> Tensor:
-    """Filter a plane with a Gaussian window and zero padding."""
+    """Blur a plane [H, W] with a Gaussian window of standard deviation `SIGMA`, padded with zeros."""
     offsets = torch.arange(-RADIUS, RADIUS + 1, dtype=plane.dtype, device=plane.device)
     taps = torch.exp(-0.5 * (offsets / SIGMA) ** 2)
     taps = taps / taps.sum()

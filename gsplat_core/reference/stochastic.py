@@ -125,7 +125,7 @@ def sample_moments(
 
 
 QUADRATURE = 8
-"""Points per axis of a sub-pixel at which the rate is evaluated."""
+"""Points per axis of a sub-pixel at which a splat's rate of points (expected number per sub-pixel) is evaluated."""
 
 
 def dilogarithm(x: Tensor) -> Tensor:

@@ -120,7 +120,9 @@ def best_shift(left: NDArray[np.float32], right: NDArray[np.float32], before: in
 
 
 def _correlations(left: NDArray[np.float32], right: NDArray[np.float32], most: int) -> NDArray[np.float64]:
-    """Return the correlation of the overlap for each shift of the right picture from -`most` to `most`, [2 most + 1]."""
+    """Return the correlation coefficient of the overlap for each shift of the right picture to the left, from -`most`
+    to `most` pixels, [2 most + 1].
+    """
     a, b = left.astype(np.float64), right.astype(np.float64)
     height, width = a.shape
     shifts = np.arange(-most, most + 1)

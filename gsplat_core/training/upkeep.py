@@ -180,7 +180,9 @@ class Upkeep:
         return crowded if self._has_moved else crowded | (idle & ~seen.inside)
 
     def _fill_up(self, step: TrainingStep, observation: Observation, shown: Tensor) -> None:
-        """Split `shown` Gaussians, bool [N], of the largest gradients towards the initial density: at most `MOST_SPLIT`."""
+        """Split those of the `shown` Gaussians, bool [N], that have the largest gradients, towards the initial density;
+        at most the share `MOST_SPLIT` of all Gaussians.
+        """
         wanted = torch.count_nonzero(observation.mask) / self._spacing_px**2
         missing = int(wanted - torch.count_nonzero(shown))
         count = min(missing, round(MOST_SPLIT * step.gaussians.count), self._capacity - step.gaussians.count)

@@ -330,7 +330,7 @@ class _Fitting:
         kept = inputs.validating
         path = inputs.path
         if path is not None:
-            # Held-out frames have interpolated poses too.
+            # Validation frames get interpolated poses in place of their own, because held-out frames have no others.
             kept = [frame.with_fields(pose=path.interpolated(frame.time_s)) for frame in kept]
 
         def train(steps: int) -> Trained:

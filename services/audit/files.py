@@ -182,7 +182,7 @@ def write_head(log: Path, head: Head) -> None:
 
 
 def write_anchor(log: Path, anchor: Head) -> None:
-    """Replace a log's anchor file atomically."""
+    """Replace a log's anchor file, which names the last entry removed by retention, atomically."""
     _write(anchor_path(log), anchor)
 
 

@@ -428,7 +428,7 @@ def replays(
     service: Service = Service(),
     json: JsonOption = False,
 ) -> int:
-    """List the newest replays."""
+    """Print the newest replays."""
     found = service(lambda client: client.replays(count=count, batch=batch))
     return print_found(found, REPLAY, json)
 

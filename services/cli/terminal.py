@@ -206,7 +206,7 @@ def _text(field: str, value: Any) -> str:
 def _time(text: str) -> str:
     try:
         return datetime.fromisoformat(text).astimezone().strftime("%Y-%m-%d %H:%M:%S %z")
-    except (ValueError, OverflowError, OSError):  # the server's text may be no time
+    except (ValueError, OverflowError, OSError):  # not a time: print the server's text as it is
         return printable(text)
 
 

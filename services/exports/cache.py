@@ -97,7 +97,7 @@ PASSED_ON = (
 
 
 class ExportPrograms:
-    """Starts export programs within limits, and kills the running programs on `end`. Thread-safe."""
+    """Runs export programs for a limited time each, and kills the running ones on `end`. Thread-safe."""
 
     def __init__(self, program: tuple[str, ...] = PROGRAM, most_s: float = MOST_S) -> None:
         self._program, self._most_s = program, most_s
