@@ -227,10 +227,6 @@ WARM_STEPS = {"cpu": 3, "cuda": 40}
 """Optimiser steps on each warm-up picture."""
 EYES_APART = 0.07
 """Stereo baseline of the warm-up as a share of the scene's distance."""
-MOVES_AFTER, MOVES_BY = 2, 0.2
-"""Number of warm-up frames before the camera moves, so that the code for a still and for a moving camera runs, and its
-movement per frame as a share of the scene's distance.
-"""
 
 
 def warm_reconstructor(
@@ -257,7 +253,7 @@ def warm_reconstructor(
     drawn: list[object] = []
     for frames in (WARM_FRAMES, 1):  # the second scene runs the code that reuses memory
         for seq in range(frames):
-            frame = Frame(seq, seq * 33_000_000, image, mask=tissue, pose=moved(reconstructor, seq))
+            frame = Frame(seq, seq * 33_000_000, image, mask=tissue)
             if stereo:
                 right = reconstructor.camera.right_eye(EYES_APART * reconstructor.config.default_depth_mm)
                 frame = frame.with_fields(right_image=image, right_camera=right)
@@ -273,13 +269,6 @@ def warm_reconstructor(
             reconstructor.grow(frame)
         reconstructor.look_after_once()
         reconstructor.forget()
-
-
-def moved(reconstructor: Reconstructor, seq: int) -> NDArray[np.float64]:
-    """Return the pose [4, 4] of a warm-up frame: the scope moves to the left from the frame `MOVES_AFTER` on."""
-    pose = reconstructor.camera.world_to_camera.copy()
-    pose[0, 3] += max(0, seq + 1 - MOVES_AFTER) * MOVES_BY * reconstructor.config.default_depth_mm
-    return pose
 
 
 def noise(camera: Camera) -> NDArray[np.uint8]:

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import pytest
-
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.training import upkeep
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.schedule import LiveTraining
@@ -29,19 +26,3 @@ def test_upkeep_is_done_once_in_each_scene_and_nothing_of_it_stays(monkeypatch):
     warm_reconstructor(reconstructor, lambda frame, model: drawn.append(model))
     assert done == [True, True] and len(drawn) == 5
     assert reconstructor.gaussians == 0
-
-
-@pytest.mark.parametrize("preallocate", [False, True])
-def test_tissue_comes_into_view_and_is_filled(monkeypatch, preallocate):
-    added = []
-
-    def noted(step, *arguments):
-        before = step.gaussians.count
-        fill(step, *arguments)
-        added.append(step.gaussians.count - before)
-
-    fill = upkeep.fill_new_tissue
-    monkeypatch.setattr(upkeep, "fill_new_tissue", noted)
-    config = ReconstructorConfig(gaussians=120, max_gaussians=240, history_s=1.0, preallocate=preallocate)
-    warm_reconstructor(Reconstructor(config, Camera.from_focal(50.0, 48, 40), live=LiveTraining()))
-    assert max(added) > 0
