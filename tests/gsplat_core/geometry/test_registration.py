@@ -255,7 +255,7 @@ def test_a_step_is_refused_if_one_motion_is_a_thousandth_as_certain_as_another(s
 
 
 def test_the_closest_point_of_a_triangle_without_an_area_is_on_its_edges():
-    """Of a point and of a line as triangles. Both have a determinant of 0."""
+    """Three equal corners, and three corners on a line."""
     corners = np.array([[[1.0, 2, 3]] * 3, [[0, 0, 0], [2, 0, 0], [1, 0, 0]]])
     found = closest_on_triangles(np.array([[1.0, 2, 5], [1.5, 1, 0]]), corners)
     np.testing.assert_allclose(found, [[1, 2, 3], [1.5, 0, 0]])

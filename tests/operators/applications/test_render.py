@@ -156,7 +156,7 @@ def test_an_error_before_the_first_picture_leaves_no_video(tmp_path, was_there):
 
 
 def test_the_depth_of_a_very_large_scene_is_the_median_of_what_is_before_the_camera(model, monkeypatch):
-    """Of every third Gaussian, if three times as many as are pictured are there."""
+    """A scene with three times `MOST_PICTURED` Gaussians is measured by every third one."""
     scene = replace(model(), field=None)
     count = scene.gaussians.count
     means = scene.gaussians.means.clone()

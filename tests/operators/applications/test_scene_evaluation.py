@@ -21,7 +21,7 @@ LEVELS = {"0.png": 0.5, "8.png": 0.3, "16.png": 0.45}
 
 
 class Run:
-    """What an evaluation asks its parts for."""
+    """Record of the calls that an evaluation makes."""
 
     def __init__(self, patch: pytest.MonkeyPatch, device: str) -> None:
         self.memory: list[int] = []

@@ -1,4 +1,4 @@
-"""What commands print of live runs, trainings and backups, and their exit codes."""
+"""Printed results and exit codes of live runs, trainings and backups."""
 
 from __future__ import annotations
 
