@@ -63,6 +63,8 @@ class Stream:
         """Processes by role; empty while the stream is stopped."""
         self.hub: DisplayHub | None = None
         """Pictures for viewers; None while the stream is stopped."""
+        self.model_fault: str | None = None
+        """Reason why the configured model is not shown; None if it is, or if none is configured."""
         self.changing = asyncio.Lock()
         """Held during start, stop and configuration changes, so that they do not overlap."""
 
@@ -121,6 +123,8 @@ class Stream:
         state, reason = "stopped", None
         if self.processes:
             state, reason = overall(self.capture.state, self.engine.state)
+            if reason is None and self.model_fault is not None:
+                reason = f"the {self.settings.show} is not shown: {self.model_fault}"
         return StreamView(
             name=self.name,
             source=self.settings.source,
@@ -428,11 +432,17 @@ class ShownModels:
     async def _follow(self) -> None:
         while True:
             for stream in self._streams.streams():
-                try:
-                    await self.look_at(stream)
-                except (BusError, RegistryError) as error:
-                    log.warning("%s does not show its model: %s", stream.name, error)
+                await self.follow(stream)
             await asyncio.sleep(LOOK_S)
+
+    async def follow(self, stream: Stream) -> None:
+        """Call `look_at`, and note and log why it failed. The log has each reason once, not at every poll."""
+        try:
+            await self.look_at(stream)
+        except (BusError, RegistryError) as error:
+            if stream.model_fault != str(error):
+                log.warning("%s does not show its model: %s", stream.name, error)
+            stream.model_fault = str(error)
 
     async def look_at(self, stream: Stream) -> None:
         """Send `show_model` to a running engine if it does not display the active version of the stream's configured model.
@@ -451,8 +461,12 @@ class ShownModels:
             return
         await self._roll_back_if_given_up(stream.name, engine.figures)
         active = await asyncio.to_thread(self._registry.active, name)
+        if active is None:
+            stream.model_fault = f"no version of {name!r} is active; activate one"
+            return
         shown = engine.figures.get("model") or {}
-        if active is None or (shown.get("name"), shown.get("version")) == (name, active.version):
+        if (shown.get("name"), shown.get("version")) == (name, active.version):
+            stream.model_fault = None
             return
         now_s, which = asyncio.get_running_loop().time(), (stream.name, name, active.version)
         if now_s - self._refused.get(which, -AGAIN_S) < AGAIN_S:

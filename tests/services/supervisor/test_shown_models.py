@@ -7,8 +7,12 @@ from types import SimpleNamespace
 
 import pytest
 
-from services.errors import CommandRefused, Conflict
-from services.supervisor.stream import ShownModels
+from services.bus.runtime import RuntimeFolder
+from services.errors import CommandRefused, Conflict, NotFound
+from services.settings import StreamSettings
+from services.supervisor.stream import ShownModels, Stream
+from services.supervisor.worker import specs_of
+from tests.services.supervisor.test_overall import process
 
 
 class Registry:
@@ -59,7 +63,9 @@ class Engine:
 def parts():
     registry, engine = Registry(), Engine()
     settings = SimpleNamespace(show="model wall")
-    stream = SimpleNamespace(name="theatre", settings=settings, engine=engine, processes={"engine": engine})
+    stream = SimpleNamespace(
+        name="theatre", settings=settings, engine=engine, processes={"engine": engine}, model_fault=None
+    )
     return SimpleNamespace(
         registry=registry, engine=engine, stream=stream, models=ShownModels(SimpleNamespace(), registry)
     )
@@ -133,3 +139,37 @@ def test_an_engine_that_refuses_is_not_asked_all_the_time(parts):
     parts.models._refused.clear()
     asyncio.run(look_twice())
     assert len(parts.engine.asked) == 2
+
+
+def follows(parts, times):
+    async def follow():
+        for _ in range(times):
+            await parts.models.follow(parts.stream)
+
+    asyncio.run(follow())
+
+
+def test_the_reason_why_a_model_is_not_shown_is_kept_and_logged_once(parts, caplog):
+    parts.registry.active = lambda name: (_ for _ in ()).throw(NotFound(f"there is no model {name!r}"))
+    follows(parts, 5)
+    assert parts.stream.model_fault == "there is no model 'wall'"
+    assert caplog.text.count("there is no model 'wall'") == 1
+    del parts.registry.active
+    parts.registry.current = None
+    follows(parts, 1)
+    assert parts.stream.model_fault == "no version of 'wall' is active; activate one"
+    parts.registry.current = 1
+    follows(parts, 2)
+    assert parts.stream.model_fault is None
+
+
+def test_a_stream_that_does_not_show_its_model_says_why(tmp_path):
+    settings = StreamSettings(source="synthetic:", device="cpu", show="model wall")
+    stream = Stream(settings, specs_of("theatre", settings), RuntimeFolder(tmp_path))
+    states = {"capture": process("live"), "engine": process("running", "live")}
+    stream.processes = {role: SimpleNamespace(state=state) for role, state in states.items()}
+    stream.model_fault = "there is no model 'wall'"
+    view = stream.view()
+    assert (view.state, view.reason) == ("live", "the model wall is not shown: there is no model 'wall'")
+    stream.model_fault = None
+    assert stream.view().reason is None
