@@ -8,6 +8,7 @@ import logging
 import os
 import signal
 import socket
+import sys
 import threading
 import time
 from collections import Counter
@@ -30,6 +31,8 @@ from services.audit.log import SystemEvents
 from services.errors import CannotServe
 from services.settings import ServiceSettings
 
+TOO_LONG = 431
+HEAD_TOO_LONG = f"the head of the request has more than {MOST_HEAD_BYTES} bytes; send a shorter one"
 CANNOT_BE_READ = "the WebSocket handshake cannot be read; send a GET request with the headers of RFC 6455 and no body"
 TOO_LARGE = "the head of the WebSocket handshake has too many or too long lines; send at most 128 lines of 8192 bytes"
 
@@ -46,7 +49,7 @@ class AnsweredHandshakes(WebSocketsSansIOProtocol):
         if self.conn.handshake_exc is not None and not self.handshake_initiated and not self.transport.is_closing():
             causes = (self.conn.handshake_exc, self.conn.handshake_exc.__cause__)
             is_long = any(isinstance(each, SecurityError) for each in causes)
-            self.transport.write(_refusal(431 if is_long else 400, TOO_LARGE if is_long else CANNOT_BE_READ))
+            self.transport.write(_refusal(TOO_LONG if is_long else 400, TOO_LARGE if is_long else CANNOT_BE_READ))
             self.transport.close()
 
 
@@ -359,7 +362,8 @@ class DrainingServer(uvicorn.Server):
 def with_head_limits(head_s: float) -> type[H11Protocol]:
     """Return uvicorn's HTTP protocol with limits on the request head.
 
-    The head must be complete within `head_s`; uvicorn itself sets no such limit. A head that is too long gets 431.
+    The head must be complete within `head_s`; uvicorn itself sets no such limit. A head that is too long gets 431, another
+    malformed request 400.
 
     Args:
         head_s: time limit in seconds.
@@ -392,19 +396,14 @@ def with_head_limits(head_s: float) -> type[H11Protocol]:
                 self._timer = None
 
         def send_400_response(self, msg: str) -> None:
-            """Answer a malformed request with 400, or with 431 if h11 found no end of the head within its limit."""
-            if len(self.conn.trailing_data[0]) <= MOST_HEAD_BYTES:
-                super().send_400_response(msg)
-                return
+            """Answer a request that h11 refuses with the status that h11 suggests, and with its reason. If the answer to the
+            request has begun, only close the connection."""
             self._stop_watching()
-            body = b"the head of the request is too long"
-            headers = [
-                ("content-type", "text/plain; charset=utf-8"),
-                ("connection", "close"),
-                ("content-length", str(len(body))),
-            ]
-            for event in (h11.Response(status_code=431, headers=headers), h11.Data(data=body), h11.EndOfMessage()):
-                self.transport.write(self.conn.send(event) or b"")
+            if self.conn.our_state in (h11.IDLE, h11.SEND_RESPONSE):
+                error = sys.exception()
+                is_long = isinstance(error, h11.RemoteProtocolError) and error.error_status_hint == TOO_LONG
+                text = HEAD_TOO_LONG if is_long else f"the request is not valid HTTP/1.1: {error or msg}"
+                self.transport.write(_refusal(TOO_LONG if is_long else 400, text))
             self.transport.close()
 
         def _close(self) -> None:

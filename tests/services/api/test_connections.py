@@ -254,6 +254,35 @@ def test_a_head_in_one_piece_is_bounded(served):
     assert b"HTTP/1.1 431" in answer(tcp(port), twice)
 
 
+@pytest.mark.parametrize(
+    ("fields", "text"),
+    [
+        (b"Content-Length: -1\r\n", b"bad Content-Length"),
+        (b"Content-Length: " + 30 * b"9" + b"\r\n", b"bad Content-Length"),
+        (b"Transfer-Encoding: gzip\r\n", b"Only Transfer-Encoding: chunked is supported"),
+        (b"no colon\r\n", b"illegal header line"),
+    ],
+)
+def test_a_malformed_head_is_400_whatever_follows_it(served, fields, text):
+    _, _, port, _ = served()
+    found = answer(tcp(port), LIVE.replace(b"Host", fields + b"Host", 1) + bytes(100_000))
+    assert found.startswith(b"HTTP/1.1 400 ") and text in found, found
+
+
+def test_a_malformed_chunk_after_the_answer_closes_the_connection_without_a_traceback(served, caplog):
+    _, _, port, _ = served()
+    head = b"PUT /v1/models/a/versions HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n"
+    with socket.create_connection(("127.0.0.1", port)) as client:
+        client.settimeout(300)
+        client.sendall(head)
+        assert client.recv(65536).startswith(b"HTTP/1.1 401 ")
+        client.sendall(b"no number\r\n")
+        with contextlib.suppress(ConnectionResetError):
+            while client.recv(65536):
+                pass
+    assert "Traceback" not in caplog.text
+
+
 HANDSHAKE = (
     b"GET /v1/streams/x/display HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
     b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
