@@ -17,6 +17,7 @@ from fastapi.routing import APIRoute
 from starlette.requests import ClientDisconnect, HTTPConnection, Request
 from starlette.responses import Response
 
+from services.api.json_body import JsonRequest
 from services.api.middleware import BoundedBody, refuse_by_length
 from services.api.problems import Forbidden, Problem, TooManyRequests, Unauthenticated, Unprocessable, WrongContent
 from services.api.state import ControlState, control_of
@@ -115,7 +116,8 @@ class GuardedRoute(APIRoute):
                 _refuse_unknown(request, known)
             if takes is not None:
                 _check_content_type(request, takes)
-            return await handle(Request(request.scope, BoundedBody(request.scope, request.receive, most_bytes, limits)))
+            body = BoundedBody(request.scope, request.receive, most_bytes, limits)
+            return await handle(JsonRequest(request.scope, body))
 
         return guarded
 
@@ -248,7 +250,11 @@ def _refuse_unknown(connection: HTTPConnection, known: set[str]) -> None:
 def _check_content_type(request: Request, takes: str) -> None:
     given = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if given != takes:
-        raise WrongContent(f"the body's Content-Type is {given!r:.80}; send {takes}")
+        said = f"the body's Content-Type is {given!r:.80}" if given else "the request has no Content-Type"
+        raise WrongContent(f"{said}; send {takes}")
+    coding = request.headers.get("content-encoding", "identity")
+    if coding.strip().lower() != "identity":
+        raise WrongContent(f"the body's Content-Encoding is {coding!r:.80}; send the body itself, without this header")
 
 
 @asynccontextmanager

@@ -28,6 +28,7 @@ from services.api.problems import (
     TooLarge,
     TooManyRequests,
     TooSlow,
+    refuse,
     response_of,
 )
 from services.settings.sections import LimitSettings, ServerSettings
@@ -109,14 +110,11 @@ class KnownHosts:
         if len(given) < 2 and all(self.knows(host) for host in given):
             return await self._app(scope, receive, send)
         self._measures.refused.labels("host").inc()
-        if scope["type"] == "websocket":
-            await receive()  # websocket.connect
-            return await send({"type": "websocket.close", "code": 1008})  # before accept: the client gets 403
         named = f"{', '.join(given):.100}"
         problem = Misdirected(
             f"this server is not known as {named!r}; ask for its address, or add the name to server.allowed_hosts"
         )
-        await response_of(problem, scope)(scope, receive, send)
+        await refuse(problem, scope, receive, send)
 
     def knows(self, host: str) -> bool:
         """Return True if a lower-case Host header names this server."""
@@ -156,9 +154,7 @@ class HeadLength:
         problem = HeadTooLarge(
             f"the head of the request has {length_of(scope)} bytes; at most {MOST_HEAD_BYTES} are taken"
         )
-        if scope["type"] == "websocket":
-            await receive()  # websocket.connect
-        await response_of(problem, scope)(scope, receive, send)
+        await refuse(problem, scope, receive, send)
 
 
 def length_of(scope: Scope) -> int:
@@ -269,10 +265,7 @@ class AddressRate:
             return await self._app(scope, receive, send)
         self._measures.refused.labels("address rate").inc()
         problem = TooManyRequests(f"too many requests from this address; wait {wait_s:.1f} s", wait_s)
-        if scope["type"] == "websocket":
-            await receive()  # websocket.connect
-            return await send({"type": "websocket.close", "code": 1013})  # before accept: the client gets 403
-        await response_of(problem, scope)(scope, receive, send)
+        await refuse(problem, scope, receive, send)
 
 
 def network_of(scope: Scope) -> str:

@@ -114,6 +114,12 @@ class WrongContent(Problem):
     status, title = 415, "Unsupported media type"
 
 
+class RangeUnusable(Problem):
+    """The Range header selects no byte of the file."""
+
+    status, title = 416, "Range not satisfiable"
+
+
 class Misdirected(Problem):
     """The Host header names another server."""
 
@@ -166,7 +172,7 @@ class NoSpace(Problem):
 OF_STATUS: dict[int, type[Problem]] = {
     kind.status: kind
     for kind in (
-        BadRequest, Forbidden, Missing, WrongMethod, TooSlow, Conflicting, TooLarge, WrongContent, Misdirected, Unprocessable,
+        BadRequest, Forbidden, Missing, WrongMethod, TooSlow, Conflicting, TooLarge, WrongContent, RangeUnusable, Misdirected, Unprocessable,
         HeadTooLarge, Internal, Unavailable, NoSpace,
     )
 }  # fmt: skip
@@ -226,6 +232,18 @@ def response_of(problem: Problem, scope: Scope) -> Response:
     return response
 
 
+async def refuse(problem: Problem, scope: Scope, receive: Receive, send: Send) -> None:
+    """Answer a request, or the handshake of a WebSocket, with a problem before a route has seen it."""
+    if scope["type"] == "websocket":
+        await receive()  # websocket.connect
+    await response_of(problem, scope)(scope, receive, send)
+
+
+async def no_such_path(scope: Scope, receive: Receive, send: Send) -> None:
+    """Answer a request for a path that no route has. The framework refuses such a handshake with an empty 403."""
+    await refuse(Missing(PHRASES[404]), scope, receive, send)
+
+
 def answer_with_problems(app: FastAPI, errors: Mapping[type[Exception], type[Problem]]) -> None:
     """Install the exception handlers of an application.
 
@@ -278,6 +296,7 @@ def answer_with_problems(app: FastAPI, errors: Mapping[type[Exception], type[Pro
     app.add_exception_handler(ClientDisconnect, on_left)  # type: ignore[arg-type]
     app.add_exception_handler(Problem, on_problem)  # type: ignore[arg-type]
     app.add_exception_handler(HTTPException, on_http)  # type: ignore[arg-type]
+    app.router.default = no_such_path
     for invalid in (RequestValidationError, WebSocketRequestValidationError):
         app.add_exception_handler(invalid, on_invalid)  # type: ignore[arg-type]
 

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import anyio
 from fastapi import Header, Path, Query, Response
 from starlette.requests import HTTPConnection, Request
-from starlette.responses import FileResponse
+from starlette.responses import FileResponse, MalformedRangeHeader, RangeNotSatisfiable
 from starlette.websockets import WebSocket, WebSocketState
 
 from operators.options import Names
 from services.api.display import REFUSED, REFUSED_WHY, ViewerStalled, in_time, until_ended
 from services.api.guard import CallerOf, new_router, recorded, requires
 from services.api.models import check_soon, registry_of
-from services.api.problems import Conflicting, Missing, Unavailable, problem_answer
+from services.api.problems import Conflicting, Missing, RangeUnusable, Unavailable, problem_answer
 from services.api.state import control_of, part
 from services.jobs.results import FILES
 from services.jobs.store import JobState
@@ -142,6 +142,25 @@ REPORT_POLICY = "; ".join(
 )
 """Content security policy for reports. A report embeds its style and pictures and has no script. It
 is sandboxed and may load nothing."""
+
+
+class ResultAnswer(FileResponse):
+    """File of a replay. A Range header that is malformed or in another unit than bytes is ignored, as RFC 9110 asks; one
+    beyond the end of the file gets a problem document."""
+
+    @classmethod
+    def _parse_range_header(cls, http_range: str, file_size: int) -> list[tuple[int, int]]:
+        try:
+            return super()._parse_range_header(http_range, file_size)
+        except MalformedRangeHeader:
+            return []  # the whole file
+        except RangeNotSatisfiable as error:
+            raise RangeUnusable(
+                f"the file has {file_size} bytes, and the Range {http_range!r:.80} selects none of them",
+                headers={"Content-Range": f"bytes */{file_size}"},
+            ) from error
+
+
 ResultFile = Annotated[str, Names(FILES)]
 
 
@@ -151,6 +170,7 @@ ResultFile = Annotated[str, Names(FILES)]
     responses={
         200: {"description": "The file.", "content": {kind.partition(";")[0]: {} for kind in FILES.values()}},
         206: {"description": "The part of the file that the `Range` header selects."},
+        416: problem_answer("The `Range` header selects no byte of the file."),
     },
 )
 @requires("viewer", ticket=True)
@@ -159,7 +179,7 @@ async def replay_result(request: Request, caller: CallerOf, job_id: JobId, file:
     path = await asyncio.to_thread(jobs_of(request).file, job_id, file)
     headers = {"Content-Security-Policy": REPORT_POLICY} if file == "report.html" else {}
     shown = file != "model.isplat"
-    return FileResponse(
+    return ResultAnswer(
         path, media_type=FILES[file], headers=headers, filename=f"{job_id}-{file}",
         content_disposition_type="inline" if shown else "attachment",
     )  # fmt: skip

@@ -41,9 +41,11 @@ def check_source(address: str, rules: SourceRules) -> None:
     Raises:
         Unprocessable: if the rules do not allow the address.
     """
-    if len(address) > MOST_LENGTH or not _PRINTABLE.fullmatch(address) or "\\" in address:
+    if len(address) > MOST_LENGTH:
+        raise Unprocessable(f"the source's address has {len(address)} characters; at most {MOST_LENGTH} are taken")
+    if not _PRINTABLE.fullmatch(address) or "\\" in address:
         raise Unprocessable(
-            "the source's address has spaces, backslashes or letters beyond ASCII, or is too long; encode them as %20"
+            "the source's address is empty, or has spaces, backslashes or letters beyond ASCII; encode them as %20"
         )
     eyes = address.removeprefix(_STEREO).split("|") if address.startswith(_STEREO) else [address]
     for eye in eyes:

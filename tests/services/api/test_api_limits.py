@@ -83,7 +83,7 @@ STATUSES = {
     "delete /v1/replays/{job_id}": "204 404 409",
     "get /v1/batches/{batch}": "200 404",
     "post /v1/replays/{job_id}/cancel": "200 404 409",
-    "get /v1/replays/{job_id}/results/{file}": "200 206 404",
+    "get /v1/replays/{job_id}/results/{file}": "200 206 404 416",
     "post /v1/replays/{job_id}/keep": "201 404 408 409 415",
     "get /v1/recordings": "200",
     "get /v1/recordings/{name}": "200 404",

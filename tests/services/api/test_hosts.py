@@ -6,10 +6,11 @@ import asyncio
 
 import pytest
 from pydantic import ValidationError
-from starlette.websockets import WebSocketDisconnect
+from starlette.testclient import WebSocketDenialResponse
 
 from services.api.middleware import KnownHosts
 from services.api.observability import Measures
+from services.api.problems import PROBLEM_JSON
 from services.settings.sections import ServerSettings
 
 
@@ -64,9 +65,9 @@ def test_a_page_of_another_name_gets_nothing(new_plane):
     assert plane.ask("GET", "/livez", headers={"Host": "evil.example"}).status_code == 421, "public routes, too"
     assert plane.ask("GET", "/livez", headers={"Host": "localhost, localhost"}).status_code == 421
     assert plane.ask("GET", "/livez", headers={"Host": "localhost:8000"}).status_code == 200
-    with pytest.raises(WebSocketDisconnect) as closed, plane.client.websocket_connect("/v1/streams/a/display"):
+    with pytest.raises(WebSocketDenialResponse) as refused, plane.client.websocket_connect("/v1/streams/a/display"):
         pass
-    assert closed.value.code == 1008
+    assert refused.value.status_code == 421 and refused.value.headers["content-type"] == PROBLEM_JSON
     assert 'refused_total{reason="host"}' in plane.ask("GET", "/metrics", headers={"Host": "localhost"}).text
 
 
@@ -100,4 +101,11 @@ def test_a_request_has_one_host(plane, kind, hosts, taken):
     asyncio.run(KnownHosts(app, ServerSettings(), Measures())(scope, receive, send))
     assert bool(reached) == taken
     if not taken:
-        assert sent[0].get("status") == 421 or sent[0] == {"type": "websocket.close", "code": 1008}
+        assert sent[0]["status"] == 421
+
+
+def test_a_handshake_for_a_path_that_there_is_not_is_404(plane):
+    for path in ("/v1/streams", "/zork"):
+        with pytest.raises(WebSocketDenialResponse) as refused, plane.client.websocket_connect(path):
+            pass
+        assert refused.value.status_code == 404 and refused.value.headers["content-type"] == PROBLEM_JSON

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gzip
 
 import pytest
 
@@ -94,6 +95,31 @@ def test_a_body_that_is_announced_too_long_is_not_read(plane):
 def test_another_content_type_is_415(plane, content_type):
     answer = plane.ask("POST", "/v1/tickets", content=b'{"path": "/v1/x"}', headers={"Content-Type": content_type})
     assert (answer.status_code, answer.headers["content-type"]) == (415, PROBLEM_JSON)
+
+
+def test_a_compressed_body_is_415(plane):
+    headers = {"Content-Type": "application/json", "Content-Encoding": "gzip"}
+    answer = plane.ask("POST", "/v1/tickets", content=gzip.compress(b'{"path": "/v1/x"}'), headers=headers)
+    assert answer.status_code == 415 and "Content-Encoding is 'gzip'" in answer.json()["detail"]
+
+
+@pytest.mark.parametrize(
+    ("body", "detail"),
+    [
+        (b'{"path":\n "/v1/x",}', "not JSON at line 2, column 10: "),
+        (b'{"path": "/v1/x"} x', "not JSON at line 1, column 19: Extra data"),
+        (b'{"path": "\xff"}', "not UTF-8 text at byte 10"),
+        ('{"path": "/v1/x"}'.encode("utf-16"), "not UTF-8 text at byte 0"),
+        (b'{"path": "/v1/x", "path": "/v1/y"}', "gives the key 'path' twice"),
+        (b'{"path": {"a": 1, "a": 1}}', "gives the key 'a' twice"),
+        (b'{"path": ' + 5000 * b"1" + b"}", "a whole number with thousands of digits"),
+        (b"[" * 100_000, "too many lists and objects inside each other"),
+    ],
+)
+def test_a_body_that_cannot_be_parsed_says_where_and_why(plane, body, detail):
+    answer = plane.ask("POST", "/v1/tickets", content=body, headers={"Content-Type": "application/json"})
+    assert (answer.status_code, answer.headers["content-type"]) == (400, PROBLEM_JSON)
+    assert detail in answer.json()["detail"]
 
 
 @pytest.mark.parametrize("body", [b"{", b"[]", b"null", b'{"path": "\xff"}', b'{"path": 1e999}', b"[" * 100_000])

@@ -10,7 +10,7 @@ from starlette.testclient import WebSocketDenialResponse
 from starlette.websockets import WebSocketDisconnect
 
 from services.api.assembly import ERRORS
-from services.api.problems import Conflicting, Missing
+from services.api.problems import PROBLEM_JSON, Conflicting, Missing
 from services.api.replays import REPORT_POLICY
 from services.errors import NotFound
 from services.jobs.replays import Replays
@@ -163,6 +163,26 @@ def test_a_report_is_shown_without_rights_and_the_rest_keeps_its_policy(plane, w
     assert "sandbox" not in video.headers["content-security-policy"]
     model = plane.ask("GET", f"{REPLAYS}/{job_id}/results/model.isplat")
     assert model.headers["content-disposition"].startswith("attachment") and model.content == b"GOOD"
+
+
+@pytest.mark.parametrize("given", ["lines=0-1", "bytes=x-y", "bytes=9-1", "", "zork"])
+def test_a_range_that_cannot_be_read_is_ignored(plane, worker, given):
+    job_id = start(plane).json()["id"]
+    worker.finish(job_id)
+    video = plane.ask("GET", f"{REPLAYS}/{job_id}/results/reconstruction.mp4", headers={"Range": given})
+    whole = plane.ask("GET", f"{REPLAYS}/{job_id}/results/reconstruction.mp4")
+    assert (video.status_code, video.content) == (200, whole.content)
+
+
+@pytest.mark.parametrize("given", ["bytes=99999-", "bytes=-0"])
+def test_a_range_without_bytes_is_a_problem(plane, worker, given):
+    job_id = start(plane).json()["id"]
+    worker.finish(job_id)
+    path = f"{REPLAYS}/{job_id}/results/reconstruction.mp4"
+    size = len(plane.ask("GET", path).content)
+    refused = plane.ask("GET", path, headers={"Range": given})
+    assert (refused.status_code, refused.headers["content-type"]) == (416, PROBLEM_JSON)
+    assert refused.headers["content-range"] == f"bytes */{size}" and f"has {size} bytes" in refused.json()["detail"]
 
 
 @pytest.mark.parametrize("file", ["log", "..%2fjobs.sqlite", "../jobs.sqlite", ".intrasplat.json", "report.json"])
