@@ -84,9 +84,14 @@ class DefaultStrategy(Strategy):
         """Keep the gradient of the projected centres; call before `loss.backward()`.
 
         Raises:
-            InvalidParameters: if `info` lacks the centres.
+            InvalidParameters: if `info` lacks the centres, or they were rendered without gradients.
         """
-        self._needed(info, self.key_for_gradient).retain_grad()
+        centres = self._needed(info, self.key_for_gradient)
+        if not centres.requires_grad:
+            raise InvalidParameters(
+                f"{self.key_for_gradient} was rendered without gradients; render trainable means outside torch.no_grad()"
+            )
+        centres.retain_grad()
 
     def step_post_backward(
         self,
@@ -105,10 +110,10 @@ class DefaultStrategy(Strategy):
             state: result of `initialize_state`.
             step: number of the training step, from 0.
             info: third result of `rasterization`.
-            packed: True if `rasterization` was called with `packed=True`.
+            packed: accepted as in gsplat; `info` tells whether its rows are packed.
 
         Raises:
-            InvalidParameters: if `info` lacks an entry.
+            InvalidParameters: if `info` lacks an entry or has no gradient.
         """
         if step >= self.refine_stop_iter:
             return
@@ -129,15 +134,27 @@ class DefaultStrategy(Strategy):
             reset_opa(params, optimizers, state, value=2 * self.prune_opa)
 
     def _update_state(self, params: Params, state: dict[str, Any], info: dict[str, Any], packed: bool = False) -> None:
-        """Add the gradients, views and, if used, radii of one step to the statistics."""
+        """Add the gradients, views and, if used, radii of one step to the statistics.
+
+        Args:
+            params: tensors of the Gaussians.
+            state: statistics.
+            info: third result of `rasterization`.
+            packed: not used; `info` has `gaussian_ids` if its rows are packed.
+        """
         centres, width, height, cameras, radii = (
             self._needed(info, name) for name in (self.key_for_gradient, "width", "height", "n_cameras", "radii")
         )
-        gradients = centres.absgrad if self.absgrad else centres.grad
+        gradients = getattr(centres, "absgrad", None) if self.absgrad else centres.grad
+        if gradients is None and self.absgrad:
+            raise InvalidParameters(
+                f"{self.key_for_gradient} has no absolute gradient; render with absgrad=True and call backward first, or use"
+                " absgrad=False. with_eval3d and gradient_2dgs have none"
+            )
         if gradients is None:
             raise InvalidParameters(
-                f"{self.key_for_gradient} has no gradient; call step_pre_backward before backward, and render with absgrad"
-                " if the strategy uses it"
+                f"{self.key_for_gradient} has no gradient; call step_pre_backward before backward. Pictures with"
+                " with_eval3d=True have none: use MCMCStrategy for them"
             )
         scale = (width / 2 * cameras, height / 2 * cameras)
         extent_scale = 1 / max(width, height)
@@ -146,8 +163,8 @@ class DefaultStrategy(Strategy):
             if state.get(name) is None:
                 state[name] = torch.zeros(count, device=gradients.device)
         radii = (radii if radii.dim() == gradients.dim() else radii[..., None]).int().expand(gradients.shape)
-        if packed:
-            self._add_packed(state, gradients, radii, scale, extent_scale, self._needed(info, "gaussian_ids"))
+        if info.get("gaussian_ids") is not None:
+            self._add_packed(state, gradients, radii, scale, extent_scale, info["gaussian_ids"])
             return
         shape = (gradients.shape[:-2].numel(), count, 2)
         accumulate_gradient_norms_(

@@ -113,7 +113,8 @@ class MCMCStrategy(Strategy):
     @torch.no_grad()
     def _relocate_gs(self, params: Params, optimizers: Optimizers, binoms: Tensor) -> int:
         """Move dead Gaussians to visible places. Returns their number; synchronises."""
-        dead = params["opacities"].flatten().sigmoid() <= self.min_opacity
+        # A NaN is dead, too.
+        dead = ~(params["opacities"].flatten().sigmoid() > self.min_opacity)
         count = int(torch.count_nonzero(dead))
         self._check_alive(len(dead) - count)
         if count:

@@ -1,7 +1,7 @@
 """Row operations of strategies: Gaussians are added, removed or changed together with the state of their optimisers.
 
-All functions change `params`, the optimisers and `state` in place. Tensors in `state` have a row for each Gaussian, other
-entries are left alone. Random numbers come from torch's default generator of the device, or from `generator`, so a seed gives
+All functions change `params`, the optimisers and `state` in place. Tensors in `state` have a row for each Gaussian; numbers and
+tensors without dimensions are left alone. Random numbers come from torch's default generator of the device, or from `generator`, so a seed gives
 the same Gaussians. Signatures are gsplat's.
 """
 
@@ -99,7 +99,8 @@ def update_rows(
 
     Args:
         param_fn: returns the new parameter for a name and the old parameter.
-        optimizer_fn: returns the new value for the name and the value of an entry of the optimiser's state, `step` excepted.
+        optimizer_fn: returns the new value for the name and the value of an entry of the optimiser's state. `step` and tensors
+            without dimensions stay.
         params: tensors of the Gaussians.
         optimizers: optimisers by the same names.
         names: parameters to replace; None for all.
@@ -119,14 +120,17 @@ def update_rows(
         for group in optimizer.param_groups:
             group["params"] = [new]
         if moments:
-            kept = {key: value if key == "step" else optimizer_fn(key, value) for key, value in moments.items()}
+            kept = {
+                key: optimizer_fn(key, value) if key != "step" and _has_rows(value) else value
+                for key, value in moments.items()
+            }
             optimizer.state[new] = kept
 
 
 @torch.no_grad()
 def duplicate(params: Params, optimizers: Optimizers, state: State, mask: Tensor) -> None:
     """Append a copy of each Gaussian in `mask`, bool [N]. Copies start with zero moments."""
-    chosen = mask.nonzero()[:, 0]
+    chosen, _ = _divided(params, mask)
     _append(params, optimizers, chosen, lambda name, tensor: tensor[chosen])
     for name, rows in _rows_of(state):
         state[name] = torch.cat([rows, rows[chosen]])
@@ -154,7 +158,7 @@ def split(
         revised_opacity: give the samples the opacity 1 - √(1 - o), which keeps the picture (Rota Bulò et al. 2024).
         generator: source of the random numbers, on the device of `mask`.
     """
-    chosen, rest = mask.nonzero()[:, 0], (~mask).nonzero()[:, 0]
+    chosen, rest = _divided(params, mask)
     scales = params["scales"][chosen].exp()
     noise = torch.randn(2, len(chosen), 3, device=mask.device, dtype=scales.dtype, generator=generator)
     axes = rotations(params["quats"][chosen])
@@ -184,7 +188,7 @@ def split(
 @torch.no_grad()
 def remove(params: Params, optimizers: Optimizers, state: State, mask: Tensor) -> None:
     """Remove the Gaussians in `mask`, bool [N]; the others keep their order and moments."""
-    rest = (~mask).nonzero()[:, 0]
+    _, rest = _divided(params, mask)
     update_rows(
         lambda _, tensor: Parameter(tensor[rest], tensor.requires_grad),
         lambda _, values: values[rest],
@@ -232,7 +236,7 @@ def relocate(
         min_opacity: smallest opacity after the move.
         generator: source of the random numbers, on the device of `mask`.
     """
-    dead, alive = mask.nonzero()[:, 0], (~mask).nonzero()[:, 0]
+    dead, alive = _divided(params, mask)
     weights = params["opacities"][alive].sigmoid().flatten()
     places = alive[draw(weights, len(dead), generator)]
     shared = _shared(params, places, binoms, min_opacity)
@@ -322,7 +326,8 @@ def inject_noise_to_position(
 
 
 def draw(weights: Tensor, count: int, generator: torch.Generator | None = None) -> Tensor:
-    """Draw `count` indices with replacement in proportion to `weights` [N], int64 [count]."""
+    """Draw `count` indices with replacement in proportion to `weights` [N], int64 [count]; a NaN is never drawn."""
+    weights = weights.nan_to_num(0.0)
     if len(weights) <= LARGEST_MULTINOMIAL:
         return torch.multinomial(weights, count, replacement=True, generator=generator)
     total = weights.double().cumsum(0)
@@ -356,5 +361,24 @@ def _shared(params: Params, places: Tensor, binoms: Tensor, min_opacity: float) 
     return {"opacities": torch.logit(opacities.clamp(min_opacity, most)), "scales": scales.log()}
 
 
+def _divided(params: Params, mask: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the rows in `mask` and the others.
+
+    Raises:
+        InvalidParameters: if `mask` is not a bool with one value per Gaussian.
+    """
+    count = len(next(iter(params.values())))
+    if mask.dtype != torch.bool or mask.numel() != count:
+        raise InvalidParameters(
+            f"mask must be bool [N] with N = {count} Gaussians, got {mask.dtype} {list(mask.shape)}"
+        )
+    mask = mask.flatten()
+    return mask.nonzero()[:, 0], (~mask).nonzero()[:, 0]
+
+
+def _has_rows(value: Any) -> bool:
+    return isinstance(value, Tensor) and value.dim() > 0
+
+
 def _rows_of(state: State) -> list[tuple[str, Tensor]]:
-    return [(name, value) for name, value in state.items() if isinstance(value, Tensor)]
+    return [(name, value) for name, value in state.items() if _has_rows(value)]

@@ -44,7 +44,7 @@ def picture(params, **options):
     return rasterization(
         params["means"], params["quats"], params["scales"].exp(), params["opacities"].sigmoid(), params["colors"],
         torch.eye(4).expand(2, 4, 4), torch.tensor([[40.0, 0, 24], [0, 40, 16], [0, 0, 1]]).expand(2, 3, 3), width, height,
-        packed=False, **options,
+        **{"packed": False} | options,
     )  # fmt: skip
 
 
@@ -213,6 +213,41 @@ def test_adc_counts_packed_splats_as_dense_ones():
         torch.testing.assert_close(states[0][name], states[1][name])
 
 
+@pytest.mark.parametrize("stated", [False, True])
+@pytest.mark.parametrize("rendered", [{"packed": True}, {"packed": False}, {"packed": True, "with_ut": True}])
+def test_adc_finds_out_from_the_render_information_whether_rows_are_packed(stated, rendered):
+    params, optimizers = scene()
+    strategy = DefaultStrategy(refine_scale2d_stop_iter=10)
+    state = strategy.initialize_state()
+    colors, _, info = picture(params, **rendered)
+    strategy.step_pre_backward(params, optimizers, state, 1, info)
+    colors.square().mean().backward()
+    strategy.step_post_backward(params, optimizers, state, 1, info, packed=stated)
+    _, _, dense = picture(params, with_ut="with_ut" in rendered)
+    assert torch.equal(state["count"], (dense["radii"] > 0).all(-1).sum(0).float())
+    assert state["grad2d"].any() and not state["grad2d"][state["count"] == 0].any()
+
+
+def test_adc_says_why_there_is_no_gradient():
+    params, optimizers = scene()
+
+    def train(strategy, **options):
+        colors, _, info = picture(params, **options)
+        state = strategy.initialize_state()
+        strategy.step_pre_backward(params, optimizers, state, 1, info)
+        colors.square().mean().backward()
+        strategy.step_post_backward(params, optimizers, state, 1, info)
+
+    with pytest.raises(AssertionError, match="means2d has no absolute gradient; render with absgrad=True"):
+        train(DefaultStrategy(absgrad=True))
+    with pytest.raises(AssertionError, match="with_eval3d=True have none: use MCMCStrategy"):
+        train(DefaultStrategy(), with_ut=True, with_eval3d=True)
+    with torch.no_grad():
+        _, _, info = picture(params)
+    with pytest.raises(AssertionError, match="rendered without gradients"):
+        DefaultStrategy().step_pre_backward(params, optimizers, {}, 1, info)
+
+
 @pytest.mark.parametrize(("compat", "expected"), [("1.6", [4, 8]), ("1.5.3", [])])
 def test_adc_resets_opacities_except_as_1_5_3(compat, expected):
     params, optimizers = scene()
@@ -270,6 +305,42 @@ def test_mcmc_refuses_a_scene_without_live_gaussians():
     strategy = MCMCStrategy(refine_start_iter=0, refine_every=1)
     with pytest.raises(RuntimeError, match=r"no live Gaussians.*min_opacity=0\.005"):
         strategy.step_post_backward(params, optimizers, strategy.initialize_state(), 1, {}, lr=1e-3)
+
+
+def test_mcmc_moves_a_gaussian_whose_opacity_is_not_a_number():
+    params, optimizers = scene()
+    with torch.no_grad():
+        params["opacities"][3] = float("nan")
+    strategy = MCMCStrategy(refine_start_iter=0, refine_every=1, cap_max=COUNT + 1)
+    strategy.step_post_backward(params, optimizers, strategy.initialize_state(), 1, {}, lr=0.0)
+    assert len(params["means"]) == COUNT + 1 and params["opacities"].isfinite().all()
+    assert 3 not in params["label"]
+
+
+@pytest.mark.parametrize(
+    "mask", [torch.ones(COUNT, dtype=torch.uint8), torch.tensor([1, 2, 3]), torch.zeros(COUNT - 1, dtype=torch.bool)]
+)
+@pytest.mark.parametrize("operation", [ops.duplicate, ops.split, ops.remove, ops.relocate])
+def test_a_mask_that_is_no_bool_for_each_gaussian_changes_nothing(operation, mask):
+    params, optimizers = scene()
+    before = {name: tensor.detach().clone() for name, tensor in params.items()}
+    further = (binomials(),) if operation is ops.relocate else ()
+    with pytest.raises(InvalidInput, match=rf"mask must be bool \[N\] with N = {COUNT} Gaussians, got {mask.dtype}"):
+        operation(params, optimizers, {}, mask, *further)
+    assert all(torch.equal(params[name], before[name]) for name in before)
+
+
+def test_values_without_rows_stay_when_rows_change():
+    params, _ = scene(frozen=False)
+    optimizers = {name: torch.optim.NAdam([p], lr=1e-3) for name, p in params.items()}
+    for name, optimizer in optimizers.items():
+        params[name].grad = torch.ones_like(params[name])
+        optimizer.step()
+    state = {"scene_scale": torch.tensor(2.0), "age": torch.arange(COUNT)}
+    ops.duplicate(params, optimizers, state, torch.arange(COUNT) < 5)
+    assert state["scene_scale"] == 2 and state["age"].tolist() == [*range(COUNT), *range(5)]
+    kept = optimizers["means"].state[params["means"]]
+    assert kept["mu_product"].dim() == 0 and len(kept["exp_avg"]) == COUNT + 5
 
 
 def test_parameters_that_do_not_fit_are_refused():
