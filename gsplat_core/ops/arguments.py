@@ -279,9 +279,14 @@ def check_projection_options(width: int, height: int, camera_model: str, compens
     if not 0 <= compensation_floor <= 1:
         raise InvalidInput(f"compensation_floor must be from 0 to 1, got {compensation_floor}")
     if camera_model not in CAMERA_MODELS:
-        if camera_model in ("ftheta", "lidar"):
+        if camera_model == "ftheta":
             raise NotImplementedError(
-                f"camera_model={camera_model!r} is not supported; the models are {', '.join(CAMERA_MODELS)}"
+                "camera_model='ftheta' needs the unscented projection; use rasterization(with_ut=True, ftheta_coeffs=...)"
+                " or fully_fused_projection_with_ut"
+            )
+        if camera_model == "lidar":
+            raise NotImplementedError(
+                f"camera_model='lidar' is not supported; the models are {', '.join(CAMERA_MODELS)}"
             )
         raise InvalidInput(f"unknown camera_model {camera_model!r}; the models are {', '.join(CAMERA_MODELS)}")
 

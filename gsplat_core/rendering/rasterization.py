@@ -22,6 +22,7 @@ from gsplat_core.ops.tiles import bin_splats
 from gsplat_core.rendering.pipeline import Operations
 from gsplat_core.rendering.settings import Arguments, RenderSettings
 from gsplat_core.rendering.single_call import single_call
+from gsplat_core.rendering.torch_modes import in_plain_mode
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.transfers import HostCopy
@@ -61,6 +62,7 @@ _REQUIRED = [name for name in _POSITIONAL if _PARAMETERS[name].default is inspec
 
 
 @functools.wraps(_operations.rasterization)
+@in_plain_mode
 def rasterization(*arguments: Any, **options: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:
     # Signature and docstring are copied from `Operations.rasterization`. Calling that method
     # directly would put its name into argument errors.
@@ -71,6 +73,9 @@ def rasterization(*arguments: Any, **options: Any) -> tuple[Tensor, Tensor, dict
         if wrong is None:
             raise
     raise TypeError(wrong)
+
+
+rasterization.__module__, rasterization.__qualname__ = __name__, "rasterization"  # so that it can be pickled
 
 
 def _wrong_names(positional: int, named: Collection[str]) -> str | None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import operator
 from collections.abc import Hashable
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, get_args
@@ -104,23 +106,21 @@ class RenderSettings:
     """True if the Gaussians are shared out over processes."""
 
     def __post_init__(self) -> None:
-        for name, least in (("width", 1), ("height", 1), ("tile_size", 1)):
-            number = getattr(self, name)
-            if isinstance(number, bool) or not hasattr(number, "__index__"):
-                raise InvalidInput(f"{name} must be a whole number of pixels, got {_shown(number)}")
-            if not least <= number <= MOST_SIDE_PX:
-                raise InvalidInput(f"{name} must be from {least} to {MOST_SIDE_PX} px, got {number}")
+        # Python's own numbers replace those of NumPy and tensors of one element, which gsplat takes, too.
+        for name in ("width", "height", "tile_size"):
+            side = _whole(name, getattr(self, name), "a whole number of pixels")
+            if not 1 <= side <= MOST_SIDE_PX:
+                raise InvalidInput(f"{name} must be from 1 to {MOST_SIDE_PX} px, got {side}")
+            object.__setattr__(self, name, side)
         for name in ("near_plane", "far_plane", "radius_clip", "eps2d"):
-            number = getattr(self, name)
-            if isinstance(number, bool) or not isinstance(number, int | float) or number != number:
-                raise InvalidInput(f"{name} must be a number, got {_shown(number)}")
-        for name, degree in (("sh_degree", self.sh_degree), ("extra_signals_sh_degree", self.extra_degree)):
-            if degree is None:
+            object.__setattr__(self, name, _number(name, getattr(self, name)))
+        for field_name, name in (("sh_degree", "sh_degree"), ("extra_degree", "extra_signals_sh_degree")):
+            if getattr(self, field_name) is None:
                 continue
-            if isinstance(degree, bool) or not hasattr(degree, "__index__"):
-                raise InvalidInput(f"{name} must be None or 0 to {MAX_SH_DEGREE}, got {_shown(degree)}")
+            degree = _whole(name, getattr(self, field_name), f"None or 0 to {MAX_SH_DEGREE}")
             if not 0 <= degree <= MAX_SH_DEGREE:
                 raise InvalidInput(f"{name} must be None or 0 to {MAX_SH_DEGREE}, got {degree}")
+            object.__setattr__(self, field_name, degree)
         for name, value, known in (
             ("render_mode", self.render_mode, _RENDER_MODES),
             ("rasterize_mode", self.rasterize_mode, _RASTERIZE_MODES),
@@ -216,6 +216,27 @@ def is_transformed() -> bool:
     if torch.compiler.is_compiling():
         return True
     return torch._C._are_functorch_transforms_active() or torch._C._len_torch_dispatch_stack() > 0
+
+
+def _whole(name: str, value: Any, expected: str) -> int:
+    """Return a whole number as an int; `expected` completes the error about other values."""
+    try:
+        if not isinstance(value, bool):
+            return operator.index(value)
+    except TypeError:
+        pass
+    raise InvalidInput(f"{name} must be {expected}, got {_shown(value)}")
+
+
+def _number(name: str, value: Any) -> float:
+    """Return a number, also an infinite one, as a float."""
+    try:
+        number = math.nan if isinstance(value, bool | str | bytes) else float(value)
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        number = math.nan
+    if math.isnan(number):
+        raise InvalidInput(f"{name} must be a number, got {_shown(value)}")
+    return number
 
 
 def _shown(value: object) -> str:

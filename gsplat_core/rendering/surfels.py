@@ -38,11 +38,13 @@ from gsplat_core.rendering.settings import (
     RenderSettings,
     check_tensors,
 )
+from gsplat_core.rendering.torch_modes import in_plain_mode
 
 SurfelMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 DepthMode = Literal["expected", "median"]
 
 
+@in_plain_mode
 def rasterization_2dgs(
     means: Tensor,
     quats: Tensor,
@@ -126,6 +128,7 @@ def rasterization_2dgs(
         sh_degree=sh_degree, packed=packed, tile_size=tile_size, render_mode=render_mode, absgrad=absgrad,
         constants=constants,
     )  # fmt: skip
+    width, height, tile_size = settings.width, settings.height, settings.tile_size
     arguments = Arguments(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, None)
     check_tensors(arguments)
     batch_dims, n = check_shapes(arguments, settings)

@@ -16,6 +16,7 @@ from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
 from gsplat_core.ops.arguments import require_float32
 from gsplat_core.ops.basis_field.plain_torch import BASIS_CHANNELS as CHANNELS
+from gsplat_core.ops.derivatives import register_gradient
 from gsplat_core.ops.scalars import store_scalars_
 from gsplat_core.scene.gaussians import RAW_COLUMNS
 
@@ -193,4 +194,4 @@ def _backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, Tensor, None,
     return *torch.ops.gsplat_core.basis_field_backward(gradient, *ctx.saved_tensors), None, None
 
 
-torch.library.register_autograd("gsplat_core::basis_field", _backward, setup_context=_setup_context)
+register_gradient("gsplat_core::basis_field", _backward, setup_context=_setup_context)

@@ -17,6 +17,7 @@ from torch import Tensor
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
 from gsplat_core.ops.arguments import require_shape, require_trailing
+from gsplat_core.ops.derivatives import register_gradient
 
 
 def rasterize_to_pixels(
@@ -210,7 +211,7 @@ def _backward(ctx: Any, v_image: Tensor, v_alphas: Tensor, _: Tensor | None) -> 
     )
 
 
-torch.library.register_autograd("gsplat_core::composite", _backward, setup_context=_setup_context)
+register_gradient("gsplat_core::composite", _backward, setup_context=_setup_context)
 
 
 MAX_ALPHA = 0.99

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from gsplat_core.ops import native  # noqa: F401  registers the compiled op
 from gsplat_core.ops.arguments import check_covariance_arguments, require_float32
+from gsplat_core.ops.derivatives import register_gradient
 
 
 def quat_scale_to_covar_preci(
@@ -71,4 +72,4 @@ def _backward(ctx: Any, v_covars: Tensor | None, v_precis: Tensor | None) -> tup
     return v_quats, v_scales, None, None, None
 
 
-torch.library.register_autograd("gsplat_core::quat_scale_to_covar_preci", _backward, setup_context=_setup_context)
+register_gradient("gsplat_core::quat_scale_to_covar_preci", _backward, setup_context=_setup_context)

@@ -11,6 +11,7 @@ from torch import Tensor
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
 from gsplat_core.ops.arguments import require_tiled_splats
+from gsplat_core.ops.derivatives import register_gradient
 from gsplat_core.ops.splat_rays import RAY_NUMBERS
 from gsplat_core.scene.cameras import Camera
 
@@ -92,4 +93,4 @@ def _backward(ctx: Any, v_out: Tensor) -> tuple[Tensor | None, ...]:
     return (None, None, None, None, v_planes, None, None, None, None, None)
 
 
-torch.library.register_autograd("gsplat_core::blend_flow", _backward, setup_context=_setup_context)
+register_gradient("gsplat_core::blend_flow", _backward, setup_context=_setup_context)

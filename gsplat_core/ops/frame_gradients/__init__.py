@@ -15,6 +15,7 @@ from torch import Tensor
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
 from gsplat_core.ops.arguments import GAUSSIAN_TENSORS, View, check_inputs, require_shape
+from gsplat_core.ops.derivatives import register_gradient
 from gsplat_core.scene.gaussians import COLOUR, LOG_SCALE, OPACITY, POSITION, RAW_COLUMNS, ROTATION
 
 if TYPE_CHECKING:
@@ -250,4 +251,4 @@ def _backward(ctx: Any, v_image: Tensor | None, v_alphas: Tensor | None, *_: Any
     return own, raw if of_deltas else None, *[None] * 11
 
 
-torch.library.register_autograd("gsplat_core::render_frame", _backward, setup_context=_setup_context)
+register_gradient("gsplat_core::render_frame", _backward, setup_context=_setup_context)

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
+from gsplat_core.ops.derivatives import register_gradient
 
 
 def hexplane_features(
@@ -122,4 +123,4 @@ def _backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, ...]:
     return torch.ops.gsplat_core.hexplane_features_backward(gradient, *ctx.saved_tensors)
 
 
-torch.library.register_autograd("gsplat_core::hexplane_features", _backward, setup_context=_setup_context)
+register_gradient("gsplat_core::hexplane_features", _backward, setup_context=_setup_context)

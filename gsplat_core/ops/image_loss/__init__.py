@@ -13,6 +13,7 @@ from torch import Tensor
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled op
 from gsplat_core.ops.arguments import ImageLoss
+from gsplat_core.ops.derivatives import register_gradient
 from gsplat_core.ops.ssim import MAX_CHANNELS
 
 STEEP_AS_L1 = 0.01
@@ -126,7 +127,7 @@ def _backward(
     )
 
 
-torch.library.register_autograd("gsplat_core::image_loss", _backward, setup_context=_save)
+register_gradient("gsplat_core::image_loss", _backward, setup_context=_save)
 
 
 class FrameLoss(NamedTuple):

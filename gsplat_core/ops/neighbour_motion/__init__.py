@@ -13,6 +13,7 @@ from torch import Tensor
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled op
 from gsplat_core.ops.arguments import require_float32, require_shape
+from gsplat_core.ops.derivatives import register_gradient
 
 
 def neighbour_motion(before: Tensor, after: Tensor, turned: Tensor, neighbours: Tensor, stiffness: float) -> Tensor:
@@ -67,4 +68,4 @@ def _backward(ctx: Any, v_out: Tensor) -> tuple[Tensor | None, ...]:
     return None, v_after, v_turned, None, None
 
 
-torch.library.register_autograd("gsplat_core::neighbour_motion", _backward, setup_context=_setup_context)
+register_gradient("gsplat_core::neighbour_motion", _backward, setup_context=_setup_context)

@@ -19,6 +19,7 @@ from torch import Tensor
 from gsplat_core.ops import native  # noqa: F401  registers the compiled op
 from gsplat_core.ops.arguments import FOV_MARGIN, PackedProjection, Pairs, check_spherical_harmonics_arguments
 from gsplat_core.ops.covariance import quat_scale_to_covar_preci
+from gsplat_core.ops.derivatives import differentiable_once
 from gsplat_core.scene.cameras import CAMERA_MODELS
 
 NEAR_AXIS = 0.0625
@@ -271,6 +272,7 @@ class _ProjectVisible(torch.autograd.Function):
         return ids, *rest, radii
 
     @staticmethod
+    @differentiable_once
     def backward(ctx: Any, *v: Tensor | None) -> tuple[Tensor | None, ...]:
         *inputs, viewmats, Ks, ids, conics, compensations = ctx.saved_tensors
         pairs, needs = ctx.pairs, ctx.needs_input_grad[3:]
@@ -374,6 +376,7 @@ class _VisibleHarmonics(torch.autograd.Function):
         return colors
 
     @staticmethod
+    @differentiable_once
     def backward(ctx: Any, *v: Tensor) -> tuple[Tensor | None, ...]:
         dirs, coefficients, ids = ctx.saved_tensors
         pairs, used, bases = ctx.pairs, (ctx.degree + 1) ** 2, coefficients.shape[-2]

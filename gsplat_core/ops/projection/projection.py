@@ -18,6 +18,7 @@ from gsplat_core.ops.arguments import (
     check_sparse_gradient,
     require_float32,
 )
+from gsplat_core.ops.derivatives import register_gradient
 from gsplat_core.ops.packed_projection import intrinsics_gradient, project_visible, world_covariances
 from gsplat_core.scene.cameras import CAMERA_MODELS
 
@@ -210,4 +211,4 @@ def _backward(ctx: Any, *v: Tensor | None) -> tuple[Tensor | None, ...]:
     )
 
 
-torch.library.register_autograd("gsplat_core::project_gaussians", _backward, setup_context=_setup_context)
+register_gradient("gsplat_core::project_gaussians", _backward, setup_context=_setup_context)

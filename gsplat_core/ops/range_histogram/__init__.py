@@ -10,6 +10,7 @@ from torch import Tensor
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled op
 from gsplat_core.ops.arguments import check_max_alpha, require_float32, require_tiled_splats
+from gsplat_core.ops.derivatives import register_gradient
 from gsplat_core.ops.splat_rays import RAY_NUMBERS
 
 MOST_BINS = 65536
@@ -115,4 +116,4 @@ def _backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
     return (*gradients, *[None] * (3 + len(ctx.rest)))
 
 
-torch.library.register_autograd("gsplat_core::range_histogram", _backward, setup_context=_setup_context)
+register_gradient("gsplat_core::range_histogram", _backward, setup_context=_setup_context)

@@ -6,16 +6,14 @@ Follows Kerbl et al. 2023. Two autograd nodes expose the intermediate `means2d`:
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 from torch.autograd import Function
-from torch.autograd.function import once_differentiable
 
 from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
+from gsplat_core.ops.derivatives import differentiable_once
 
 PLAIN_COLORS = -1
 """Value of `Options.degree` for plain colours without spherical harmonics, at most `MOST_PLAIN_COLORS` channels."""
@@ -172,17 +170,6 @@ def rasterize(inputs: Inputs, view: View, differentiable: bool) -> Rasterized:
     return Rasterized(image, alphas, means2d, depths, conics, opacities, *call.outputs[6:returned])
 
 
-def _differentiable_once(backward: Callable[..., Any]) -> Callable[..., Any]:
-    """Return `once_differentiable(backward)` that calls `backward` directly if no second derivative is requested."""
-    guarded = once_differentiable(backward)
-
-    @functools.wraps(backward)
-    def called(ctx: Any, *v: Tensor | None) -> Any:
-        return guarded(ctx, *v) if torch.is_grad_enabled() else backward(ctx, *v)
-
-    return called
-
-
 class _Project(Function):
     @staticmethod
     def forward(ctx: Any, call: _Call, *inputs: Any) -> tuple[Tensor, ...]:
@@ -195,7 +182,7 @@ class _Project(Function):
         return out[2], out[3], out[4], out[5], own[0]
 
     @staticmethod
-    @_differentiable_once
+    @differentiable_once
     def backward(ctx: Any, *v: Tensor | None) -> tuple[Tensor | None, ...]:
         v_means2d, v_depths, v_conics, v_opacities, v_records = v
         *inputs, radii, row_of = ctx.saved_tensors
@@ -225,7 +212,7 @@ class _Blend(Function):
         return out[0], out[1]
 
     @staticmethod
-    @_differentiable_once
+    @differentiable_once
     def backward(ctx: Any, v_image: Tensor | None, v_alphas: Tensor | None) -> tuple[Tensor | None, ...]:
         *tensors, means2d = ctx.saved_tensors
         saved = Saved(*tensors)

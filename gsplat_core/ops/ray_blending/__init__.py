@@ -10,6 +10,7 @@ from torch import Tensor
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
 from gsplat_core.ops.arguments import check_max_alpha, require_float32, require_tiled_splats
+from gsplat_core.ops.derivatives import register_gradient
 from gsplat_core.ops.splat_rays import RAY_NUMBERS
 
 MAX_CHANNELS = 15
@@ -157,4 +158,4 @@ def _backward(
     return (*gradients, None, None, None, None, None)
 
 
-torch.library.register_autograd("gsplat_core::blend_rays", _backward, setup_context=_setup_context)
+register_gradient("gsplat_core::blend_rays", _backward, setup_context=_setup_context)

@@ -14,6 +14,7 @@ from torch import Tensor
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
 from gsplat_core.ops.arguments import require_float32, require_shape
+from gsplat_core.ops.derivatives import register_gradient
 from gsplat_core.scene.cameras import CAMERA_MODELS
 
 
@@ -104,4 +105,4 @@ def _backward(ctx: Any, v_value: Tensor | None, *_: Tensor | None) -> tuple[Tens
 
 
 for _op in ("ray_depth_loss", "ray_normal_loss"):
-    torch.library.register_autograd(f"gsplat_core::{_op}", _backward, setup_context=_save)
+    register_gradient(f"gsplat_core::{_op}", _backward, setup_context=_save)

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from gsplat_core.ops import native  # noqa: F401  registers the compiled op
 from gsplat_core.ops.arguments import check_spherical_harmonics_arguments, require_float32
+from gsplat_core.ops.derivatives import register_gradient
 
 
 def spherical_harmonics(degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None = None) -> Tensor:
@@ -72,4 +73,4 @@ def _backward(ctx: Any, v_colors: Tensor) -> tuple[Tensor | None, ...]:
     return None, v_dirs if ctx.needs_input_grad[1] else None, v_coeffs, None
 
 
-torch.library.register_autograd("gsplat_core::spherical_harmonics", _backward, setup_context=_setup_context)
+register_gradient("gsplat_core::spherical_harmonics", _backward, setup_context=_setup_context)

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
 from gsplat_core.ops.arguments import require_float32, require_shape
+from gsplat_core.ops.derivatives import register_gradient
 from gsplat_core.scene.cameras import CameraModel
 
 RAY_NUMBERS = 10
@@ -110,4 +111,4 @@ def _backward(ctx: Any, v_rays: Tensor, v_normals: Tensor) -> tuple[Tensor | Non
     return *torch.ops.gsplat_core.splat_rays_backward(*ctx.saved_tensors, v_rays, v_normals), None, None
 
 
-torch.library.register_autograd("gsplat_core::splat_rays", _backward, setup_context=_setup_context)
+register_gradient("gsplat_core::splat_rays", _backward, setup_context=_setup_context)

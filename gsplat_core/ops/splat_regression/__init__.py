@@ -10,6 +10,7 @@ from torch import Tensor
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled op
 from gsplat_core.ops.arguments import require_float32
+from gsplat_core.ops.derivatives import register_gradient
 
 MOST_DIMENSIONS = 4
 """Largest number of dimensions of the points at which a splat regression is evaluated."""
@@ -77,4 +78,4 @@ def _backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
     return None, *torch.ops.gsplat_core.splat_regression_backward(points, centres, factors, values, gradient)
 
 
-torch.library.register_autograd("gsplat_core::splat_regression", _backward, setup_context=_setup_context)
+register_gradient("gsplat_core::splat_regression", _backward, setup_context=_setup_context)

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled op
+from gsplat_core.ops.derivatives import register_gradient
 
 MAX_CHANNELS = 32
 WINDOW_RADIUS_PX = 5
@@ -101,4 +102,4 @@ def _backward(ctx: torch.autograd.function.FunctionCtx, gradient: Tensor) -> tup
     )
 
 
-torch.library.register_autograd("gsplat_core::ssim_map", _backward, setup_context=_save)
+register_gradient("gsplat_core::ssim_map", _backward, setup_context=_save)

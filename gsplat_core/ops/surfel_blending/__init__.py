@@ -16,6 +16,7 @@ from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
 from gsplat_core.ops.arguments import require_shape, require_trailing
 from gsplat_core.ops.compositing import MAX_ALPHA, MIN_ALPHA, blend_pairs, blended_pairs
+from gsplat_core.ops.derivatives import register_gradient
 
 MAX_CHANNELS = 16
 """Colour channels of one call of the compiled op; more of them are blended in several calls."""
@@ -252,7 +253,7 @@ def _backward(ctx: Any, *v: Tensor) -> tuple[Tensor | None, ...]:
     )
 
 
-torch.library.register_autograd("gsplat_core::blend_surfels", _backward, setup_context=_setup_context)
+register_gradient("gsplat_core::blend_surfels", _backward, setup_context=_setup_context)
 
 
 SCREEN_FACTOR = 2.0

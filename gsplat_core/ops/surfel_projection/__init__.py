@@ -16,6 +16,7 @@ from gsplat_core.ops.arguments import (
     pack_surfels,
     require_float32,
 )
+from gsplat_core.ops.derivatives import register_gradient
 
 
 def fully_fused_projection_2dgs(
@@ -143,4 +144,4 @@ def _backward(ctx: Any, *v: Tensor | None) -> tuple[Tensor | None, ...]:
     return (*(gradient if needed else None for gradient, needed in zip(gradients, needs, strict=False)), *[None] * 6)
 
 
-torch.library.register_autograd("gsplat_core::project_surfels", _backward, setup_context=_setup_context)
+register_gradient("gsplat_core::project_surfels", _backward, setup_context=_setup_context)

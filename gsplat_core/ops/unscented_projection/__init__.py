@@ -26,6 +26,7 @@ from gsplat_core.ops.arguments import (
     require_same_kind,
     require_shape,
 )
+from gsplat_core.ops.derivatives import register_gradient
 from gsplat_core.poses.rolling_shutter import RollingShutterType, Shutter
 from gsplat_core.scene.cameras import CAMERA_MODELS
 from gsplat_core.scene.distortion import FThetaCameraDistortionParameters, Lens
@@ -421,4 +422,4 @@ def _backward(ctx: Any, *v: Tensor | None) -> tuple[Tensor | None, ...]:
     return (*gradients, *[None] * 18)
 
 
-torch.library.register_autograd("gsplat_core::project_unscented", _backward, setup_context=_setup_context)
+register_gradient("gsplat_core::project_unscented", _backward, setup_context=_setup_context)

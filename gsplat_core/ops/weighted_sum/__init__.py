@@ -12,6 +12,7 @@ from torch import Tensor
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled op
 from gsplat_core.ops.arguments import require_float32, require_shape, require_tiled_splats
+from gsplat_core.ops.derivatives import register_gradient
 
 MOST_CHANNELS = 32
 """Largest number of channels; `kMostChannels` of `weighted_sum.h`."""
@@ -98,4 +99,4 @@ def _backward(ctx: Any, v_sums: Tensor) -> tuple[Tensor | None, ...]:
     return *gradients, None, None, None, None
 
 
-torch.library.register_autograd("gsplat_core::weighted_sums", _backward, setup_context=_setup_context)
+register_gradient("gsplat_core::weighted_sums", _backward, setup_context=_setup_context)

@@ -16,6 +16,7 @@ from torch.utils.checkpoint import checkpoint
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
 from gsplat_core.ops.arguments import require_kernels, require_same_kind, require_shape
+from gsplat_core.ops.derivatives import register_gradient
 from gsplat_core.ops.unscented_projection import UnscentedTransformParameters, checked_camera, sigma_offsets
 from gsplat_core.poses.rolling_shutter import RollingShutterType, Shutter
 from gsplat_core.scene.distortion import FThetaCameraDistortionParameters, Lens
@@ -86,7 +87,7 @@ def _backward(ctx: Any, v_image: Tensor, v_through: Tensor, _: Tensor) -> tuple[
     return of_batches, v_colors, v_opacities, v_rays, None, None, None, None, None
 
 
-torch.library.register_autograd("gsplat_core::blend_world", _backward, setup_context=_setup_context)
+register_gradient("gsplat_core::blend_world", _backward, setup_context=_setup_context)
 
 
 ALPHA_MIN = 1.0 / 255.0

@@ -48,6 +48,31 @@ def test_a_wrong_size_is_named(name, value):
         gsplat_core.rasterization(**{**arguments(), name: value})
 
 
+NUMBERS = {
+    "width": 16,
+    "height": 16,
+    "tile_size": 8,
+    "sh_degree": 0,
+    "near_plane": 1.0,
+    "far_plane": 9.0,
+    "radius_clip": 0.0,
+    "eps2d": 0.25,
+}
+
+
+@pytest.mark.parametrize("render", [gsplat_core.rasterization, gsplat_core.rasterization_2dgs])
+@pytest.mark.parametrize(
+    "kind", [np.array, lambda v: np.float32(v) if isinstance(v, float) else np.int64(v), torch.tensor]
+)
+def test_numbers_of_numpy_and_torch_are_those_of_python(render, kind):
+    given = {**arguments(), **NUMBERS, "colors": torch.ones(2, 1, 3), "packed": False, "render_mode": "RGB+ED"}
+    other = render(**{**given, **{name: kind(value) for name, value in NUMBERS.items()}})
+    expected = render(**given)
+    assert torch.equal(other[0], expected[0]) and expected[0].any()
+    for name in ("width", "height", "tile_size"):
+        assert type(other[-1][name]) is int and other[-1][name] == NUMBERS[name]
+
+
 @pytest.mark.parametrize("name", ["width", "height"])
 def test_a_size_that_is_none_is_named(name):
     with pytest.raises(InvalidInput, match=name):
@@ -55,7 +80,7 @@ def test_a_size_that_is_none_is_named(name):
 
 
 @pytest.mark.parametrize("name", ["near_plane", "far_plane", "radius_clip", "eps2d"])
-@pytest.mark.parametrize("value", [None, "x", [1], True, float("nan")])
+@pytest.mark.parametrize("value", [None, "x", [1], True, float("nan"), torch.ones(2), "1", 10**400])
 def test_a_wrong_number_is_named(name, value):
     with pytest.raises(InvalidInput, match=name):
         gsplat_core.rasterization(**{**arguments(), name: value})

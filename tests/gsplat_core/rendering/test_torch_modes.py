@@ -1,0 +1,75 @@
+"""Rendering functions inside modes of torch: autocasting, transforms, forward-mode and second derivatives."""
+
+from __future__ import annotations
+
+import pickle
+
+import pytest
+import torch
+from torch.autograd import forward_ad
+
+import gsplat_core
+from gsplat_core import rasterization, rasterization_2dgs
+
+RENDER = {
+    "dense": lambda *a: rasterization(*a, 24, 16, packed=False)[0],
+    "packed": lambda *a: rasterization(*a, 24, 16)[0],
+    "order and depth along rays": lambda *a: rasterization(*a, 24, 16, global_z_order=False, render_mode="RGB-Ed")[0],
+    "unscented": lambda *a: rasterization(*a, 24, 16, with_ut=True, with_eval3d=True)[0],
+    "surfels": lambda *a: torch.cat(rasterization_2dgs(*a, 24, 16, render_mode="RGB+ED", packed=False)[:3], -1),
+}
+
+
+def arguments():
+    random = torch.Generator().manual_seed(3)
+    draw = lambda *shape: torch.rand(*shape, generator=random)
+    means = (draw(30, 3) - 0.5) * torch.tensor([3.0, 2.0, 1.0]) + torch.tensor([0.0, 0.0, 3.0])
+    views = torch.eye(4).repeat(2, 1, 1)
+    views[1, :3, 3] = torch.tensor([0.3, -0.2, 0.4])
+    Ks = torch.tensor([[20.0, 0, 12], [0, 20, 8], [0, 0, 1]]).repeat(2, 1, 1)
+    return [means, draw(30, 4) - 0.5, 0.05 + 0.2 * draw(30, 3), draw(30), draw(30, 3), views, Ks]
+
+
+@pytest.mark.parametrize("render", RENDER.values(), ids=RENDER.keys())
+def test_autocasting_does_not_change_the_picture(render):
+    expected = render(*arguments())
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert torch.is_autocast_enabled("cpu")
+        found = render(*arguments())
+        assert torch.is_autocast_enabled("cpu")
+    assert found.dtype == torch.float32 and torch.equal(found, expected)
+
+
+@pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated")  # by torch itself when jvp is first used
+@pytest.mark.parametrize("render", [RENDER["dense"], RENDER["packed"], RENDER["surfels"]])
+def test_transforms_that_would_give_wrong_results_are_refused(render):
+    means, *others = arguments()
+    of_means = lambda each: render(each, *others)
+    with pytest.raises(
+        NotImplementedError, match=r"rasterization(_2dgs)?\(\) has no transforms.*batch dimensions in place of vmap"
+    ):
+        torch.func.vmap(of_means)(means.expand(2, 30, 3))
+    with pytest.raises(NotImplementedError, match="no forward-mode derivatives"):
+        torch.func.jvp(of_means, (means,), (torch.ones_like(means),))
+    with forward_ad.dual_level(), pytest.raises(NotImplementedError, match="no forward-mode derivatives"):
+        of_means(forward_ad.make_dual(means, torch.ones_like(means)))
+    assert of_means(means).any()
+
+
+@pytest.mark.parametrize("render", RENDER.values(), ids=RENDER.keys())
+def test_second_derivatives_are_refused_and_first_ones_stay(render):
+    means, *others = arguments()
+    means.requires_grad_()
+    image = render(means, *others)
+    (expected,) = torch.autograd.grad(image.square().sum(), means, retain_graph=True)
+    (gradient,) = torch.autograd.grad(image.square().sum(), means, create_graph=True)
+    assert torch.equal(gradient, expected) and expected.any()
+    # The gradient of a plain sum does not depend on the image, which torch's own guard misses.
+    (gradient,) = torch.autograd.grad(image.sum(), means, create_graph=True)
+    with pytest.raises(NotImplementedError, match="first derivatives only"):
+        (gradient.square().sum() + image.sum()).backward()
+
+
+def test_rendering_functions_can_be_pickled():
+    for function in (gsplat_core.rasterization, gsplat_core.rasterization_2dgs):
+        assert pickle.loads(pickle.dumps(function)) is function
