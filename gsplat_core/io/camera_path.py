@@ -26,15 +26,15 @@ from numpy.typing import NDArray
 from gsplat_core.errors import BundleCorrupt, InvalidInput, InvalidSetting
 from gsplat_core.io.files import read_regular
 from gsplat_core.io.json_object import JsonObject
-from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.cameras import MAX_INTRINSICS_PX, MIN_FOCAL_PX, Camera
 from gsplat_core.value_ranges import IntegerIn, NumberIn
 
 MOST_BYTES = 1 << 24
 MOST_CAMERAS = 100_000
 TIME_S = NumberIn(-1e10, 1e10)
 PLACE = NumberIn(-1e9, 1e9)
-FOCAL_PX = NumberIn(1e-3, 1e7)
-CENTRE_PX = NumberIn(-1e7, 1e7)
+FOCAL_PX = NumberIn(MIN_FOCAL_PX, MAX_INTRINSICS_PX)
+CENTRE_PX = NumberIn(-MAX_INTRINSICS_PX, MAX_INTRINSICS_PX)
 HEIGHT_PX = IntegerIn(1, 1 << 16)
 ROTATION_TOLERANCE = 2e-3
 INTRINSICS = {"fx": FOCAL_PX, "fy": FOCAL_PX, "cx": CENTRE_PX, "cy": CENTRE_PX}

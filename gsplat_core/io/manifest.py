@@ -18,9 +18,10 @@ from gsplat_core.deformation.kinds import field_from_config, kind_of
 from gsplat_core.errors import BundleCorrupt, InvalidInput, InvalidSetting, UnknownFormatVersion
 from gsplat_core.io.json_object import JsonObject
 from gsplat_core.models import Model, TrainedBy
-from gsplat_core.scene.cameras import CAMERA_MODELS, Camera, CameraModel
+from gsplat_core.scene.cameras import CAMERA_MODELS, MAX_INTRINSICS_PX, MIN_FOCAL_PX, Camera, CameraModel
 from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
 from gsplat_core.scene.depth_source import DepthError, DepthSource
+from gsplat_core.scene.frames import LONGEST_RECORDING_S
 from gsplat_core.scene.gaussians import MAX_SH_DEGREE, Gaussians
 from gsplat_core.value_ranges import IntegerIn, NumberIn, shortened
 
@@ -32,14 +33,14 @@ VERSION = IntegerIn(1, (1 << 53) - 1)
 COUNT = IntegerIn(0, 50_000_000)
 SH_DEGREE = IntegerIn(0, MAX_SH_DEGREE)
 TIME_S = NumberIn(-1e10, 1e10)
-LONGEST_WINDOW_S = 86_400.0
-"""Longest time window of a model: one day."""
+LONGEST_WINDOW_S = LONGEST_RECORDING_S
+"""Longest time window of a model."""
 LONGEST_FIELD_WINDOW_S = 4 * LONGEST_WINDOW_S
 """Longest time window of a deformation field, which may extend beyond the observed window."""
 SIDE_PX = IntegerIn(1, 16_384)
 MOST_PIXELS = 1 << 26
-FOCAL_PX = NumberIn(1e-3, 1e7)
-INTRINSICS_PX = NumberIn(-1e7, 1e7)
+FOCAL_PX = NumberIn(MIN_FOCAL_PX, MAX_INTRINSICS_PX)
+INTRINSICS_PX = NumberIn(-MAX_INTRINSICS_PX, MAX_INTRINSICS_PX)
 POSE = NumberIn(-1e9, 1e9)
 ROTATION_TOLERANCE = 2e-3
 """Tolerance of the pose's R Rᵀ from the identity (per entry) and of its determinant from 1."""

@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 
 CameraModel = Literal["pinhole", "ortho", "fisheye"]
 CAMERA_MODELS: tuple[str, ...] = get_args(CameraModel)
+MIN_FOCAL_PX, MAX_INTRINSICS_PX = 1e-3, 1e7
+"""Smallest focal length, and largest focal length and distance of the principal point from the origin, in every file
+that contains a camera."""
 
 
 def _matrix(value: ArrayLike, size: int, name: str) -> NDArray[np.float64]:

@@ -26,6 +26,8 @@ class FrameStatus(Enum):
     """Picture that may contain the decoder's error concealment. It is displayed, but neither trained on nor scored."""
 
 
+LONGEST_RECORDING_S = 86_400.0
+"""Longest recording, and longest time window of a model: one day."""
 BLUR, CUT_IN_DOUBT = "blur", "cut in doubt"
 """Values of `Frame.withheld` for a blurred frame, and for one that may belong to another scene."""
 

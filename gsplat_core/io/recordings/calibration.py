@@ -30,17 +30,13 @@ from gsplat_core.io.recordings.plain_files import (
     read_array,
     stays_inside,
 )
-from gsplat_core.scene.cameras import CAMERA_MODELS, Camera
+from gsplat_core.scene.cameras import CAMERA_MODELS, MAX_INTRINSICS_PX, MIN_FOCAL_PX, Camera
 
 DEFAULT_FOCAL_FACTOR = 0.9
 """Default focal length in units of the longer image side: 58° field of view, usual in endoscopes."""
 MAX_JSON_BYTES = 32 * 1024 * 1024
 MAX_LENGTH = 1e9
-"""Largest camera coordinate in the recording's unit, and largest focal length in pixels.
-
-Keeps products within the range of float32.
-"""
-MIN_FOCAL_PX = 1e-3
+"""Largest camera coordinate in the recording's unit. Keeps products within the range of float32."""
 _ROTATION_TOLERANCE = 1e-3
 
 
@@ -119,9 +115,9 @@ def read_poses_bounds(
     if np.any(poses[:, :, 4] != poses[0, :, 4]):
         findings.problem(path, "H, W or f differ between rows", "Give one size and focal length for all frames")
         return None
-    if not MIN_FOCAL_PX <= focal_px <= MAX_LENGTH:
+    if not MIN_FOCAL_PX <= focal_px <= MAX_INTRINSICS_PX:
         findings.problem(
-            path, f"the focal length is {focal_px:g} px", f"Give one from {MIN_FOCAL_PX:g} to {MAX_LENGTH:g} px"
+            path, f"the focal length is {focal_px:g} px", f"Give one from {MIN_FOCAL_PX:g} to {MAX_INTRINSICS_PX:g} px"
         )
         return None
     world_to_camera = invert_poses(poses[:, :, :4], path, findings)
@@ -139,7 +135,7 @@ def read_json(path: Path, findings: Findings) -> dict[str, Any] | None:
         if len(data) > MAX_JSON_BYTES:
             findings.problem(path, f"it has more bytes than the bound of {MAX_JSON_BYTES}", "Split it")
             return None
-        content = json.loads(data.decode("utf-8"), object_pairs_hook=_each_key_once)
+        content = json.loads(data.decode("utf-8-sig"), object_pairs_hook=_each_key_once)
     except UnreadableFile as error:
         findings.problem(path, str(error), "Give a JSON file")
         return None
@@ -177,13 +173,14 @@ def read_pinhole(path: Path, content: dict[str, Any], findings: Findings) -> Cam
     width, height, fx, fy, cx, cy = (float(value) for value in values.values() if value is not None)
     model = content.get("model", "pinhole")
     whole = all(side >= 1 and not side % 1 and side <= MAX_PIXELS for side in (width, height))
-    bounded = all(MIN_FOCAL_PX <= value <= MAX_LENGTH for value in (fx, fy)) and max(abs(cx), abs(cy)) <= MAX_LENGTH
+    bounded = all(MIN_FOCAL_PX <= value <= MAX_INTRINSICS_PX for value in (fx, fy))
+    bounded = bounded and max(abs(cx), abs(cy)) <= MAX_INTRINSICS_PX
     if not whole or not bounded or model not in CAMERA_MODELS:
         findings.problem(
             path,
             f"this cannot be a camera: {model!r:.40}, {width:g}x{height:g} px, fx = {fx:g}, fy = {fy:g}, cx = {cx:g}, cy = {cy:g}",
-            f"Sizes are whole pixels, focal lengths {MIN_FOCAL_PX:g} to {MAX_LENGTH:g} px, the model is one of "
-            f"{', '.join(CAMERA_MODELS)}",
+            f"Sizes are whole pixels, focal lengths {MIN_FOCAL_PX:g} to {MAX_INTRINSICS_PX:g} px, cx and cy at most"
+            f" {MAX_INTRINSICS_PX:g} px from 0, the model is one of {', '.join(CAMERA_MODELS)}",
         )
         return None
     return Camera(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), int(width), int(height), model=model)

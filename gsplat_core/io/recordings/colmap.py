@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from gsplat_core.errors import CoreError, InvalidSetting, RecordingInvalid, RecordingMissing
 from gsplat_core.io.files import open_regular
 from gsplat_core.io.recordings.plain_files import UnreadableFile, decode_picture
-from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.cameras import MAX_INTRINSICS_PX, Camera
 
 MODELS = {
     0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8),
@@ -33,7 +33,6 @@ MODELS = {
 PLACES = (Path("sparse/0"), Path("sparse"), Path("."))
 MOST_NAME_BYTES = 4096
 MOST_SIDE_PX = 1 << 16
-MOST_PARAMETER_PX = 1e7
 MOST_TRANSLATION = 1e9
 SAME_SHAPE = 0.01
 """Largest relative difference of the aspect ratios of a camera and its image file."""
@@ -190,9 +189,9 @@ def _camera(path: Path, number: int, model: str, width_px: int, height_px: int, 
         raise RecordingInvalid(
             f"{path}: camera {number} has {len(values)} parameters and {width_px}x{height_px} px; {model} has {wanted}, and a side at most {MOST_SIDE_PX}"
         )
-    if not all(abs(value) < MOST_PARAMETER_PX for value in values):
+    if not all(abs(value) < MAX_INTRINSICS_PX for value in values):
         raise RecordingInvalid(
-            f"{path}: camera {number} has the parameters {values}; they must be below {MOST_PARAMETER_PX:g} px"
+            f"{path}: camera {number} has the parameters {values}; they must be below {MAX_INTRINSICS_PX:g} px"
         )
     fx, fy, cx, cy = values if wanted == 4 else (values[0], *values)
     try:

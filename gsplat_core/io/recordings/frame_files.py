@@ -187,9 +187,16 @@ def resized_scan(scan: RangeScan, width_px: int, scale: float) -> RangeScan:
     return RangeScan(sensor, (np.diff(at_edges, axis=0) / np.diff(edges)[:, None]).astype(np.float32))
 
 
-POLARITY_SAMPLES = 16
+SAMPLES = 16
+"""Number of evenly spaced frames whose masks and depth are read when a recording is opened."""
 MAX_TOOL_SHARE = 0.5
 """Largest plausible share of tool pixels. Tools cover 5-35 %; a larger class is the tissue."""
+PLAUSIBLE_DEPTH_MM = (1.0, 1000.0)
+"""Range of the median depth in front of an endoscope. Metres read as millimetres are below it, micrometres above it."""
+
+
+def _sampled(count: int) -> list[int]:
+    return [int(index) for index in np.unique(np.linspace(0, count - 1, SAMPLES).round())]
 
 
 class ImageFiles:
@@ -255,10 +262,10 @@ class MaskFiles:
         """Return the share of tool pixels over evenly spaced frames; None after a problem, such as an implausible
         share.
         """
-        indices = np.unique(np.linspace(0, len(self.files) - 1, POLARITY_SAMPLES).round().astype(int))
+        indices = _sampled(len(self.files))
         shares = []
         for index in indices:
-            mask = self.read(int(index), findings)
+            mask = self.read(index, findings)
             if mask is None:
                 return None
             shares.append(1 - float(mask.mean()))
@@ -301,6 +308,28 @@ class DepthFiles:
             )
             return None
         return depth
+
+    def check_unit(self, findings: Findings) -> None:
+        """Warn if the median depth over evenly spaced frames is implausible, or no depth is known.
+
+        Problems of single files are left to `read`.
+        """
+        indices = _sampled(len(self.files))
+        read = [depth for index in indices if (depth := self.read(index, Findings())) is not None]
+        known = [values for depth in read if (values := depth[depth > 0]).size]
+        low, high = PLAUSIBLE_DEPTH_MM
+        if read and not known:
+            findings.warn(
+                self.files[0].parent,
+                f"no depth is known: all pixels are 0 ({len(indices)} frames looked at)",
+                "Export the depth maps again, or remove the folder",
+            )
+        elif known and not low <= (median := float(np.median([np.median(values) for values in known]))) <= high:
+            findings.warn(
+                self.files[0].parent,
+                f"the median depth is {median:.3g} mm ({len(indices)} frames looked at)",
+                f"Endoscopes see {low:g} to {high:g} mm. Check depth_unit_mm in recording.json for PNG; .npy holds millimetres",
+            )
 
     def _array(self, path: Path, findings: Findings) -> NDArray[np.float32] | None:
         def wrong(header: ArrayHeader) -> str | None:

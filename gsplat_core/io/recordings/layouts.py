@@ -52,6 +52,7 @@ from gsplat_core.io.recordings.plain_files import (
 )
 from gsplat_core.io.recordings.sidecars import DESCRIPTION_FILE, Beside
 from gsplat_core.io.recordings.video import VIDEO_SUFFIXES, open_video
+from gsplat_core.scene.frames import LONGEST_RECORDING_S
 
 if TYPE_CHECKING:
     from gsplat_core.io.sessions.reader import SessionContents
@@ -236,7 +237,13 @@ def inspect(path: Path, findings: Findings) -> Contents | SessionContents | None
     if is_file:
         return _with_sidecars(path, "video", open_video(path, findings), None, findings)
     if not is_folder:
-        findings.problem(path, "there is no such file or folder", f"Check the path; give {_LAYOUTS}", missing=True)
+        why = "there is no such file or folder"
+        try:
+            missing = not os.path.lexists(path)
+            check_plain(path)
+        except UnreadableFile as error:
+            why = why if missing else str(error)
+        findings.problem(path, why, f"Check the path; give {_LAYOUTS}", missing=True)
         return None
     try:
         return _inspect_folder(path, findings)
@@ -351,6 +358,8 @@ def _with_sidecars(
     valid_mask, labels, scans = beside.valid_mask(), beside.labels(), beside.scans()
     if len(findings.problems) > known:
         return None
+    if depth is not None:
+        depth.check_unit(findings)
     eyes = _calibrated(root, size, calibration, beside, findings, stereo=right is not None)
     if len(findings.problems) > known:
         return None
@@ -367,6 +376,14 @@ def _with_sidecars(
     if fps is None:
         findings.warn(root, "the frame rate is not stated", f"{DEFAULT_FPS:g} frames/s are assumed")
         fps = DEFAULT_FPS
+    last = images.times[-1] if images.times else images.frame_count - 1
+    if last > LONGEST_RECORDING_S * fps:
+        findings.problem(
+            root,
+            f"its last frame is {last / fps:.6g} s after the first one, at {fps:g} frames/s",
+            f"Recordings last up to {LONGEST_RECORDING_S:g} s; check the frame rate, and the numbers or times of the frames",
+        )
+        return None
     if images.frame_count == 1:
         findings.warn(
             root, "it has one frame: nothing can be held out and nothing moves", "Give more frames to measure"

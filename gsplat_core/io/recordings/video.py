@@ -7,6 +7,7 @@ from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
+from itertools import pairwise
 from pathlib import Path
 from typing import BinaryIO
 
@@ -33,6 +34,8 @@ class VideoIndex:
     """Damage reported by the container, by packet number."""
     frame_count: int
     """Number of displayed pictures, including those lost to container damage."""
+    times: tuple[int, ...] | None
+    """Display times of the pictures in units of the stream; None without distinct times, and after container damage."""
     ordered: bool
     """True if `positions` is reliable.
 
@@ -89,7 +92,9 @@ def read_index(opened: av.container.InputContainer, stream: av.VideoStream, cont
         shown.append(not packet.is_discard and is_shown(name, bytes(packet)))
     duration = _frame_duration(stream)
     positions, count, ordered = _positions(times, shown, lost, duration, stream.codec_context.has_b_frames)
-    return VideoIndex(positions, bytes(keys), damaged, count, ordered)
+    displayed = [time for time, is_visible in zip(times, shown, strict=True) if is_visible and time is not None]
+    is_timed = len(set(displayed)) == count and not lost
+    return VideoIndex(positions, bytes(keys), damaged, count, tuple(sorted(displayed)) if is_timed else None, ordered)
 
 
 def _frame_duration(stream: av.VideoStream) -> Fraction | None:
@@ -124,6 +129,8 @@ def _positions(
 
 VIDEO_SUFFIXES = frozenset({".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm"})
 _REENCODE = "Copy the file again from its source, or re-encode it (ffmpeg -i IN -c:v libx264 OUT.mp4)"
+MAX_JITTER = 0.5
+"""Largest deviation of a display time from even spacing, in frame durations, that is ignored as rounding or jitter."""
 _MOST_LATE = 64
 """Maximum number of packets by which a decoder delays a picture."""
 
@@ -131,13 +138,21 @@ _MOST_LATE = 64
 class VideoFrames:
     """Frames of a video file, decoded sequentially."""
 
-    def __init__(self, path: Path, container: Container, index: VideoIndex, fps: float, rotation: int) -> None:
+    def __init__(
+        self,
+        path: Path,
+        container: Container,
+        index: VideoIndex,
+        fps: float,
+        rotation: int,
+        times: Sequence[float] | None = None,
+    ) -> None:
         self.path = path
         self.files: tuple[Path, ...] = (path,)
         self.frame_count = index.frame_count
         self.numbers: list[int | None] = list(range(index.frame_count))
         self.width_px = self.height_px = 0
-        self.times: Sequence[float] | None = None
+        self.times = times
         self.fps: float | None = fps
         self._container = container
         self._index = index
@@ -318,17 +333,37 @@ def _inspect(
         )
         return None
     fps = frame_rate(stream)
-    announced = stream.frames or int(fps * _duration_s(opened, stream))
     index = read_index(opened, stream, container)
-    if index.frame_count < 0.98 * announced - 2 and not _is_edited(index):
-        findings.problem(
-            path, f"the video ends early: {index.frame_count} of about {announced} frames are there", _REENCODE
-        )
+    times = _frame_times(index, stream, findings, path)
+    announced = stream.frames or int(fps * _duration_s(opened, stream))
+    # Without a stated count, a video of irregular frame times has fewer frames than its duration suggests.
+    found = index.frame_count if stream.frames or times is None else round(times[-1]) + 1
+    if found < 0.98 * announced - 2 and not _is_edited(index):
+        findings.problem(path, f"the video ends early: {found} of about {announced} frames are there", _REENCODE)
         return None
     if not 0.1 <= fps <= 1000:
         findings.warn(path, f"the container announces {fps} frames/s", "30 frames/s are assumed")
-        fps = 30.0
-    return _with_first_frame(path, container, index, fps, findings)
+        fps, times = 30.0, None
+    return _with_first_frame(path, container, index, fps, times, findings)
+
+
+def _frame_times(index: VideoIndex, stream: av.VideoStream, findings: Findings, path: Path) -> tuple[float, ...] | None:
+    """Return the display times in frame durations since the first picture, with a warning if they are irregular; None if
+    they are unknown, or agree with the frame rate up to `MAX_JITTER`.
+    """
+    duration = _frame_duration(stream)
+    if not index.times or duration is None:
+        return None
+    times = tuple(float((time - index.times[0]) / duration) for time in index.times)
+    if all(abs(time - place) <= MAX_JITTER for place, time in enumerate(times)):
+        return None
+    spacing = times[-1] / (len(times) - 1)
+    if any(abs(time - place * spacing) > MAX_JITTER for place, time in enumerate(times)):
+        steps = [(later - earlier) * float(duration * (stream.time_base or 0)) for earlier, later in pairwise(times)]
+        findings.warn(
+            path, f"its frames are {min(steps):.3g} to {max(steps):.3g} s apart", "They keep their times in the file"
+        )
+    return times
 
 
 def _duration_s(opened: av.container.InputContainer, stream: av.VideoStream) -> float:
@@ -353,10 +388,15 @@ def _rotation(path: Path, container: Container) -> int:
 
 
 def _with_first_frame(
-    path: Path, container: Container, index: VideoIndex, fps: float, findings: Findings
+    path: Path,
+    container: Container,
+    index: VideoIndex,
+    fps: float,
+    times: Sequence[float] | None,
+    findings: Findings,
 ) -> VideoFrames | None:
     """Return the video; None after a problem with its first frame, which must be intact to initialise the scene."""
-    video = VideoFrames(path, container, index, fps, _rotation(path, container))
+    video = VideoFrames(path, container, index, fps, _rotation(path, container), times)
     first = video.look_at_first()
     if first is None:
         findings.problem(path, "no frame of the video can be decoded", _REENCODE)

@@ -141,6 +141,15 @@ def test_images_of_two_sizes(tmp_path: Path, make: SimpleNamespace, refused: Ref
     refused(tmp_path, RecordingInvalid, "000002.png", "30x20", "48x40")
 
 
+@pytest.mark.parametrize("last", [2 + 30 * 86_400, 10**20])
+def test_image_numbers_that_span_more_than_a_day(
+    tmp_path: Path, make: SimpleNamespace, refused: Refused, last: int
+) -> None:
+    make.images(tmp_path, 3)
+    make.image(tmp_path / f"{last}.png", make.frame_image(3))
+    refused(tmp_path, RecordingInvalid, "after the first one, at 30 frames/s", "up to 86400 s")
+
+
 def test_right_eye_of_another_size_or_count(endonerf_folder: Path, make: SimpleNamespace, refused: Refused) -> None:
     make.image(endonerf_folder / "images_right" / "frame-000001.color.png", make.frame_image(1, 24, 20))
     refused(endonerf_folder, RecordingInvalid, "images_right", "24x20")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -184,6 +185,14 @@ def test_validation_lists_every_bad_frame(endonerf_folder: Path) -> None:
             },
             ["40x40", "48x40"],
         ),
+        (
+            {
+                "format": "intrasplat-recording",
+                "version": 1,
+                "camera": {"width": 48, "height": 40, "fx": 40, "fy": 40, "cx": 1.1e7, "cy": 20},
+            },
+            ["cx = 1.1e+07", "at most 1e+07 px from 0"],
+        ),
     ],
 )
 def test_wrong_description(endonerf_folder: Path, refused: Refused, content: dict, fragments: list[str]) -> None:
@@ -201,3 +210,31 @@ def test_description_gives_rate_unit_and_camera(endonerf_folder: Path) -> None:
     frame = list(recording)[1]
     assert frame.pts_ns == 100_000_000
     assert frame.depth is not None and frame.depth[1, 1] == 20.5
+
+
+def test_description_may_begin_with_a_byte_order_mark(endonerf_folder: Path) -> None:
+    text = json.dumps({"format": "intrasplat-recording", "version": 1, "fps": 10})
+    (endonerf_folder / "recording.json").write_text(text, "utf-8-sig")
+    assert open_recording(endonerf_folder).fps == 10
+
+
+@pytest.mark.parametrize(
+    ("depth_mm", "fragment"),
+    [
+        (0.99, "median depth is 0.99 mm"),
+        (1.0, None),
+        (1000.0, None),
+        (1001.0, "is 1e+03 mm"),
+        (0.0, "no depth is known"),
+    ],
+)
+def test_implausible_depth_is_noted(endonerf_folder: Path, depth_mm: float, fragment: str | None) -> None:
+    count = open_recording(endonerf_folder).frame_count
+    shutil.rmtree(endonerf_folder / "depth")
+    (endonerf_folder / "depth").mkdir()
+    for index in range(count):
+        depth = np.full((40, 48), depth_mm, np.float32)
+        depth[:12] = 0  # unknown pixels do not count
+        np.save(endonerf_folder / "depth" / f"{index:06d}.npy", depth)
+    notes = [note for note in open_recording(endonerf_folder).notes if "frames looked at" in note]
+    assert [fragment is not None and fragment in note for note in notes] == ([] if fragment is None else [True])

@@ -75,6 +75,48 @@ def test_containers_without_exact_frame_count(tmp_path: Path, make: SimpleNamesp
     assert recording.frame_count == 7 == len(list(recording))
 
 
+def write_timed(path: Path, ticks: list[int]) -> None:
+    """Write one frame for each display time, in units of 1/25 s, to a Matroska file, which states no number of frames."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("ffv1", rate=25)
+        stream.width, stream.height, stream.pix_fmt = 48, 40, "bgr0"
+        for index, tick in enumerate(ticks):
+            frame = av.VideoFrame.from_ndarray(np.full((40, 48, 3), 20 * index, np.uint8), format="rgb24")
+            frame.pts = tick
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+
+
+@pytest.mark.parametrize(("ticks", "is_noted"), [([0, 1, 2, 50, 51, 900], True), ([0, 3, 6, 9, 12, 15], False)])
+def test_frames_keep_their_times_in_the_file(tmp_path: Path, ticks: list[int], is_noted: bool) -> None:
+    write_timed(tmp_path / "v.mkv", ticks)
+    recording = open_recording(tmp_path / "v.mkv")
+    assert [frame.pts_ns for frame in recording] == [tick * 40_000_000 for tick in ticks]
+    assert any("0.04 to 34 s apart" in note for note in recording.notes) == is_noted
+
+
+def test_even_times_are_multiples_of_the_frame_duration(tmp_path: Path) -> None:
+    """Matroska rounds times to milliseconds."""
+    write_timed(tmp_path / "v.mkv", [0, 1, 2, 3, 4, 5])
+    recording = open_recording(tmp_path / "v.mkv")
+    assert [frame.pts_ns for frame in recording] == [index * 40_000_000 for index in range(6)]
+    assert not any("apart" in note for note in recording.notes)
+
+
+def test_a_video_longer_than_a_day_is_refused(tmp_path: Path, refused: Refused) -> None:
+    write_timed(tmp_path / "v.mkv", [0, 1, 25 * 86_401])
+    refused(tmp_path / "v.mkv", RecordingInvalid, "86401 s after the first one", "25 frames/s")
+
+
+def test_a_path_that_is_neither_file_nor_folder_is_named(tmp_path: Path, refused: Refused) -> None:
+    os.mkfifo(tmp_path / "pipe.mp4")
+    refused(tmp_path / "pipe.mp4", RecordingMissing, "not a plain file")
+    (tmp_path / "loop.mp4").symlink_to(tmp_path / "loop.mp4")
+    refused(tmp_path / "loop.mp4", RecordingMissing, "symbolic links")
+    (tmp_path / "lost.mp4").symlink_to(tmp_path / "nowhere.mp4")
+    refused(tmp_path / "lost.mp4", RecordingMissing, "leads to nothing")
+
+
 def test_max_frames_and_scale(video_folder: Path) -> None:
     recording = open_recording(video_folder, scale=0.5, max_frames=3)
     frames = list(recording)
