@@ -55,9 +55,9 @@ class SourceOp(Operator):
         frame: `Frame`; the message's metadata carries `seq` and `pts_ns`.
 
     Params:
-        source: opened by `start()` and closed by `stop()`.
+        source: opened by the first `compute`, when all operators are ready, so that no frame waits for their start. Closed by `stop()`.
         stop_requested: polled before each frame; True ends the stream. Frames in flight are finished.
-        seconds: maximum duration after `start()`; None for no limit.
+        seconds: maximum duration after the source is opened; None for no limit.
     """
 
     def __init__(
@@ -71,7 +71,8 @@ class SourceOp(Operator):
     ) -> None:
         self.source = source
         self.seconds = seconds
-        self._until_s = math.inf
+        self._until_s: float | None = None
+        """End of the duration on the monotonic clock in seconds, infinite without a limit; None until the source is opened."""
         self._out_of_time = False
         self.stop_requested = stop_requested
         self.emitted = 0
@@ -92,8 +93,7 @@ class SourceOp(Operator):
         self.withheld.clear()
         self._states = _TimeInStates()
         self._out_of_time = False
-        self.source.open()
-        self._until_s = math.inf if self.seconds is None else time.monotonic() + self.seconds
+        self._until_s = None
 
     def stop(self) -> None:
         self.source.close()
@@ -143,6 +143,9 @@ class SourceOp(Operator):
 
     def _next(self) -> Frame | None:
         """Read the next frame. None if no frame arrived in time or the stream has ended."""
+        if self._until_s is None:
+            self.source.open()
+            self._until_s = math.inf if self.seconds is None else time.monotonic() + self.seconds
         for _ in range(round(PATIENCE_S / LOOK_S)):
             if self.stop_requested() or time.monotonic() > self._until_s:
                 self._out_of_time = time.monotonic() > self._until_s

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from operators.errors import OperatorFailed
-from operators.graph import Application, Operator
+from operators.graph import Application, MultiThreadScheduler, Operator
 from operators.ingest import SourceOp, SourceResult
 from operators.outcome import OutcomeBuilder
 from operators.sources.recording import RecordingSource
@@ -75,6 +75,19 @@ def test_every_frame_arrives_once_in_order_with_its_metadata(recording):
     assert run.computes["source"] == 5, "the stream ends with its last frame, not with an empty compute"
     assert (result(app).frames, result(app).reached_end) == (5, True)
     assert result(app).description.name == recording.name
+
+
+def test_the_source_is_opened_after_all_operators_are_ready(camera, frame, monkeypatch):
+    """The frames of a live source arrive from then on, so the first one would wait for the slowest operator."""
+    events = []
+    source = Scripted([frame(0)], camera)
+    monkeypatch.setattr(source, "open", lambda: events.append("source opened"))
+    monkeypatch.setattr(Collect, "prepare_thread", lambda self: events.append("thread prepared"))
+    app = Stream(source)
+    app.scheduler(MultiThreadScheduler(app))
+    app.run()
+    assert events == ["thread prepared", "source opened"]
+    assert [seq for seq, _ in app.sink.seen] == [0]
 
 
 def test_a_stop_ends_the_stream_and_what_is_on_its_way_arrives(recording):
