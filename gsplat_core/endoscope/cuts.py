@@ -1,4 +1,4 @@
-"""Scene change detection: cuts between shots, returns to an earlier scene, and changes of size or frame rate.
+"""Scene change detection: cuts between shots, and changes of size or frame rate.
 
 Pictures are compared by their content, independent of exposure, at 64x48 pixels. *Difference* is the median difference
 of log levels after removing each channel's gain. *Colours* is the overlap of the hue histograms. *Structure* searches
@@ -177,7 +177,7 @@ cut is confirmed by the next frame matching the unmatched one. Each cut without 
 frame matches, so that a stream of unrelated pictures passes.
 """
 KEPT_VIEWS = 4
-"""Number of views kept of the present scene. Twice as many are kept of earlier scenes."""
+"""Number of views kept of the present scene."""
 VIEW_EVERY = 15
 """Number of frames between two kept views."""
 RATE_RATIO = 1.4
@@ -191,9 +191,7 @@ class SceneVerdict:
     """Classification of a frame relative to earlier ones."""
 
     new_scene: str | None = None
-    """Reason why a new scene starts with the frame: "cut", "returned" (to an earlier scene),
-    "resized" or "frame rate". None for the same scene.
-    """
+    """Reason why a new scene starts with the frame: "cut", "resized" or "frame rate". None for the same scene."""
     in_doubt: bool = False
     """True for an unmatched frame; the next frame decides whether it was a cut."""
 
@@ -209,13 +207,11 @@ class CutDetector:
         self._last: View | None = None
         self._shape: tuple[int, ...] = ()
         self._doubted: View | None = None
-        self._doubted_is_known = False
         self._doubts = 0
         self._doubts_since_ns = 0
         self._most_doubts = LONGEST_DOUBT_FRAMES
         self._gap = False
         self._views: deque[View] = deque(maxlen=KEPT_VIEWS)
-        self._earlier: deque[View] = deque(maxlen=2 * KEPT_VIEWS)
         self._since_view = 0
         self._rate = FrameRate()
 
@@ -239,33 +235,26 @@ class CutDetector:
         if image.shape != self._shape:
             self._shape = image.shape
             return self._accept(view, "resized")
-        if self._related(view):
-            self._most_doubts = LONGEST_DOUBT_FRAMES
-            return self._accept(view, "frame rate" if other_rate else None)
+        if self._same(view, self._last, self._gap):
+            return self._accept_related(view, other_rate)
+        # Compared before the views of the scene, because the first picture of a new scene is to be shown without delay.
         settled = self._doubted is not None and self._same(view, self._doubted, gap=False)
+        if not settled and any(self._same(view, earlier, self._gap) for earlier in self._views):
+            return self._accept_related(view, other_rate)
         if self._doubts == 0:
             self._doubts_since_ns = pts_ns
         self._doubts += 1
         too_long = pts_ns - self._doubts_since_ns > 1e9 * LONGEST_DOUBT_S
         if settled or self._doubts > self._most_doubts or too_long:
             self._most_doubts = LONGEST_DOUBT_FRAMES if settled else self._most_doubts // 2
-            known = self._doubted_is_known if settled else self._is_known(view)
-            return self._accept(view, "returned" if known else "cut")
-        # Compared with earlier scenes before the cut is certain, because the next frame is to be shown without delay.
-        self._doubted, self._doubted_is_known = view, self._is_known(view)
+            return self._accept(view, "cut")
+        self._doubted = view
         return SceneVerdict(in_doubt=True)
 
-    def _related(self, view: View) -> bool:
-        """Return True if the view belongs to the present scene."""
-        assert self._last is not None
-        if self._same(view, self._last, self._gap):
-            return True
-        interrupted = self._gap or self._doubted is not None
-        return interrupted and any(self._same(view, earlier, self._gap) for earlier in self._views)
-
-    def _is_known(self, view: View) -> bool:
-        """Return True if the view belongs to an earlier scene."""
-        return any(self._same(view, earlier, gap=False) for earlier in self._earlier)
+    def _accept_related(self, view: View, other_rate: bool) -> SceneVerdict:
+        """Accept a view of the present scene; with another frame rate, a new scene starts nevertheless."""
+        self._most_doubts = LONGEST_DOUBT_FRAMES
+        return self._accept(view, "frame rate" if other_rate else None)
 
     def _same(self, view: View, other: View, gap: bool) -> bool:
         away = difference(view, other)
@@ -279,9 +268,6 @@ class CutDetector:
     def _accept(self, view: View, new_scene: str | None) -> SceneVerdict:
         self._since_view += 1
         if new_scene is not None:
-            self._earlier.extend(self._views)
-            if self._last is not None:
-                self._earlier.append(self._last)
             self._views.clear()
         if new_scene is not None or self._since_view >= VIEW_EVERY:
             self._views.append(view)

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsplat_core.endoscope import cuts
-from gsplat_core.endoscope.cuts import CutDetector, FrameRate
+from gsplat_core.endoscope.cuts import CutDetector, FrameRate, View
 from tests.gsplat_core.endoscope.clips import FRAME_NS, PLACES, brightened, clip, resized, texture
 
 OTHERS = list(itertools.permutations(PLACES, 2))
@@ -77,11 +77,11 @@ def test_what_happens_in_a_scene_is_no_cut(recordings_dir, name, event):
 
 @pytest.mark.recordings
 @pytest.mark.parametrize("first, second", OTHERS)
-def test_a_splice_is_a_cut_and_the_way_back_is_a_return(recordings_dir, first, second):
+def test_a_splice_and_the_way_back_are_cuts(recordings_dir, first, second):
     before = list(clip(recordings_dir, first)[:20])
     between = resized(clip(recordings_dir, second)[5:20], before[0])
     found = verdicts([*before, *between, *before[10:]])
-    assert found == {20: "in doubt", 21: "cut", 35: "in doubt", 36: "returned"}
+    assert found == {20: "in doubt", 21: "cut", 35: "in doubt", 36: "cut"}
 
 
 @pytest.mark.recordings
@@ -107,24 +107,27 @@ def test_scenes_that_change_with_every_frame_are_cut_after_a_while():
     assert list(verdicts([*texture(1, 5, 64, 48), *unrelated]).values()) == ["in doubt"] * 6 + ["cut"]
 
 
-@pytest.mark.parametrize(("last", "verdict"), [(["known", "odd"], "cut"), (["odd", "known"], "returned")])
-def test_only_the_frame_that_ends_the_doubts_tells_whether_an_earlier_scene_returned(rng, last, verdict):
-    earlier, present = texture(1, 16, 64, 48), texture(2, 16, 64, 48)
-    odd = [rng.integers(0, 256, (48, 64, 3), np.uint8) for _ in range(6)]
-    ends = {"known": earlier[0], "odd": odd[5]}
-    found = verdicts([*earlier, *present, *odd[:5], *(ends[each] for each in last)])
-    assert list(found.values()) == ["in doubt", "cut", *["in doubt"] * 6, verdict]
-
-
-def test_earlier_scenes_are_compared_before_the_cut_is_certain(monkeypatch):
-    """The frame that makes it certain is displayed; the one before it is withheld."""
-    earlier, present = texture(1, 16, 64, 48), texture(2, 16, 64, 48)
+def test_a_frame_like_a_kept_view_of_the_scene_is_not_in_doubt():
+    present, elsewhere = texture(1, 40, 64, 48), texture(2, 1, 64, 48)
+    assert verdicts([*present, *elsewhere, present[14]]) == {40: "in doubt"}
     detector = CutDetector()
-    for k, image in enumerate([*earlier, *present, earlier[0]]):
-        verdict = detector.observe(image, k, k * FRAME_NS)
-    assert verdict.in_doubt
-    monkeypatch.setattr(detector, "_is_known", lambda view: pytest.fail("compared too late"))
-    assert detector.observe(earlier[1], 32, 32 * FRAME_NS).new_scene == "returned"
+    for k, image in enumerate(present):
+        detector.observe(image, k, k * FRAME_NS)
+    detector._last = View(elsewhere[0])  # as if the picture had changed completely, but gradually
+    verdict = detector.observe(present[14], 40, 40 * FRAME_NS)
+    assert (verdict.new_scene, verdict.in_doubt) == (None, False)
+
+
+def test_the_frame_that_confirms_a_cut_is_compared_with_two_frames_only(monkeypatch):
+    """It is displayed, and comparing it with all kept views would delay its picture."""
+    detector = CutDetector()
+    for k, image in enumerate([*texture(1, 80, 64, 48), texture(2, 2, 64, 48)[0]]):
+        detector.observe(image, k, k * FRAME_NS)
+    compared = []
+    same = detector._same
+    monkeypatch.setattr(detector, "_same", lambda view, other, gap: compared.append(other) or same(view, other, gap))
+    assert detector.observe(texture(2, 2, 64, 48)[1], 81, 81 * FRAME_NS).new_scene == "cut"
+    assert len(compared) == 2
 
 
 def test_a_stream_of_unrelated_pictures_passes_after_a_while(rng):
@@ -226,7 +229,7 @@ def test_every_fifteenth_frame_is_a_view_of_its_scene_and_four_are_kept(monkeypa
         detector.observe(image, k, k * FRAME_NS)
         counts.append(len(detector._views))
     assert [counts[k] for k in (13, 14, 28, 29, 59, 89)] == [0, 1, 1, 2, 4, 4]
-    assert (detector._views.maxlen, detector._earlier.maxlen, detector._rate._recent.maxlen) == (4, 8, 15)
+    assert (detector._views.maxlen, detector._rate._recent.maxlen) == (4, 15)
 
 
 def test_colours_agree_by_the_share_of_pixels_of_equal_hue():
