@@ -1,6 +1,4 @@
-"""Import hook that serves modules of gsplat 1.5.3 and of 1.6's `contrib.dynamic`, and where `gsplat_core` defines each of
-their names.
-"""
+"""Import hook that serves modules of gsplat 1.5.3 and some of 1.6, and where `gsplat_core` defines each of their names."""
 
 from __future__ import annotations
 
@@ -8,8 +6,10 @@ import functools
 import importlib
 import importlib.abc
 import importlib.machinery
+import importlib.metadata
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -29,6 +29,7 @@ _STRATEGIES = {
 _OPERATIONS = "gsplat_core.training.strategies.operations"
 _DYNAMIC = "gsplat_core.contrib.dynamic"
 _SURGICAL = "gsplat_core.contrib.surgical"
+_TRAINER = "gsplat_core.contrib.trainer"
 _DISTRIBUTED = "gsplat_core.rendering.distributed"
 _CUDA = {
     "FThetaCameraDistortionParameters": "gsplat_core.scene.distortion",
@@ -57,6 +58,26 @@ _RENDERING = {
     "rasterization_inria_wrapper": "gsplat_core.rendering.rasterizer",
 }
 
+_ROW_OPERATIONS = {
+    "_multinomial_sample": _FUNCTIONS,
+    "_update_param_with_optimizer": f"{_OPERATIONS}:update_rows",
+    "compute_relocation": _OPERATIONS,
+    "duplicate": _OPERATIONS,
+    "inject_noise_to_position": _OPERATIONS,
+    "normalized_quat_to_rotmat": _FUNCTIONS,
+    "relocate": _OPERATIONS,
+    "remove": _OPERATIONS,
+    "reset_opa": _OPERATIONS,
+    "sample_add": _OPERATIONS,
+    "split": _OPERATIONS,
+}
+_COLLECTIVES = {
+    "all_gather_int32": _DISTRIBUTED,
+    "all_gather_tensor_list": _DISTRIBUTED,
+    "all_to_all_int32": _DISTRIBUTED,
+    "all_to_all_tensor_list": _DISTRIBUTED,
+}
+
 MODULES: Mapping[str, Mapping[str, str]] = {
     "gsplat": {
         **_CUDA,
@@ -70,6 +91,7 @@ MODULES: Mapping[str, Mapping[str, str]] = {
         "export_splats": "gsplat_core.io.exports.export",
     },
     "gsplat._helper": {"load_test_data": "gsplat_core.as_gsplat.functions"},
+    "gsplat.color_correct": {"color_correct_affine": _TRAINER, "color_correct_quadratic": _TRAINER},
     "gsplat.compression": {"PngCompression": "gsplat_core.io.png_compression"},
     "gsplat.compression.png_compression": {"PngCompression": "gsplat_core.io.png_compression"},
     "gsplat.contrib": {},
@@ -115,20 +137,27 @@ MODULES: Mapping[str, Mapping[str, str]] = {
         "accumulate_2dgs": "gsplat_core.ops.surfel_blending",
     },
     "gsplat.cuda._wrapper": {**_CUDA, "CameraModel": "gsplat_core.scene.cameras"},
-    "gsplat.distributed": {
-        "all_gather_int32": _DISTRIBUTED,
-        "all_gather_tensor_list": _DISTRIBUTED,
-        "all_to_all_int32": _DISTRIBUTED,
-        "all_to_all_tensor_list": _DISTRIBUTED,
-        "cli": _DISTRIBUTED,
+    "gsplat.distributed": {**_COLLECTIVES, "cli": _DISTRIBUTED},
+    "gsplat.exporter": {
+        "export_splats": "gsplat_core.io.exports.export",
+        "load_ply_to_splats": _FUNCTIONS,
+        "sh2rgb": _FUNCTIONS,
+        "splat2ply_bytes": _FUNCTIONS,
+        "splat2splat_bytes": _FUNCTIONS,
     },
-    "gsplat.exporter": {"export_splats": "gsplat_core.io.exports.export"},
     "gsplat.init_utils": {"knn_scale_init": _SURGICAL, "multi_frame_depth_unprojection": _SURGICAL},
     "gsplat.losses": {
         "binocular_disparity_l1": _SURGICAL,
+        "depth_l1_loss": _TRAINER,
+        "l1_loss": _TRAINER,
         "masked_l1": _SURGICAL,
         "masked_ssim": _SURGICAL,
+        "mse_loss": _TRAINER,
+        "opacity_reg_loss": _TRAINER,
         "pearson_depth_loss": _SURGICAL,
+        "scale_reg_loss": _TRAINER,
+        "ssim_loss": _TRAINER,
+        "total_variation_loss": _TRAINER,
     },
     "gsplat.optimizers": {"SelectiveAdam": "gsplat_core.training.steps.optimiser"},
     "gsplat.optimizers.selective_adam": {"SelectiveAdam": "gsplat_core.training.steps.optimiser"},
@@ -137,26 +166,18 @@ MODULES: Mapping[str, Mapping[str, str]] = {
     "gsplat.rendering": {
         **_RENDERING,
         **_CUDA,
+        **_COLLECTIVES,
+        "depth_to_normal": "gsplat_core.rendering.depth_maps",
+        "get_projection_matrix": _FUNCTIONS,
         "RasterizeMode": "gsplat_core.rendering.settings",
         "RenderMode": "gsplat_core.rendering.settings",
         "_rasterization": _PLAIN,
     },
     "gsplat.strategy": _STRATEGIES,
     "gsplat.strategy.base": {"Strategy": _STRATEGIES["Strategy"]},
-    "gsplat.strategy.default": {"DefaultStrategy": _STRATEGIES["DefaultStrategy"]},
-    "gsplat.strategy.mcmc": {"MCMCStrategy": _STRATEGIES["MCMCStrategy"]},
-    "gsplat.strategy.ops": {
-        "_multinomial_sample": _FUNCTIONS,
-        "_update_param_with_optimizer": f"{_OPERATIONS}:update_rows",
-        "compute_relocation": "gsplat_core.training.strategies.operations",
-        "duplicate": _OPERATIONS,
-        "inject_noise_to_position": _OPERATIONS,
-        "relocate": _OPERATIONS,
-        "remove": _OPERATIONS,
-        "reset_opa": _OPERATIONS,
-        "sample_add": _OPERATIONS,
-        "split": _OPERATIONS,
-    },
+    "gsplat.strategy.default": {**_STRATEGIES, **_ROW_OPERATIONS},
+    "gsplat.strategy.mcmc": {**_STRATEGIES, **_ROW_OPERATIONS},
+    "gsplat.strategy.ops": _ROW_OPERATIONS,
     "gsplat.training": {"TwoStageScheduleStep": _SURGICAL, "TwoStageScheduler": _SURGICAL},
     "gsplat.utils": {
         "depth_to_normal": "gsplat_core.rendering.depth_maps",
@@ -235,6 +256,44 @@ def _with_options(value: Any, options: Mapping[str, Any] | None) -> Any:
     return value if options is None else _bound(value, tuple(options.items()))
 
 
+_EXTENSION = "gsplat.csrc"
+"""Compiled extension of gsplat, whose presence programs test."""
+_OF_0_1 = (
+    "_torch_impl", "cuda_legacy", "nd_rasterize", "project_gaussians", "rasterize", "rasterize_gaussians", "sh",
+)  # fmt: skip
+"""Modules and functions of gsplat 0.1 that 1.5.3 does not have."""
+
+
+def _absent(fullname: str) -> ModuleNotFoundError:
+    """Return the error about a module of gsplat, or a name in one, that this package does not serve.
+
+    The error does not carry the name of the module, because `from gsplat import name` would then replace its message.
+    """
+    parent, _, name = fullname.rpartition(".")
+    if fullname.split(".")[1] in _OF_0_1:
+        advice = (
+            "it belongs to gsplat 0.1, and this package has the functions of 1.5.3; use gsplat.rasterization, or"
+            " gsplat.fully_fused_projection, isect_tiles and rasterize_to_pixels"
+        )
+    else:
+        known = parent if parent in MODULES else "gsplat"
+        children = [each.rpartition(".")[2] for each in MODULES if each.rpartition(".")[0] == known]
+        advice = f"{known} has {', '.join(sorted([*MODULES[known], *children]))}"
+    return ModuleNotFoundError(f"no module or name {name!r} in {parent} of gsplat_core: {advice}")
+
+
+class _Distribution(importlib.metadata.Distribution):
+    """Metadata of the package `gsplat` for programs that ask for its version."""
+
+    def read_text(self, filename: str) -> str | None:
+        """Return the content of METADATA; None for other files."""
+        return f"Metadata-Version: 2.1\nName: gsplat\nVersion: {VERSION}\n" if filename == "METADATA" else None
+
+    def locate_file(self, path: Any) -> Any:
+        """Return the path of a file in the folder of this module."""
+        return Path(__file__).parent / path
+
+
 class Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
     """Import hook that finds the modules of `MODULES` before any installed gsplat."""
 
@@ -244,12 +303,26 @@ class Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> importlib.machinery.ModuleSpec | None:
-        """Return the specification of a module of `MODULES`; None for others."""
+        """Return the specification of a module of `MODULES`; None for other packages.
+
+        Raises:
+            ModuleNotFoundError: for another module of gsplat.
+        """
         if fullname not in MODULES:
+            if fullname.startswith("gsplat.") and fullname != _EXTENSION:
+                raise _absent(fullname)
             return None
-        return importlib.machinery.ModuleSpec(
-            fullname, self, is_package=any(each.startswith(f"{fullname}.") for each in MODULES)
-        )
+        # `from gsplat.exporter import name` asks this finder about missing names of packages only, so all modules are such.
+        spec = importlib.machinery.ModuleSpec(fullname, self, origin=__file__, is_package=True)
+        spec.has_location = True  # gives the module its `__file__`
+        return spec
+
+    def find_distributions(
+        self, context: importlib.metadata.DistributionFinder.Context | None = None
+    ) -> Iterator[importlib.metadata.Distribution]:
+        """Yield the metadata of gsplat if they are asked for by name."""
+        if context is not None and context.name == "gsplat":
+            yield _Distribution()
 
     def create_module(self, spec: importlib.machinery.ModuleSpec) -> ModuleType:
         """Create the module object without importing the modules that define its attributes."""

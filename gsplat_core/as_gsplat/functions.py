@@ -1,4 +1,4 @@
-"""Small functions of `gsplat.utils` in plain torch, the scene of gsplat's tests and profiles, and a stand-in for gsplat's compiled extension."""
+"""Small functions of `gsplat.utils` and `gsplat.exporter`, the scene of gsplat's tests and profiles, and a stand-in for gsplat's compiled extension."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.io.exports.export import export_splats
+from gsplat_core.io.ply import load_ply
 from gsplat_core.ops.arguments import require_trailing
 from gsplat_core.scene.gaussians import SH_C0
 from gsplat_core.training.strategies.operations import draw
@@ -79,6 +80,45 @@ def save_ply(splats: Mapping[str, Tensor], dir: str, colors: Tensor | None = Non
     export_splats(
         splats["means"], splats["scales"], splats["quats"], splats["opacities"], sh0, shN, format="ply", save_to=dir
     )
+
+
+def sh2rgb(sh: Tensor) -> Tensor:
+    """Return the colours of coefficients of the constant spherical harmonic, in the same shape; not clamped to 0 to 1."""
+    return sh * SH_C0 + 0.5
+
+
+def load_ply_to_splats(path: str | Path) -> dict[str, Tensor]:
+    """Read a `.ply` file, on the CPU: means [N, 3], scales [N, 3] (logarithms), quats [N, 4], opacities [N] (logits), sh0
+    [N, 1, 3] and shN [N, K, 3].
+
+    Raises:
+        BundleError: if the file is missing or damaged.
+    """
+    read = load_ply(path)
+    return {
+        "means": read.means, "scales": read.log_scales, "quats": read.quats, "opacities": read.logit_opacities,
+        "sh0": read.sh[:, :1], "shN": read.sh[:, 1:],
+    }  # fmt: skip
+
+
+def splat2ply_bytes(means: Tensor, scales: Tensor, quats: Tensor, opacities: Tensor, sh0: Tensor, shN: Tensor) -> bytes:
+    """Return the bytes of a `.ply` file.
+
+    Args:
+        means: positions [N, 3].
+        scales: logarithms [N, 3].
+        quats: rotations wxyz [N, 4].
+        opacities: logits [N].
+        sh0: coefficients [N, 3] of the constant spherical harmonic.
+        shN: further coefficients [N, 3 K], all of red first, then of green, then of blue.
+    """
+    further = shN.reshape(len(shN), 3, shN.shape[1] // 3).mT
+    return export_splats(means, scales, quats, opacities, sh0[:, None], further, format="ply")
+
+
+def splat2splat_bytes(means: Tensor, scales: Tensor, quats: Tensor, opacities: Tensor, sh0: Tensor) -> bytes:
+    """Return the bytes of a `.splat` file. Arguments are those of `splat2ply_bytes`."""
+    return export_splats(means, scales, quats, opacities, sh0[:, None], sh0.new_zeros(len(sh0), 0, 3), format="splat")
 
 
 def _multinomial_sample(weights: Tensor, n: int, replacement: bool = True) -> Tensor:

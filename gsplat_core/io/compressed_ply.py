@@ -209,6 +209,8 @@ def _packed_rotation(quats: NDArray[np.float32]) -> NDArray[np.uint32]:
 
 def morton_order(means: NDArray[np.float32]) -> NDArray[np.int64]:
     """Return the order of points along a Z-curve with 21 bits per axis; neighbours in it are close in space."""
+    if not len(means):
+        return np.zeros(0, np.int64)
     low, high = means.min(0).astype(np.float64), means.max(0).astype(np.float64)
     cells = (means - low) / np.where(high > low, high - low, 1.0) * (2**21 - 1)
     code = np.zeros(len(means), np.uint64)

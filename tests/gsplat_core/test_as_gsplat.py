@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import importlib
+import importlib.metadata
+import importlib.util
 import subprocess
 import sys
+from pathlib import Path
 from types import ModuleType
 
 import pytest
@@ -93,8 +96,64 @@ def test_an_unknown_name_is_reported_with_those_that_exist(installed):
     module = importlib.import_module("gsplat.exporter")
     with pytest.raises(AttributeError, match=r"no attribute 'export_gltf'.*export_splats"):
         module.export_gltf  # noqa: B018
-    with pytest.raises(ImportError):
+    with pytest.raises(ImportError, match=r"'sensors' in gsplat of gsplat_core: gsplat has .*rasterization.*strategy"):
         importlib.import_module("gsplat.sensors")
+    with pytest.raises(ImportError, match=r"'export_gltf' in gsplat\.exporter of gsplat_core.*export_splats"):
+        exec("from gsplat.exporter import export_gltf")
+    with pytest.raises(ImportError, match=r"gsplat 0\.1, .*use gsplat\.rasterization"):
+        exec("from gsplat.project_gaussians import project_gaussians")
+    with pytest.raises(ImportError, match=r"gsplat 0\.1, .*use gsplat\.rasterization"):
+        exec("from gsplat import rasterize_gaussians")
+    assert not hasattr(importlib.import_module("gsplat"), "rasterize_gaussians")
+
+
+def test_programs_that_ask_for_version_file_and_extension_get_answers(installed):
+    module = importlib.import_module("gsplat")
+    assert importlib.metadata.version("gsplat") == module.__version__
+    assert Path(module.__file__).is_file()
+    assert importlib.util.find_spec("gsplat.csrc") is None
+    importlib.reload(module)
+    assert module.rasterization is gsplat_core.rasterization
+
+
+def test_names_that_gsplats_own_modules_import_are_found_in_them(installed):
+    """Programs import some names from modules that only import them."""
+    default = importlib.import_module("gsplat.strategy.default")
+    assert default.remove is importlib.import_module("gsplat.strategy.ops").remove
+    assert importlib.import_module("gsplat.rendering").depth_to_normal is depth_to_normal
+
+
+def test_a_ply_file_is_read_back_as_splats(tmp_path):
+    random = torch.Generator().manual_seed(0)
+    draw = lambda *shape: torch.randn(*shape, generator=random)
+    splats = {
+        "means": draw(5, 3), "scales": draw(5, 3), "quats": draw(5, 4), "opacities": draw(5), "sh0": draw(5, 1, 3),
+        "shN": draw(5, 8, 3),
+    }  # fmt: skip
+    gsplat_core.export_splats(**splats, save_to=tmp_path / "a.ply")
+    read = utils.load_ply_to_splats(tmp_path / "a.ply")
+    assert set(read) == set(splats)
+    for name, tensor in splats.items():
+        torch.testing.assert_close(read[name], tensor)
+    flat = {**splats, "sh0": splats["sh0"][:, 0], "shN": splats["shN"].mT.reshape(5, 24)}
+    assert utils.splat2ply_bytes(**flat) == (tmp_path / "a.ply").read_bytes()
+    flat.pop("shN")
+    assert utils.splat2splat_bytes(**flat) == gsplat_core.export_splats(**splats, format="splat")
+    assert utils.sh2rgb(torch.zeros(2, 3)).tolist() == [[0.5] * 3] * 2
+
+
+@pytest.mark.parametrize("kind", ["ply", "splat", "ply_compressed"])
+@pytest.mark.parametrize("count", [0, 2])
+def test_a_scene_without_visible_gaussians_is_written_as_an_empty_file(tmp_path, kind, count):
+    """`count` Gaussians have no finite position."""
+    empty = {
+        "means": torch.full((count, 3), torch.nan), "scales": torch.zeros(count, 3), "quats": torch.ones(count, 4),
+        "opacities": torch.zeros(count), "sh0": torch.zeros(count, 1, 3), "shN": torch.zeros(count, 3, 3),
+    }  # fmt: skip
+    written = gsplat_core.export_splats(**empty, format=kind, save_to=tmp_path / "a.ply")
+    assert written == b"" if kind == "splat" else b"element vertex 0\n" in written
+    if kind == "ply":
+        assert utils.load_ply_to_splats(tmp_path / "a.ply")["means"].shape == (0, 3)
 
 
 def test_another_gsplat_that_is_loaded_already_is_not_replaced(monkeypatch):

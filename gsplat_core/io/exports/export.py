@@ -183,13 +183,14 @@ def export_splats(
     if format not in get_args(SplatFormat):
         raise InvalidInput(f"unknown format {format!r}; the formats are {', '.join(get_args(SplatFormat))}")
     count = means.shape[0]
+    require_shape("opacities", opacities, (count,), "[N]")
     require_shape("sh0", sh0, (count, 1, 3), "[N, 1, 3]")
     if shN.dim() != 3 or shN.shape[0] != count or shN.shape[2] != 3:
         raise InvalidInput(f"shN must be [N, K, 3] with N = {count}, got {list(shN.shape)}")
     gaussians = Gaussians(means, quats, scales, opacities, torch.cat([sh0, shN], 1)).detach().to("cpu", torch.float32)
     kept = torch.ones(count, dtype=torch.bool)
     for tensor in gaussians.tensors().values():
-        kept &= tensor.reshape(count, -1).isfinite().all(1)
+        kept &= tensor.isfinite().flatten(1).all(1) if tensor.dim() > 1 else tensor.isfinite()
     if format == "ply_compressed":
         kept &= gaussians.opacities > LEAST_OPACITY
     gaussians = gaussians.select(kept)
