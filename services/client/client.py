@@ -10,7 +10,7 @@ from typing import Any
 import httpx2
 from pydantic import TypeAdapter, ValidationError
 
-from services.client.requests import Picture, Requests, pictures, refused_by, waited_for
+from services.client.requests import Picture, Requests, check_origin, pictures, refused_by, waited_for
 from services.errors import ClientError
 from services.schemas import (
     AuditPage,
@@ -441,6 +441,7 @@ class Client(ReplayMethods, SnapshotMethods):
                 if not answer.is_success:
                     answer.read()
                     raise refused_by(answer, self.url)
+                check_origin(answer, self.url)
                 yield from answer.iter_lines()
         except httpx2.HTTPError as error:
             raise self._unreachable(error) from error

@@ -157,9 +157,10 @@ class Requests:
         except (httpx2.InvalidURL, ValueError) as error:
             raise ClientError(f"the request cannot be sent: {error}; check the names and values in it") from error
         whole = _with_body(answer, content)
-        if whole.is_success:
-            return whole
-        raise refused_by(whole, self.url)
+        if not whole.is_success:
+            raise refused_by(whole, self.url)
+        check_origin(answer, self.url)
+        return whole
 
     def _put_file(self, path: str, file: Path, **options: Any) -> Any:
         """Send a file as the body, with its digest.
@@ -198,6 +199,7 @@ class Requests:
             ):
                 if not answer.is_success:
                     raise refused_by(_with_body(answer, _read_some(answer)), self.url)
+                check_origin(answer, self.url)
                 sha256 = hashlib.sha256()
                 for piece in answer.iter_bytes(CHUNK_BYTES):
                     partial.file.write(piece)
@@ -271,6 +273,17 @@ def _read_some(answer: httpx2.Response) -> bytes:
         if len(content) > MOST_PROBLEM_BYTES:
             break
     return bytes(content[:MOST_PROBLEM_BYTES])
+
+
+def check_origin(answer: httpx2.Response, url: str) -> None:
+    """Check that a successful answer is from an IntraSplat server, which numbers all its answers, and not a page of a proxy
+    that wants a sign-in, for example.
+
+    Raises:
+        ClientError: if the answer has no request id.
+    """
+    if "x-request-id" not in answer.headers:
+        raise not_from_us(url, "has no X-Request-ID")
 
 
 def _check_whole(answer: httpx2.Response, digest: bytes, size: int, name: str) -> None:

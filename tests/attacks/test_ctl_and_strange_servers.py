@@ -65,7 +65,12 @@ def ctl(server, *arguments):
 
 
 def sized(body: bytes, **headers: str):
-    return {"Content-Length": str(len(body)), **{name.replace("_", "-"): value for name, value in headers.items()}}
+    """Return headers of an answer with a body, with the request id of a server of ours."""
+    return {
+        "Content-Length": str(len(body)),
+        "X-Request-ID": "0",
+        **{name.replace("_", "-"): value for name, value in headers.items()},
+    }
 
 
 BOMB = zlib.compress(bytes(80 << 20), 9)
@@ -242,13 +247,32 @@ def test_a_download_replaces_an_earlier_one_on_request_alone(server, tmp_path):
     assert ctl(server, *DOWNLOADS["result"](str(file)), "--overwrite") == OK
 
 
+SILENT = {
+    "render": lambda file: ["render", "liver", "1", file],
+    "audit": lambda file: ["audit", "--format", "csv"],
+    "camera": lambda file: ["camera", "s"],
+    "delete": lambda file: ["delete", "stream", "s", "--yes"],
+}
+
+
+@pytest.mark.parametrize("status", [200, 204])
+@pytest.mark.parametrize("command", SILENT)
+def test_an_answer_of_another_server_is_no_success(server, capsys, tmp_path, command, status):
+    """Such as the sign-in page of a proxy. These commands read nothing in the answer that would tell."""
+    body = b"<html>sign in</html>" if status == 200 else b""
+    server.answer = status, {"Content-Length": str(len(body))}, body
+    assert ctl(server, *SILENT[command](str(tmp_path / "x.png"))) == BAD_INPUT
+    assert list(tmp_path.iterdir()) == []
+    assert _is_one_sentence(capsys)
+
+
 @pytest.mark.parametrize(
     "headers",
     [
-        {"Content-Length": "100"},
-        {"Content-Digest": "sha-256=:AAAA:", "Content-Length": "3"},
-        {},
-        {"Transfer-Encoding": "chunked"},
+        {"Content-Length": "100", "X-Request-ID": "0"},
+        {"Content-Digest": "sha-256=:AAAA:", "Content-Length": "3", "X-Request-ID": "0"},
+        {"X-Request-ID": "0"},
+        {"Transfer-Encoding": "chunked", "X-Request-ID": "0"},
     ],
     ids=str,
 )

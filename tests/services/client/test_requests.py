@@ -39,6 +39,7 @@ class Client(Requests):
             request.read()
             if isinstance(answer, Exception):
                 raise answer
+            answer.headers["X-Request-ID"] = "0"
             return answer
 
         self._http = httpx2.Client(
