@@ -21,6 +21,7 @@ from services.api.json_body import JsonRequest
 from services.api.middleware import BoundedBody, refuse_by_length
 from services.api.problems import Forbidden, Problem, TooManyRequests, Unauthenticated, Unprocessable, WrongContent
 from services.api.state import ControlState, control_of
+from services.audit import AuditUnwritable
 from services.audit.files import Detail, Outcome
 from services.auth.roles import ANYBODY, Caller, Role
 
@@ -277,7 +278,7 @@ async def recorded(
         The detail of the entry.
 
     Raises:
-        AuditUnwritable: if the entry cannot be written, although the change may already be made.
+        AuditUnwritable: if the entry cannot be written. The message says so if the change was made.
     """
     said: Detail = dict(detail or {})
     outcome: Outcome = "failed"
@@ -289,7 +290,14 @@ async def recorded(
         said["error"] = type(error).__name__
         raise
     finally:
-        await _write(request, caller, event, subject, outcome, said)
+        try:
+            await _write(request, caller, event, subject, outcome, said)
+        except AuditUnwritable as error:
+            if outcome != "done":
+                raise
+            raise AuditUnwritable(
+                f"the request was carried out, but its audit entry could not be written: {error}"
+            ) from error
 
 
 async def _write(request: Request, caller: Caller, event: str, subject: str, outcome: Outcome, detail: Detail) -> None:

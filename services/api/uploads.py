@@ -143,5 +143,5 @@ def _check_space(folder: Path, wanted_bytes: int) -> None:
     free = shutil.disk_usage(folder).free
     if free < wanted_bytes + SPARE_BYTES:
         raise NoSpace(
-            f"{free // 2**20} MiB are free and {SPARE_BYTES // 2**20} MiB must stay so; delete versions that are not needed"
+            f"{free // 2**20} MiB are free and {SPARE_BYTES // 2**20} MiB must stay so; delete recordings, replays or versions that are not needed"
         )

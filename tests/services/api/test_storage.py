@@ -40,6 +40,7 @@ def test_a_change_is_refused_while_the_audit_log_cannot_be_written(plane, full_d
     full_disk(True)
     answer = plane.ask("POST", "/v1/streams", json=WANTED)
     assert answer.status_code == 503 and "No space left on device" in answer.json()["detail"]
+    assert "was carried out, but its audit entry could not be written" in answer.json()["detail"]
     ready = plane.client.get("/readyz?verbose")
     assert (ready.status_code, ready.json()["status"]) == (503, "not ready")
     assert "No space left on device" in ready.json()["checks"]["audit"]["detail"]
