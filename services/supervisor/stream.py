@@ -277,10 +277,8 @@ class SupervisedStreams:
         Raises:
             NotFound: if the stream does not exist.
         """
-        stream = self._stream(name)
-        async with stream.changing:
-            self._launcher.open()  # not before the first stream, because preloaded modules take memory
-            await stream.start()
+        async with self._changing(name) as stream:
+            await self._start(stream)
         return stream.view()
 
     async def stop(self, name: str) -> StreamView:
@@ -289,8 +287,8 @@ class SupervisedStreams:
         Raises:
             NotFound: if the stream does not exist.
         """
-        stream = self._stream(name)
-        await self._stop(stream, "it was requested")
+        async with self._changing(name) as stream:
+            await stream.stop("it was requested")
         return stream.view()
 
     async def set_options(self, name: str, options: Mapping[str, Any]) -> StreamView:
@@ -300,13 +298,15 @@ class SupervisedStreams:
             NotFound: if the stream does not exist.
             Rejected: if an option is not valid.
         """
-        stream = self._stream(name)
-        settings = stream.settings.model_copy(update={"options": {**stream.settings.options, **options}})
-        specs = self._specs(name, settings)
-        runs = stream.hub is not None
-        await self._stop(stream, "its options change")
-        stream.settings, stream.specs = settings, specs
-        return await self.start(name) if runs else stream.view()
+        async with self._changing(name) as stream:
+            settings = stream.settings.model_copy(update={"options": {**stream.settings.options, **options}})
+            specs = self._specs(name, settings)
+            runs = stream.hub is not None
+            await stream.stop("its options change")
+            stream.settings, stream.specs = settings, specs
+            if runs:
+                await self._start(stream)
+        return stream.view()
 
     async def delete(self, name: str) -> None:
         """Stop and delete a stream.
@@ -314,8 +314,9 @@ class SupervisedStreams:
         Raises:
             NotFound: if the stream does not exist.
         """
-        await self._stop(self._stream(name), "it is deleted")
-        self._streams.pop(name, None)
+        async with self._changing(name) as stream:
+            await stream.stop("it is deleted")
+            del self._streams[name]
 
     async def set_camera(self, name: str, camera: Mapping[str, float]) -> Mapping[str, float]:
         """Set the stream's virtual camera and return its resulting position.
@@ -364,8 +365,29 @@ class SupervisedStreams:
         async with hub.subscribe(kind, quality) as viewer:
             yield viewer
 
+    def _is_missing(self) -> NotFound:
+        return NotFound("there is no stream with this name; GET /v1/streams lists them")
+
     def _is_stopped(self, name: str) -> Conflict:
         return Conflict(f"the stream {name} is stopped; start it first")
+
+    @asynccontextmanager
+    async def _changing(self, name: str) -> AsyncIterator[Stream]:
+        """Hold the lock of a stream for a change.
+
+        Raises:
+            NotFound: if the stream does not exist, or was deleted while this call waited for the lock. Its processes must not
+                be started then, because nothing would stop them.
+        """
+        stream = self._stream(name)
+        async with stream.changing:
+            if self._streams.get(name) is not stream:
+                raise self._is_missing()
+            yield stream
+
+    async def _start(self, stream: Stream) -> None:
+        self._launcher.open()  # not before the first stream, because preloaded modules take memory
+        await stream.start()
 
     async def _stop(self, stream: Stream, reason: str) -> None:
         async with stream.changing:
@@ -373,7 +395,7 @@ class SupervisedStreams:
 
     def _stream(self, name: str) -> Stream:
         if name not in self._streams:
-            raise NotFound("there is no stream with this name; GET /v1/streams lists them")
+            raise self._is_missing()
         return self._streams[name]
 
     def _specs(self, name: str, settings: StreamSettings) -> dict[Role, ProcessSpec]:

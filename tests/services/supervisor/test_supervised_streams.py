@@ -141,6 +141,50 @@ def test_a_launcher_is_there_before_the_first_stream_starts(streams, processes, 
     asyncio.run(run())
 
 
+class SlowProcess(Process):
+    """A process whose end lets other tasks run."""
+
+    async def close(self, reason):
+        for _ in range(5):
+            await asyncio.sleep(0)
+        await super().close(reason)
+
+
+@pytest.fixture
+def slow(processes, monkeypatch):
+    monkeypatch.setattr(stream_module, "ManagedProcess", SlowProcess)
+    monkeypatch.setattr(stream_module.Stream, "view", lambda self: self.settings)
+    return processes
+
+
+@pytest.mark.parametrize("late", ["start", "set_options", "stop", "delete"])
+def test_a_stream_that_is_deleted_meanwhile_is_not_started_again(streams, slow, late):
+    """Nothing would stop its processes: the API has forgotten it."""
+
+    async def run():
+        streams.create("theatre-1", stream())
+        await streams.start("theatre-1")
+        arguments = [{"scale": 0.5}] if late == "set_options" else []
+        results = await asyncio.gather(
+            streams.delete("theatre-1"), getattr(streams, late)("theatre-1", *arguments), return_exceptions=True
+        )
+        assert results[0] is None and isinstance(results[1], NotFound)
+
+    asyncio.run(run())
+    started = [process for process in slow if process != "launcher"]
+    assert len(started) == 2 and all(process.closed for process in started)
+
+
+def test_options_that_are_set_at_the_same_time_are_all_kept(streams, slow):
+    async def run():
+        streams.create("theatre-1", stream())
+        await streams.start("theatre-1")
+        await asyncio.gather(*(streams.set_options("theatre-1", {n: v}) for n, v in (("scale", 0.5), ("loop", False))))
+        assert streams._stream("theatre-1").settings.options == {"scale": 0.5, "loop": False}
+
+    asyncio.run(run())
+
+
 def test_streams_of_the_settings_are_made_and_those_that_say_so_started(streams, processes, monkeypatch):
     closed, removed = [], []
 
