@@ -57,10 +57,13 @@ def load_splat(path: Path) -> Gaussians:
         def take(first: int, rows: NDArray[np.void]) -> None:
             part = slice(first, first + len(rows))
             for name in ("position", "scale"):
-                bad = int(np.count_nonzero(~np.isfinite(rows[name])))
-                if bad or (name == "scale" and (rows[name] < 0).any()):
+                is_wrong = ~np.isfinite(rows[name])
+                if name == "scale":
+                    is_wrong |= rows[name] < 0
+                if is_wrong.any():
                     raise BundleCorrupt(
-                        f"{path}: {bad} values of {name} are NaN or infinite, or scales are negative; it is no .splat file"
+                        f"{path}: {int(is_wrong.sum())} values of {name} are NaN, infinite or negative (first:"
+                        f" {rows[name][is_wrong][0]:g}); it is no .splat file"
                     )
             means[part], log_scales[part] = rows["position"], np.log(np.maximum(rows["scale"], 1e-20))
             quats[part] = (rows["rotation"].astype(np.float32) - 128) / 128
@@ -111,6 +114,15 @@ def static_model(gaussians: Gaussians, path: Path) -> Model:
     """
     if gaussians.count == 0:
         raise BundleCorrupt(f"{path} holds no Gaussians; there is nothing to show")
+    if (wrong := wrong_extent(gaussians)) is not None:
+        raise BundleCorrupt(f"{path} {wrong}; export it in another unit")
+    return Model(1, gaussians, None, _camera_for(gaussians), WINDOW_S)
+
+
+def wrong_extent(gaussians: Gaussians) -> str | None:
+    """Return why Gaussians are too far away, too large or too close together to be shown, as a predicate; None if they
+    can be shown.
+    """
     for name, values, most in (
         ("position", gaussians.means, MOST_COORDINATE),
         ("scale", gaussians.log_scales, MOST_LOG_SCALE),
@@ -118,24 +130,24 @@ def static_model(gaussians: Gaussians, path: Path) -> Model:
         found = float(values.max() if name == "scale" else max(values.max(), -values.min()))
         if found > most:
             shown = f"exp({found:.3g})" if name == "scale" else f"{found:.3g}"
-            raise BundleCorrupt(f"{path} holds a {name} of {shown}, beyond what can be shown; export it again")
-    return Model(1, gaussians, None, _camera_for(gaussians, path), WINDOW_S)
+            return f"holds a {name} of {shown}, beyond what can be shown"
+    _, radius = _sphere_of(gaussians)
+    return f"is {2 * radius:.3g} across, too small to be shown" if radius < LEAST_RADIUS else None
 
 
-def _camera_for(gaussians: Gaussians, path: Path) -> Camera:
-    """Return a camera that looks along z at all Gaussians except outliers.
-
-    Raises:
-        BundleCorrupt: if the scene is too small for the camera's near plane.
-    """
+def _sphere_of(gaussians: Gaussians) -> tuple[NDArray[np.float64], float]:
+    """Return centre and radius of a sphere around all Gaussians except outliers."""
     every = slice(None, None, -(-gaussians.count // MOST_PLACED))
     means: NDArray[np.float64] = gaussians.means[every].numpy().astype(np.float64)
     centre = np.median(means, axis=0)
     radius = float(np.quantile(np.linalg.norm(means - centre, axis=1), SHOWN_SHARE))
     size = float(np.exp(np.median(gaussians.log_scales[every].numpy().astype(np.float64))))
-    radius = max(radius, 3 * size)
-    if radius < LEAST_RADIUS:
-        raise BundleCorrupt(f"{path} is {2 * radius:.3g} across, too small to be shown; export it in a smaller unit")
+    return centre, max(radius, 3 * size)
+
+
+def _camera_for(gaussians: Gaussians) -> Camera:
+    """Return a camera that looks along z at all Gaussians except outliers."""
+    centre, radius = _sphere_of(gaussians)
     pose = np.eye(4)
     pose[:3, 3] = -centre + [0, 0, 2 * radius / FIELD_OF_VIEW]
     return Camera.from_focal(HEIGHT_PX / FIELD_OF_VIEW, WIDTH_PX, HEIGHT_PX).with_pose(pose)

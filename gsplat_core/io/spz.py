@@ -185,6 +185,8 @@ def _load_version_4(file: BinaryIO, path: Path, size: int) -> Gaussians:
             f"{path} has {size} bytes, fewer than the header of .spz; the file was cut short, copy it again"
         )
     _, version, count, degree, fraction, _, streams, table = HEADER_4.unpack(header)
+    if version in VERSIONS:
+        raise BundleCorrupt(f"{path} is a .spz file of version {version} that is not compressed; compress it with gzip")
     if version != ZSTD_VERSION:
         raise BundleCorrupt(f"{path} is a .spz file of version {version}; versions 2 to 4 are read, so convert it")
     _check_header(path, degree, fraction)

@@ -48,7 +48,11 @@ def read_surface(path: Path) -> TriangleMesh:
         raise InvalidSetting(f"cannot read {path}: {error.strerror or error}") from error
     try:
         vertices, triangles = reader(data)
-    except (ValueError, IndexError, KeyError, OverflowError, TypeError, MemoryError) as error:
+    except OverflowError as error:
+        raise InvalidSetting(
+            f"{path} is no plain {path.suffix.lower()} mesh: it holds a number that is too large"
+        ) from error
+    except (ValueError, IndexError, KeyError, TypeError, MemoryError) as error:
         raise InvalidSetting(f"{path} is no plain {path.suffix.lower()} mesh: {error!s:.120}") from error
     if not len(vertices):
         raise InvalidSetting(f"{path} has no vertices")
@@ -75,6 +79,8 @@ def _read_obj(data: bytes) -> TriangleMesh:
     for line in data.decode("utf-8", "replace").splitlines():
         parts = line.split()
         if parts and parts[0] == "v":
+            if len(parts) < 4:
+                raise ValueError(f"the vertex {line.strip()!r:.60} has fewer than three coordinates")
             vertices.append([float(value) for value in parts[1:4]])
         elif parts and parts[0] == "f":
             # OBJ indices count from 1, or if negative backwards from the newest vertex.
@@ -88,6 +94,8 @@ def _read_stl(data: bytes) -> TriangleMesh:
     if len(data) == 84 + count * STL_ROW.itemsize:
         corners = np.frombuffer(data, STL_ROW, count, 84)["corners"].astype(np.float64).reshape(-1, 3)
     else:
+        if not data.isascii():
+            raise ValueError(f"it has {len(data)} bytes, and {84 + max(count, 0) * STL_ROW.itemsize} by its header")
         words = data.decode("ascii").split()
         at = [k for k, word in enumerate(words) if word == "vertex"]
         corners = np.array([[float(word) for word in words[k + 1 : k + 4]] for k in at], np.float64).reshape(-1, 3)
@@ -168,10 +176,14 @@ class _BinaryPly:
         length, item = np.dtype(SCALAR_TYPES[length_type]), np.dtype(SCALAR_TYPES[item_type])
         found = []
         for _ in range(count):
+            if self._at + length.itemsize > len(self._body):
+                raise ValueError("it was cut short")
             (corners,) = np.frombuffer(self._body, length, 1, self._at)
             self._at += length.itemsize
             if corners < 0:
                 raise ValueError(f"a list has {corners} items")
+            if self._at + item.itemsize * int(corners) > len(self._body):
+                raise ValueError("it was cut short")
             found.append(np.frombuffer(self._body, item, int(corners), self._at).tolist())
             self._at += item.itemsize * int(corners)
         return found

@@ -384,7 +384,7 @@ def write_video(images: Iterator[NDArray], out: Path, size_px: tuple[int, int], 
                 for image in images:
                     video.write(image)
         except UserError:
-            if video.frames and not replaces:
+            if partial.path.stat().st_size and not replaces:
                 partial.finish()
             raise
         if not video.frames:

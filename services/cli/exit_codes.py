@@ -86,6 +86,10 @@ def _of_the_machine(error: BaseException, arguments: Iterable[str]) -> str | Non
     if _is_out_of_memory(error):
         said = str(error).strip().splitlines() or ["an allocation failed"]
         return f"there is not enough memory ({said[0][:200]}); free some, or give a smaller --scale or fewer frames"
+    if isinstance(error, RuntimeError) and str(error) == "can't start new thread":
+        return (
+            "the system refuses another thread; raise the limit of processes (`ulimit -u`) or of memory (`ulimit -v`)"
+        )
     if not isinstance(error, OSError):
         return None
     named = None if error.filename is None else os.fsdecode(error.filename)

@@ -26,11 +26,12 @@ from gsplat_core.io.bundle import load_bundle, save_bundle
 from gsplat_core.io.exports.export import export_model
 from gsplat_core.io.exports.formats import ExportWish, format_named, format_of
 from gsplat_core.io.manifest import parse_manifest
-from gsplat_core.io.model_sources import load_model
+from gsplat_core.io.model_sources import load_model, wrong_extent
 from gsplat_core.io.surface_files import read_surface
 from gsplat_core.machine import in_gib
 from gsplat_core.models import Model
 from gsplat_core.scene.collection import GaussianCollection
+from gsplat_core.value_ranges import plain_float
 from operators.applications.bench import BenchSettings, bench_model
 from operators.applications.render import render_model
 from operators.errors import OutputError
@@ -336,7 +337,10 @@ def _read_pairs(text: str) -> tuple[np.ndarray, np.ndarray]:
         InvalidSetting: if the text is malformed.
     """
     try:
-        values = np.array([[side.split(",") for side in pair.split("=")] for pair in text.split(";")], np.float64)
+        pairs = [pair.split("=") for pair in text.split(";")]
+        values = np.array(
+            [[[plain_float(part.strip()) for part in side.split(",")] for side in pair] for pair in pairs]
+        )
     except ValueError as error:
         raise InvalidSetting(f"the pairs {text!r:.80} cannot be read; give x,y,z=x,y,z;... (model = mesh)") from error
     if values.ndim != 3 or values.shape[1:] != (2, 3) or not np.isfinite(values).all():
@@ -431,6 +435,14 @@ def edited_model(model: Model, edit: Edit) -> Model:
         chosen &= _selected(scene, text)
     if edit.outside:
         chosen = ~chosen
+    if not chosen.any():
+        low, high = (
+            [round(value, 3) for value in of(model.gaussians.means, 0).tolist()] for of in (torch.amin, torch.amax)
+        )
+        raise InvalidInput(
+            f"{'the outside of ' if edit.outside else ''}the selection holds none of the {len(scene)} Gaussians; they are at"
+            f" {low} to {high}"
+        )
     field = model.field
     if edit.delete:
         scene.delete(chosen)
@@ -450,6 +462,8 @@ def edited_model(model: Model, edit: Edit) -> Model:
     if edit.merge is not None:
         other = load_model(edit.merge)
         scene.merge(other.at(other.time_window_s[1]))
+    if moves and (wrong := wrong_extent(scene.gaussians)) is not None:
+        raise InvalidInput(f"the edited model {wrong}; change --scale or --translate")
     return replace(model, gaussians=scene.gaussians, field=field, unseen_s=None)
 
 
@@ -464,7 +478,7 @@ def _selected(scene: GaussianCollection, text: str) -> Tensor:
 
 def _numbers(name: str, form: str, text: str, count: int) -> list[float]:
     try:
-        values = [float(part) for part in text.split(",")]
+        values = [plain_float(part.strip()) for part in text.split(",")]
     except ValueError:
         values = []
     if len(values) != count or not all(math.isfinite(value) for value in values):

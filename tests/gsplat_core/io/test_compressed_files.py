@@ -280,6 +280,7 @@ def _flipped(data):
         (b"", "gzip"),
         (b"ply\n", "gzip"),
         (b"NGSP" + bytes(100), "version 0; versions 2 to 4"),
+        (b"NGSP\3" + bytes(100), "version 3 that is not compressed"),
         (b"\x1f\x8b\x08\x00", "cut short"),
         (gzip.compress(b"NG"), "cut short"),
         (spz_file(magic=b"PSNG"), "PSNG"),

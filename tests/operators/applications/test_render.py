@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -143,6 +145,19 @@ def test_after_an_error_an_earlier_video_is_kept(tmp_path):
         write_video(pictures_until_an_error(3), out, (64, 48), 30.0, overwrite=True)
     assert out.read_bytes() == b"earlier"
     assert [path.name for path in tmp_path.iterdir()] == ["view.mp4"]
+
+
+def test_a_video_that_cannot_be_finished_is_not_left(tmp_path):
+    """The encoder holds back the frames until the end, which exceeds the largest size of a file."""
+    script = (
+        "import resource, sys, pathlib, numpy as np\n"
+        "from operators.applications.render import write_video\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (500, 500))\n"
+        "write_video(iter([np.zeros((48, 64, 3), np.uint8)] * 3), pathlib.Path(sys.argv[1]), (64, 48), 30.0, False)\n"
+    )
+    ran = subprocess.run([sys.executable, "-c", script, str(tmp_path / "view.mp4")], capture_output=True, text=True)
+    assert "ulimit -f" in ran.stderr
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("was_there", [False, True])

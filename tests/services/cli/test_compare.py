@@ -87,6 +87,12 @@ def test_a_model_without_a_unit_takes_its_scale_from_pairs(tmp_path, capsys):
     assert "RMSE 0.0" in capsys.readouterr().out
 
 
+LISTS = (
+    b"ply\nformat binary_little_endian 1.0\nelement vertex 0\nproperty float x\nproperty float y\nproperty float z\n"
+    b"element face 1\nproperty list uchar int v\nend_header\n"
+)
+
+
 @pytest.mark.parametrize(
     ("name", "content", "said"),
     [
@@ -100,6 +106,11 @@ def test_a_model_without_a_unit_takes_its_scale_from_pairs(tmp_path, capsys):
         ("ct.stl", b"solid x", "no triangles"),
         ("ct.obj", b"v 0 0 0\nf 1 2 3\n", "a vertex that is not there"),
         ("ct.obj", b"v 0 0 nan\n", "not finite"),
+        ("ct.obj", b"v 0 0\n", "the vertex 'v 0 0' has fewer than three coordinates"),
+        ("ct.obj", b"v 0 0 0\nf 1 2 " + b"9" * 30, "a number that is too large"),
+        ("ct.stl", bytes(80) + b"\xff\0\0\0" + bytes(50), "it has 134 bytes, and 12834 by its header"),
+        ("ct.ply", LISTS + b"\x03" + bytes(11), "cut short"),
+        ("ct.ply", LISTS.replace(b"uchar", b"int") + b"\x03\0", "cut short"),
         ("ct.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "no triangles with an area"),
     ],
 )

@@ -84,6 +84,12 @@ def test_a_part_is_recoloured_and_moved_and_another_scene_added(ply, gaussians, 
         (["--recolour", "red"], "--recolour takes R,G,B, got 'red'"),
         (["--rotate", "0,0,0,90"], "an axis of a length above 0"),
         (["--scale", "0"], "scale must be greater than 0"),
+        (["--scale", "1e30"], "beyond what can be shown; change --scale or --translate"),
+        (["--scale", "1e-30"], "too small to be shown; change --scale or --translate"),
+        (["--translate", "1e38,0,0"], "holds a position of 1e+38"),
+        (["--translate", "1_0,0,0"], "--translate takes X,Y,Z, got '1_0,0,0'"),
+        (["--delete", "--select", "sphere:0,0,9000,1"], "the selection holds none of the 40 Gaussians; they are at ["),
+        (["--recolour", "1,0,0", "--outside"], "the outside of the selection holds none"),
     ],
 )
 def test_wrong_edits_are_one_sentence(ply, tmp_path, capsys, words, reason):

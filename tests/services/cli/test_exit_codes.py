@@ -73,6 +73,12 @@ def test_memory_that_is_not_there_is_a_sentence(call, capsys):
     assert "Traceback" not in err
 
 
+def test_a_refused_thread_is_a_sentence(capsys):
+    assert exit_code_of(caused(RunFailed("early", None), RuntimeError("can't start new thread"))) == BAD_INPUT
+    err = capsys.readouterr().err
+    assert err.startswith("error: the system refuses another thread") and "ulimit -u" in err
+
+
 def test_every_error_on_purpose_is_either_the_users_or_a_bug():
     """InvalidInput, the graph's errors and their like are a program's mistakes: none of them is a UserError."""
 

@@ -138,6 +138,12 @@ def test_a_hostile_splat_is_refused(tmp_path, data):
         load_model(tmp_path / "scene.splat")
 
 
+def test_negative_scales_of_a_splat_are_counted(tmp_path):
+    (tmp_path / "scene.splat").write_bytes(np.array([1, 2, 3, -1, -2, 5], "<f4").tobytes() + bytes(8))
+    with pytest.raises(BundleError, match=r"2 values of scale .* \(first: -1\)"):
+        load_model(tmp_path / "scene.splat")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("command", ["render", "export", "pack", "measure", "evaluate", "view"])
 @pytest.mark.parametrize("name", ["model.pt", "scene.obj", "video.mp4", "nosuffix"])
