@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import runpy
 import sys
 from pathlib import Path
 
-from gsplat_core.as_gsplat.finder import CONSTANTS, install
+from gsplat_core.as_gsplat.finder import CONSTANTS, install_for_spawned_processes
 
 
 def main() -> None:
@@ -25,15 +26,27 @@ def main() -> None:
     program: str = chosen.program
     if not chosen.by_name and not Path(program).exists():
         parser.error(f"{program} does not exist")
-    install(chosen.constants)
+    if not chosen.by_name and Path(program).is_dir() and not Path(program, "__main__.py").exists():
+        parser.error(f"{program} is a folder without __main__.py; give a script in it")
     sys.argv = [program, *chosen.arguments]
     if chosen.by_name:
         sys.path.insert(0, "")
+        install_for_spawned_processes(chosen.constants)
+        if not _is_module(program):
+            parser.error(f"there is no module {program}")
         runpy.run_module(program, run_name="__main__", alter_sys=True)
     else:
         # As when Python itself runs a script, so that the script finds the modules in its folder.
         sys.path.insert(0, str(Path(program).resolve().parent))
+        install_for_spawned_processes(chosen.constants)
         runpy.run_path(program, run_name="__main__")
+
+
+def _is_module(name: str) -> bool:
+    try:
+        return importlib.util.find_spec(name) is not None
+    except (ImportError, ValueError):
+        return False
 
 
 if __name__ == "__main__":

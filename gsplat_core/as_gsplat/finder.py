@@ -7,6 +7,7 @@ import importlib
 import importlib.abc
 import importlib.machinery
 import importlib.metadata
+import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -357,3 +358,29 @@ def install(constants: str = "1.6") -> None:
         raise ImportError(f"gsplat has been installed with other constants than {constants}; call install() once")
     if not present:
         sys.meta_path.insert(0, Finder(constants))
+
+
+PATH_ENTRY = str(Path(__file__).parent / "path_entry")
+"""Folder whose modules install the hook in processes that inherit `sys.path`, but not `sys.meta_path`."""
+_CONSTANTS_VARIABLE = "INTRASPLAT_GSPLAT_CONSTANTS"
+"""Environment variable with the constants of such processes."""
+
+
+def install_for_spawned_processes(constants: str) -> None:
+    """Install the hook in this process, and in those that `multiprocessing` starts from now on.
+
+    Args:
+        constants: see `install`.
+    """
+    install(constants)
+    os.environ[_CONSTANTS_VARIABLE] = constants
+    if PATH_ENTRY not in sys.path:
+        # Before the folder of the program, which may be a copy of gsplat's sources.
+        sys.path.insert(0, PATH_ENTRY)
+
+
+def take_over(name: str) -> None:
+    """Install the hook, and replace the module `name` of `PATH_ENTRY`, which is being imported, by that of the hook."""
+    del sys.modules[name]
+    install(os.environ.get(_CONSTANTS_VARIABLE, CONSTANTS[0]))
+    importlib.import_module(name)

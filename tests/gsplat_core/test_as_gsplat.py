@@ -14,6 +14,7 @@ import pytest
 import torch
 
 import gsplat_core
+from gsplat_core.as_gsplat import __main__ as run
 from gsplat_core.as_gsplat import finder, install
 from gsplat_core.as_gsplat import functions as utils
 from gsplat_core.rendering.depth_maps import depth_to_normal, depth_to_points
@@ -58,6 +59,86 @@ def test_a_program_runs_unchanged_with_the_modules_in_its_folder(tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.split() == ["__main__", "1.5.3", "(1,", "16,", "16,", "3)", "['--steps',", "'3']"]
+
+
+SPAWNING = """
+import multiprocessing
+import sys
+
+import fused_ssim
+import gsplat
+from gsplat.rendering import rasterization
+
+
+def names(queue):
+    queue.put((gsplat.__name__, rasterization.__module__, fused_ssim.fused_ssim.__module__, sys.argv[1]))
+
+
+if __name__ == "__main__":
+    context = multiprocessing.get_context("spawn")
+    queue = context.Queue()
+    process = context.Process(target=names, args=(queue,))
+    process.start()
+    process.join()
+    assert process.exitcode == 0
+    print(*queue.get())
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("constants", ["1.6", "1.5.3"])
+def test_processes_that_a_program_spawns_have_the_modules_too(tmp_path, constants):
+    (tmp_path / "gsplat.py").write_text("raise ImportError('this folder has another gsplat')\n")
+    (tmp_path / "program.py").write_text(SPAWNING)
+    command = [
+        sys.executable,
+        "-m",
+        "gsplat_core.as_gsplat",
+        "--constants",
+        constants,
+        str(tmp_path / "program.py"),
+        "x",
+    ]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    expected = ["gsplat", "gsplat_core.rendering.rasterization", "gsplat_core.ops.ssim", "x"]
+    assert done.stdout.split() == expected
+
+
+@pytest.mark.parametrize("constants", ["1.6", "1.5.3"])
+def test_a_module_on_the_path_gives_way_to_that_of_the_hook(monkeypatch, constants):
+    monkeypatch.setattr(sys, "meta_path", [each for each in sys.meta_path if not isinstance(each, finder.Finder)])
+    monkeypatch.setenv("INTRASPLAT_GSPLAT_CONSTANTS", constants)
+    monkeypatch.syspath_prepend(finder.PATH_ENTRY)
+    for name in finder.MODULES:
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    try:
+        module = importlib.import_module("gsplat")
+        assert isinstance(module, finder.AliasModule) and module.__spec__.loader.constants == constants
+        assert importlib.import_module("fused_ssim").fused_ssim is gsplat_core.fused_ssim
+    finally:
+        for name in finder.MODULES:
+            sys.modules.pop(name, None)
+
+
+@pytest.mark.parametrize(
+    ("program", "found"),
+    [
+        (["nowhere.py"], "nowhere.py does not exist"),
+        (["."], ". is a folder without __main__.py"),
+        (["-m", "no_such_module_of_ours"], "there is no module no_such_module_of_ours"),
+        (["-m", "no_such_package.module"], "there is no module no_such_package.module"),
+    ],
+)
+def test_a_program_that_is_not_there_is_a_wrong_argument(tmp_path, monkeypatch, capsys, program, found):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["as_gsplat", *program])
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(sys, "meta_path", list(sys.meta_path))
+    monkeypatch.setenv("INTRASPLAT_GSPLAT_CONSTANTS", "")
+    with pytest.raises(SystemExit) as ended:
+        run.main()
+    assert ended.value.code == 2 and found in capsys.readouterr().err
 
 
 def test_every_name_exists(installed):
