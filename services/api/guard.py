@@ -19,10 +19,19 @@ from starlette.responses import Response
 
 from services.api.json_body import JsonRequest
 from services.api.middleware import BoundedBody, refuse_by_length
-from services.api.problems import Forbidden, Problem, TooManyRequests, Unauthenticated, Unprocessable, WrongContent
-from services.api.state import ControlState, control_of
+from services.api.problems import (
+    Forbidden,
+    Problem,
+    TooManyRequests,
+    Unauthenticated,
+    Unavailable,
+    Unprocessable,
+    WrongContent,
+)
+from services.api.state import KEYS_UNREADABLE, ControlState, control_of
 from services.audit import AuditUnwritable
 from services.audit.files import Detail, Outcome
+from services.auth.keys import KeysUnreadable
 from services.auth.roles import ANYBODY, Caller, Role
 
 JSON = "application/json"
@@ -167,6 +176,8 @@ async def _admit(connection: HTTPConnection, rule: Rule, control: ControlState) 
     except Unauthenticated:
         control.measures.refused.labels("not authenticated").inc()
         raise
+    except KeysUnreadable as error:  # its text has paths, and this caller is not authenticated; `_look` logs it
+        raise Unavailable(KEYS_UNREADABLE) from error
     wait_s = control.key_rate.wait_s(caller.key_id)
     if wait_s > 0:
         control.measures.refused.labels("key rate").inc()

@@ -18,6 +18,7 @@ from starlette.types import Receive, Scope, Send
 from starlette.websockets import WebSocket
 
 from services.audit import AuditUnwritable
+from services.auth.keys import KeysUnreadable
 
 PROBLEM_JSON = "application/problem+json"
 
@@ -182,7 +183,7 @@ TITLES: dict[int, str] = {status: kind.title for status, kind in OF_STATUS.items
     TooManyRequests.status: TooManyRequests.title,
 }
 log = logging.getLogger(__name__)
-KNOWN: dict[type[Exception], type[Problem]] = {AuditUnwritable: Unavailable}
+KNOWN: dict[type[Exception], type[Problem]] = {AuditUnwritable: Unavailable, KeysUnreadable: Unavailable}
 """Errors of base packages and the problem each maps to. `Parts.errors` adds the exceptions of the components."""
 OF_ERRNO: dict[int, type[Problem]] = {
     **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), NoSpace),

@@ -12,6 +12,7 @@ import platform
 import socket
 from collections.abc import Awaitable, Callable, Sequence
 from contextlib import AsyncExitStack
+from functools import partial
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any, Literal
@@ -23,7 +24,8 @@ from prometheus_client.exposition import choose_encoder
 from starlette.requests import Request
 
 from services.api.guard import new_router, requires
-from services.api.state import ControlState, control_of
+from services.api.state import KEYS_UNREADABLE, ControlState, control_of
+from services.auth.keys import KeysUnreadable
 from services.errors import CannotServe
 from services.schemas import Alive, CheckResult, Readiness, Version
 from services.settings import ServiceSettings
@@ -46,13 +48,26 @@ async def readiness(control: ControlState, *, verbose: bool) -> Readiness:
 
 
 async def _results(control: ControlState) -> dict[str, CheckResult]:
-    checks = {"disk": control.storage.disk, "audit": control.storage.audit, **control.parts.checks}
+    checks: dict[str, Callable[[], Awaitable[CheckResult]]] = {
+        "disk": control.storage.disk,
+        "audit": control.storage.audit,
+        "keys": partial(_keys, control),
+        **control.parts.checks,
+    }
     results = await asyncio.gather(*(_result(check) for check in checks.values()))
     draining = control.draining.is_set()
     return {
         "server": CheckResult(not draining, "draining" if draining else "accepting requests"),
         **dict(zip(checks, results, strict=True)),
     }
+
+
+async def _keys(control: ControlState) -> CheckResult:
+    try:
+        await asyncio.to_thread(control.keys.all)
+    except KeysUnreadable:
+        return CheckResult(False, KEYS_UNREADABLE)
+    return CheckResult(True, "their file can be read")
 
 
 async def _result(check: Callable[[], Awaitable[CheckResult]]) -> CheckResult:

@@ -141,6 +141,7 @@ async def _awaited(act: Callable[[], Awaitable[Any]]) -> Any:
 
 
 log = logging.getLogger(__name__)
+KEYS_UNREADABLE = "the file of the API keys cannot be read, so no key is accepted; the log of the server has the cause"
 SPARE_BYTES = 256 * 2**20
 """Free bytes that uploads leave for the audit log and the database. With less the service is degraded."""
 

@@ -275,6 +275,8 @@ class KeyStore:
             status = os.stat(self._path)
         except FileNotFoundError:
             return None
+        except OSError as error:
+            raise KeysUnreadable(f"{self._path} cannot be read: {error.strerror or error}; {_MEND}") from error
         return status.st_ino, status.st_mtime_ns, status.st_size
 
     @contextmanager

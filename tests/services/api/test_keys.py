@@ -289,6 +289,27 @@ def test_a_damaged_file_of_last_uses_costs_no_key(tmp_path, damage):
     assert set(store.last_used()) == {key.id}
 
 
+@pytest.mark.parametrize("damage", ["", "{", "[]", "null", "[" * 5000, None])
+def test_while_the_file_of_the_keys_is_damaged_every_key_is_503_and_the_service_not_ready(plane, damage):
+    file = plane.control.settings.data_dir / "keys.json"
+    whole = file.read_text()
+    file.unlink()
+    if damage is None:
+        file.mkdir()
+    else:
+        file.write_text(damage)
+    answer = plane.ask("GET", "/v1/me")
+    assert answer.status_code == 503 and "the file of the API keys cannot be read" in answer.json()["detail"]
+    assert str(file) not in answer.text, "this caller is not authenticated"
+    ready = plane.client.get("/readyz?verbose")
+    assert (ready.status_code, ready.json()["checks"]["keys"]["ok"]) == (503, False)
+    if damage is None:
+        file.rmdir()
+    file.write_text(whole)
+    assert plane.ask("GET", "/v1/me").status_code == 200
+    assert plane.client.get("/readyz").status_code == 200
+
+
 def test_a_full_disk_refuses_no_request(tmp_path, monkeypatch, caplog):
     store = KeyStore(tmp_path / "keys.json")
     key, token = store.create("console", Role.VIEWER)
