@@ -173,7 +173,9 @@ def read_cameras_json(root: Path, findings: Findings) -> tuple[ImageFiles, Calib
 
 def _pose(value: object, path: Path, index: int, findings: Findings) -> np.ndarray | None:
     try:
-        pose = np.array(value, dtype=np.float64)
+        if not isinstance(value, list):
+            raise TypeError
+        pose = np.array([[np.nan if (each := number(entry)) is None else each for entry in row] for row in value])
     except (TypeError, ValueError, OverflowError):
         pose = np.empty(0)
     if pose.shape != (4, 4) or not np.isfinite(pose).all() or pose[3].tolist() != [0, 0, 0, 1]:
@@ -475,8 +477,12 @@ def _undistorted(
     return _Calibrated(replace(found, camera=undistortion.camera), baseline_mm, undistortion=undistortion)
 
 
+PLAUSIBLE_BASELINE_MM = (0.5, 100.0)
+"""Range of the distance of two eyes. A calibration in metres or centimetres is below it, one in micrometres above it."""
+
+
 def _fits_eyes(root: Path, eyes: _Calibrated, stereo: bool, has_depth: bool, findings: Findings) -> bool:
-    """Check that depth and stereo data fit the calibration.
+    """Check that depth and stereo data fit the calibration. An implausible baseline only causes a warning.
 
     Returns:
         False if depth maps belong to unrectified pictures, which is a problem. A stereo pair
@@ -492,5 +498,12 @@ def _fits_eyes(root: Path, eyes: _Calibrated, stereo: bool, has_depth: bool, fin
             root,
             "the two eyes have no calibration",
             "Depth between them is relative until a calibration file, or stereo_baseline_mm of a rectified pair, is there",
+        )
+    low, high = PLAUSIBLE_BASELINE_MM
+    if stereo and eyes.baseline_mm is not None and not low <= eyes.baseline_mm <= high:
+        findings.warn(
+            root,
+            f"the two eyes are {eyes.baseline_mm:.3g} mm apart",
+            f"Those of stereo endoscopes are {low:g} to {high:g} mm apart. Check that the calibration is in millimetres",
         )
     return True

@@ -23,6 +23,7 @@ from gsplat_core.io.recordings.contents import digest_of
 from gsplat_core.io.recordings.decoder import NO_PICTURE
 from gsplat_core.io.recordings.findings import Findings, printable
 from gsplat_core.io.sessions.records import (
+    COPY_AGAIN,
     SCHEDULE_LINES,
     SEGMENTS_FOLDER,
     SESSION_FILE,
@@ -181,7 +182,7 @@ class SessionReader:
                 )
             elif segment.ends is None:
                 self.notes.append(
-                    f"segment {name} has no end: the program that recorded it was ended; it has {len(segment.seqs)} frames"
+                    f"segment {name} has no end: the program that recorded it was ended, or its log is damaged; it has {len(segment.seqs)} frames"
                 )
         first = self.segments[0] if self.segments else None
         if first is not None and first.folder.name != "000000":
@@ -330,7 +331,9 @@ def session_contents(path: Path, findings: Findings) -> SessionContents | None:
     try:
         reader = SessionReader(path)
     except RecordingInvalid as error:
-        findings.problem(path / SESSION_FILE, str(error), "Copy the session again")
+        file = path / SESSION_FILE
+        what = str(error).removeprefix(f"{printable(file)}: ").removesuffix(f". {COPY_AGAIN}.")
+        findings.problem(file, what, COPY_AGAIN)
         return None
     for note in reader.notes:
         findings.warn(path, note, _ADVICE)

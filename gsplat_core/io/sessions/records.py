@@ -318,6 +318,9 @@ def write_session_file(folder: Path, info: SessionInfo) -> None:
         partial.file.write(info.model_dump_json(indent=1, exclude_none=True).encode() + b"\n")
 
 
+COPY_AGAIN = "Copy the session again from its source"
+
+
 def read_session_file(folder: Path) -> SessionInfo:
     """Read and validate the session file.
 
@@ -335,11 +338,11 @@ def read_session_file(folder: Path) -> SessionInfo:
         info = SessionInfo.model_validate_json(data)
         camera_of(info.camera)
     except (UnreadableFile, OSError, InvalidInput) as error:
-        raise RecordingInvalid(f"{printable(path)}: {error}. Copy the session again from its source.") from error
+        raise RecordingInvalid(f"{printable(path)}: {error}. {COPY_AGAIN}.") from error
     except ValidationError as error:
         first = error.errors(include_input=False, include_url=False)[0]
         where = ".".join(str(part) for part in first["loc"]) or "the file"
         raise RecordingInvalid(
-            f"{printable(path)}: {where}: {first['msg']:.200}. This version reads {FORMAT} {VERSION}; copy the session again from its source."
+            f"{printable(path)}: {where}: {first['msg']:.200}; this version reads {FORMAT} {VERSION}. {COPY_AGAIN}."
         ) from error
     return info

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import cv2
@@ -63,6 +64,16 @@ def test_images_of_two_eyes_are_a_stereo_recording(tmp_path):
     assert [frame.right_image[0, 0, 0] for frame in frames] == [200, 201]
     assert frames[0].right_camera is None
     assert any("the two eyes have no calibration" in note for note in recording.notes)
+
+
+@pytest.mark.parametrize(("baseline_mm", "is_noted"), [(0.0044, True), (0.5, False), (100.0, False), (4400.0, True)])
+def test_a_baseline_in_another_unit_is_noted(tmp_path, baseline_mm, is_noted):
+    picture(tmp_path / "left.png")
+    picture(tmp_path / "right.png")
+    content = {"format": "intrasplat-recording", "version": 1, "stereo_baseline_mm": baseline_mm}
+    (tmp_path / "recording.json").write_text(json.dumps(content))
+    notes = [note for note in open_recording(tmp_path).notes if "mm apart" in note]
+    assert [f"the two eyes are {baseline_mm:.3g} mm apart" in note for note in notes] == [True] * is_noted
 
 
 def test_a_calibration_rectifies_them_and_gives_the_right_eyes_camera(tmp_path):

@@ -168,6 +168,7 @@ def test_right_eye_of_another_size_or_count(endonerf_folder: Path, make: SimpleN
         ({"frames": [{"file": "images/000000.png"}]}, ["camera_to_world of frame 0 is None"]),
         ({"frames": [{"file": "images/000000.png", "camera_to_world": [[1, 2], [3, 4]]}]}, ["frame 0", "[[1, 2]"]),
         ({"frames": [{"file": "images/000000.png", "camera_to_world": (2 * np.eye(4)).tolist()}]}, ["frame 0"]),
+        ({"frames": [{"file": "images/000000.png", "camera_to_world": np.eye(4).astype(str).tolist()}]}, ["[['1.0'"]),
         ({"frames": ["images/000000.png"]}, ["file of frame 0 is None"]),
         ({"fps_assumed": "fast"}, ["frame rate", "fast"]),
     ],

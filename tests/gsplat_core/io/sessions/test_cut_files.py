@@ -120,6 +120,9 @@ def test_a_session_file_that_is_cut_is_refused_with_a_sentence(session, tmp_path
     data = (folder / "session.json").read_bytes()
     for at in (0, 1, 10, len(data) // 2, len(data) - 4):
         (folder / "session.json").write_bytes(data[:at])
+        report = validate_recording(folder)
+        assert [str(problem).count("session.json") for problem in report.problems] == [1]
+        assert str(report.problems[0]).endswith(". Copy the session again from its source.")
         with pytest.raises(RecordingInvalid, match=r"session\.json"):
             open_recording(folder)
         assert not validate_recording(folder).ok
