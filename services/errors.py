@@ -5,6 +5,8 @@ Errors of HTTP requests, with their status, are in `services.api.problems`.
 
 from __future__ import annotations
 
+import errno
+
 from gsplat_core.errors import UserError
 
 
@@ -124,3 +126,14 @@ class Refused(ClientError):
         super().__init__(f"the server refuses ({status}): {sentence}")
         self.status = status
         self.sentence = sentence
+
+
+def disk_advice(error: OSError) -> str:
+    """Return a remedy for a disk error."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return "free space on that disk"
+    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS, errno.ELOOP):
+        return "check its owner and its rights"
+    if error.errno in (errno.ENOENT, errno.ENOTDIR):
+        return "a folder of the service is gone; restart it, or restore a backup"
+    return "check that disk, and free space on it"

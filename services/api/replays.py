@@ -194,8 +194,8 @@ async def keep_model(
     jobs, registry = jobs_of(request), registry_of(request)
     async with recorded(request, caller, "replay.keep", f"{wanted.model}/{job_id}") as said:
         job = await asyncio.to_thread(jobs.get, job_id)
-        if "model.isplat" not in jobs.files(job):
-            raise Conflicting(f"the replay is {job.state} and has no model; wait until it is done")
+        if job.state != JobState.DONE:
+            raise Conflicting(f"the replay is {job.state} and has no model; only one that is done has")
         path = await asyncio.to_thread(jobs.file, job_id, "model.isplat")
         record = await asyncio.to_thread(registry.upload, wanted.model, path, None, str(caller))
         said["version"] = record.version

@@ -6,6 +6,7 @@ from __future__ import annotations
 import asyncio
 import base64
 import binascii
+import errno
 import hashlib
 import os
 import re
@@ -19,8 +20,9 @@ from pathlib import Path
 
 from starlette.requests import Request
 
-from services.api.problems import BadRequest, NoSpace, TooManyRequests, Unprocessable
+from services.api.problems import BadRequest, NoSpace, Problem, TooManyRequests, Unavailable, Unprocessable
 from services.api.state import SPARE_BYTES, ControlState
+from services.errors import disk_advice
 
 _MEMBER = re.compile(r"\s*(?P<name>[a-z0-9*_.-]+)=:(?P<value>[A-Za-z0-9+/=]*):\s*")
 
@@ -75,6 +77,7 @@ async def incoming_file(request: Request, control: ControlState, expected_sha256
     Raises:
         TooManyRequests: if too many uploads run, in total or for this key.
         NoSpace: if the disk is full.
+        Unavailable: if the disk cannot be used for another reason.
         Unprocessable: if the digest differs or the body is empty.
     """
     if control.uploads.locked():
@@ -84,8 +87,11 @@ async def incoming_file(request: Request, control: ControlState, expected_sha256
         raise TooManyRequests("as many uploads of this key as may are running; wait for one to end", 5.0)
     async with control.uploads, _counted(control.uploads_of, key):
         folder = control.uploads_dir
-        _check_space(folder, int(request.headers.get("content-length", 0)))
-        descriptor, name = tempfile.mkstemp(prefix="upload-", dir=folder)
+        try:
+            _check_space(folder, int(request.headers.get("content-length", 0)))
+            descriptor, name = tempfile.mkstemp(prefix="upload-", dir=folder)
+        except OSError as error:
+            raise _unkept(error) from error
         path = Path(name)
         try:
             size, digest = await _write(request, descriptor, control)
@@ -134,9 +140,14 @@ async def _write(request: Request, descriptor: int, control: ControlState) -> tu
             await asyncio.to_thread(file.flush)
             await asyncio.to_thread(os.fsync, file.fileno())
         except OSError as error:
-            raise NoSpace(f"the upload cannot be kept: {error.strerror}; free space on that disk") from error
+            raise _unkept(error) from error
     control.measures.upload_bytes.inc(size)
     return size, running.digest()
+
+
+def _unkept(error: OSError) -> Problem:
+    kind = NoSpace if error.errno in (errno.ENOSPC, errno.EDQUOT) else Unavailable
+    return kind(f"the upload cannot be kept: {error.strerror}; {disk_advice(error)}")
 
 
 def _check_space(folder: Path, wanted_bytes: int) -> None:

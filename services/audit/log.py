@@ -51,7 +51,7 @@ from services.audit.files import (
     write_anchor,
     write_head,
 )
-from services.errors import AuditInUse, AuditUnwritable
+from services.errors import AuditInUse, AuditUnwritable, disk_advice
 
 MOST_LOOKED_AT = 50_000
 """Largest number of entries read per search, which bounds its time to about a second. The next page continues at that
@@ -329,7 +329,7 @@ class AuditLog:
         try:
             yield
         except OSError as error:
-            self._failure = f"{self.path}: {error.strerror or error}; {_advice(error)}"
+            self._failure = f"{self.path}: {error.strerror or error}; {disk_advice(error)}"
             raise AuditUnwritable(self._failure) from error
 
     def _take_back(self) -> None:
@@ -462,15 +462,6 @@ class AuditLog:
         self._descriptor = self._open()
         self._head = Head()
         self._say("audit.broken", "failed", put_aside=aside.name, why=why[:200])
-
-
-def _advice(error: OSError) -> str:
-    """Return a remedy for a disk error."""
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return "free space on that disk"
-    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS, errno.ELOOP):
-        return "check its owner and its rights"
-    return "check that disk, and free space on it"
 
 
 def _owned(lock: Path, log: Path) -> int:

@@ -21,7 +21,7 @@ from typing import Any
 import sqlalchemy as sa
 
 from gsplat_core.io.files import sync_folder
-from services.errors import CheckFailed, Conflict, NotFound, StoreUnavailable
+from services.errors import CheckFailed, Conflict, NotFound, StoreUnavailable, disk_advice
 from services.recordings.archives import ARCHIVE, MOST_UNPACKED_BYTES, kind_of
 from services.registry.checking import BroughtDown, RunningChecks, run_program
 from services.registry.database import Database, Schema
@@ -321,9 +321,7 @@ class RecordingStore:
             sync_folder(folder)
             sync_folder(self._folder)
         except OSError as error:
-            raise StoreUnavailable(
-                f"the recording cannot be kept: {error.strerror}; free space on that disk"
-            ) from error
+            raise StoreUnavailable(f"the recording cannot be kept: {error.strerror}; {disk_advice(error)}") from error
 
     def _verdict(self, row: sa.RowMapping) -> dict[str, Any]:
         reports: list[dict[str, Any]] = []

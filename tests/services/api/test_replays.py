@@ -165,6 +165,16 @@ def test_a_report_is_shown_without_rights_and_the_rest_keeps_its_policy(plane, w
     assert model.headers["content-disposition"].startswith("attachment") and model.content == b"GOOD"
 
 
+def test_a_model_that_is_gone_from_the_disk_is_not_waited_for(plane, worker, tmp_path):
+    job_id = start(plane).json()["id"]
+    early = plane.ask("POST", f"{REPLAYS}/{job_id}/keep", json={"model": "liver"})
+    assert early.status_code == 409 and "the replay is queued" in early.json()["detail"]
+    worker.finish(job_id)
+    (tmp_path / "results").rename(tmp_path / "elsewhere")
+    gone = plane.ask("POST", f"{REPLAYS}/{job_id}/keep", json={"model": "liver"})
+    assert gone.status_code == 503 and "is not on the disk; restore it from a backup" in gone.json()["detail"]
+
+
 @pytest.mark.parametrize("given", ["lines=0-1", "bytes=x-y", "bytes=9-1", "", "zork"])
 def test_a_range_that_cannot_be_read_is_ignored(plane, worker, given):
     job_id = start(plane).json()["id"]

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import base64
 import errno
+import hashlib
 import os
 import shutil
 from collections import namedtuple
@@ -145,3 +147,18 @@ def test_a_store_whose_disk_refuses_is_no_bug(plane, monkeypatch, caplog, store,
     assert answer.status_code == status and os.strerror(number) in answer.json()["detail"]
     assert ("free space" in answer.json()["detail"]) == (status == 507)
     assert "/secret" not in answer.text and "Traceback" not in caplog.text
+
+
+@pytest.mark.parametrize("gone", ["missing", "a file"])
+def test_an_upload_without_its_folder_is_no_bug(plane, gone):
+    folder = plane.control.uploads_dir
+    folder.rmdir()
+    if gone == "a file":
+        folder.touch()
+    digest = base64.b64encode(hashlib.sha256(b"GOOD").digest()).decode()
+    headers = {"Content-Type": "application/octet-stream", "Content-Digest": f"sha-256=:{digest}:"}
+    answer = plane.ask("PUT", "/v1/models/liver/versions", content=b"GOOD", headers=headers)
+    assert answer.status_code == 503 and "a folder of the service is gone" in answer.json()["detail"]
+    if gone == "a file":
+        folder.unlink()
+    folder.mkdir()
