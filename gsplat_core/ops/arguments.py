@@ -142,6 +142,11 @@ def check_spherical_harmonics_arguments(
     leading = require_trailing("dirs", dirs, (3,), "[..., 3]")
     if not 0 <= degrees_to_use <= MAX_SH_DEGREE:
         raise InvalidInput(f"degrees_to_use must be 0 to {MAX_SH_DEGREE}, got {degrees_to_use}")
+    if coeffs.shape[-2:] == (4, 4):
+        raise InvalidInput(
+            f"coeffs must be [..., K, 3], got {list(coeffs.shape)}, which may be viewmats of gsplat 1.6; give the directions"
+            " means - torch.linalg.inv(viewmats)[..., None, :3, 3] and the coefficients, as in gsplat 1.5.3"
+        )
     bases = (degrees_to_use + 1) ** 2
     if coeffs.dim() < 2 or coeffs.shape[-1] != 3 or coeffs.shape[-2] < bases:
         raise InvalidInput(

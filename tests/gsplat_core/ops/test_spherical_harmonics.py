@@ -134,6 +134,17 @@ def test_shared_coefficients_get_the_same_gradient_on_any_number_of_threads():
         assert torch.equal(one, three)
 
 
+def test_the_arguments_of_gsplat_1_6_are_refused_with_those_that_give_its_result():
+    random = torch.Generator().manual_seed(0)
+    means, coeffs = (torch.randn(*shape, generator=random) for shape in ((5, 3), (5, 9, 3)))
+    viewmats = torch.eye(4).repeat(2, 1, 1)
+    viewmats[:, :3, 3] = torch.randn(2, 3, generator=random)
+    with pytest.raises(InvalidInput, match=r"viewmats of gsplat 1\.6; give the directions"):
+        spherical_harmonics(2, means, viewmats, coeffs)
+    directions = means - torch.linalg.inv(viewmats)[..., None, :3, 3]
+    assert spherical_harmonics(2, directions, coeffs).shape == (2, 5, 3)
+
+
 def test_wrong_arguments_are_refused():
     dirs, coeffs, masks, _ = inputs((5,), 16)
     for arguments, message in [
