@@ -132,7 +132,8 @@ async def create_stream(request: Request, caller: CallerOf, wanted: StreamReques
     found = streams_of(request)
     if not caller.may_use(wanted.name):
         raise Forbidden(f"the key {caller.name} is limited to other streams; make {wanted.name} with another key")
-    detail = {"scheme": wanted.source.partition(":")[0][:20] if wanted.source.isascii() else "", "show": wanted.show}
+    address = _ADDRESS.fullmatch(wanted.source)
+    detail = {"scheme": "" if address is None else address["scheme"][:20], "show": wanted.show}
     async with recorded(request, caller, "stream.create", wanted.name, {**detail}):
         check_source(wanted.source, control_of(request).settings.sources)
         view = found.create(wanted.name, wanted)

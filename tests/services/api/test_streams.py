@@ -56,6 +56,12 @@ def test_refused_streams(plane, change):
     assert plane.parts.streams.kept == {}
 
 
+@pytest.mark.parametrize("source", ["\x00:", "\n:x", "a\x7fb:", "[]{}:", "ä:", ":", "", 'a"b:'])
+def test_a_source_that_no_audit_entry_can_hold_is_refused(plane, source):
+    answer = plane.ask("POST", "/v1/streams", json={"name": "x", "source": source})
+    assert answer.status_code == 422 and ("stream.create", "x", "refused") in plane.events()
+
+
 def test_the_virtual_camera_is_turned_by_whoever_watches(plane):
     plane.ask("POST", "/v1/streams", json={"name": "endoscope", "source": "synthetic:"})
     path = "/v1/streams/endoscope/camera"
