@@ -29,6 +29,8 @@ from gsplat_core.training.strategies.mcmc import MCMCStrategy
 
 LEAST_POINTS = 4
 """Minimum number of points, so that each has three neighbours, from whose distance its scale follows."""
+MOST_LOCATED = 10_000
+"""Largest number of points that are projected to check that an image shows one; of more, every k-th is."""
 SCENE_MARGIN = 1.1
 """Factor from the largest distance of a camera from their mean to the extent of a scene (gsplat's `scene_scale`)."""
 
@@ -141,14 +143,28 @@ def read_points(scene: ColmapScene) -> Points:
     """Read the points of a scene.
 
     Raises:
-        RecordingError: if there are fewer than `LEAST_POINTS` points, or their file is missing or malformed.
+        RecordingError: if there are fewer than `LEAST_POINTS` points, no image shows one, or their file is missing or
+            malformed.
     """
     positions, colours = scene.points()
     if len(positions) < LEAST_POINTS:
         raise RecordingInvalid(
             f"{scene.sparse} has {len(positions)} points, and training begins with at least {LEAST_POINTS}; export the scene with its points3D"
         )
+    some = positions[:: -(-len(positions) // MOST_LOCATED)]
+    if not any(_shows_a_point(each.camera, some) for each in scene.images):
+        raise RecordingInvalid(
+            f"none of the {len(positions)} points in {scene.sparse} is inside a picture; poses and points do not belong"
+            " together, so export the scene again"
+        )
     return Points(positions, colours)
+
+
+def _shows_a_point(camera: Camera, positions: NDArray[np.float64]) -> bool:
+    seen = positions @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    seen = seen[seen[:, 2] > 0] @ camera.K.T
+    inside = (seen[:, :2] >= 0) & (seen[:, :2] <= seen[:, 2:] * [camera.width_px, camera.height_px])
+    return bool(inside.all(1).any())
 
 
 class CompiledAdam(torch.optim.Optimizer):

@@ -19,10 +19,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.errors import CoreError, InvalidSetting, RecordingInvalid, RecordingMissing
+from gsplat_core.errors import InvalidSetting, RecordingInvalid, RecordingMissing
 from gsplat_core.io.files import open_regular
 from gsplat_core.io.recordings.plain_files import UnreadableFile, decode_picture
-from gsplat_core.scene.cameras import MAX_INTRINSICS_PX, Camera
+from gsplat_core.scene.cameras import MAX_INTRINSICS_PX, MIN_FOCAL_PX, Camera
 
 MODELS = {
     0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8),
@@ -118,8 +118,10 @@ class ColmapScene:
         path = _found(self.sparse, "points3D")
         rows = list(_points_of_text(path) if path.suffix == ".txt" else _points_of_binary(path))
         table = np.array(rows, np.float64).reshape(-1, 6)
-        if not np.isfinite(table).all():
-            raise RecordingInvalid(f"{path} holds points that are NaN or infinite; export the scene again")
+        if not np.isfinite(table).all() or np.abs(table[:, :3]).max(initial=0) > MOST_TRANSLATION:
+            raise RecordingInvalid(
+                f"{path} holds points that are NaN, infinite or beyond {MOST_TRANSLATION:g}; export the scene again"
+            )
         return table[:, :3], np.clip(table[:, 3:], 0, 255).astype(np.uint8)
 
 
@@ -132,18 +134,26 @@ def read_colmap(folder: Path) -> ColmapScene:
     """
     sparse = _sparse_folder(folder)
     path = _found(sparse, "cameras")
-    cameras = dict(_cameras_of_text(path) if path.suffix == ".txt" else _cameras_of_binary(path))
+    cameras: dict[int, Camera] = {}
+    for number, camera in _cameras_of_text(path) if path.suffix == ".txt" else _cameras_of_binary(path):
+        if number in cameras:
+            raise RecordingInvalid(f"{path} defines camera {number} twice; export the scene again")
+        cameras[number] = camera
     path = _found(sparse, "images")
-    images = []
-    for number, pose, camera, name in _images_of_text(path) if path.suffix == ".txt" else _images_of_binary(path):
-        if camera not in cameras:
-            raise RecordingInvalid(f"{path}: image {number} has camera {camera}, which {sparse} does not define")
+    images: dict[str, PosedImage] = {}
+    for number, pose, camera_number, name in (
+        _images_of_text(path) if path.suffix == ".txt" else _images_of_binary(path)
+    ):
+        if camera_number not in cameras:
+            raise RecordingInvalid(f"{path}: image {number} has camera {camera_number}, which {sparse} does not define")
+        if name in images:
+            raise RecordingInvalid(f"{path} has the image {name!r:.80} twice; export the scene again")
         if not name or name.startswith(("/", "\\")) or ".." in Path(name).parts or "\0" in name:
             raise RecordingInvalid(f"{path}: image {number} is named {name!r:.80}, which is not inside images/")
-        images.append(PosedImage(name, cameras[camera].with_pose(_matrix(path, number, pose))))
+        images[name] = PosedImage(name, cameras[camera_number].with_pose(_matrix(path, number, pose)))
     if not images:
         raise RecordingInvalid(f"{path} has no images; give a scene with registered images")
-    return ColmapScene(folder, sparse, tuple(sorted(images, key=lambda each: each.name)))
+    return ColmapScene(folder, sparse, tuple(sorted(images.values(), key=lambda each: each.name)))
 
 
 def _sparse_folder(folder: Path) -> Path:
@@ -194,10 +204,11 @@ def _camera(path: Path, number: int, model: str, width_px: int, height_px: int, 
             f"{path}: camera {number} has the parameters {values}; they must be below {MAX_INTRINSICS_PX:g} px"
         )
     fx, fy, cx, cy = values if wanted == 4 else (values[0], *values)
-    try:
-        return Camera(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), width_px, height_px)
-    except CoreError as error:
-        raise RecordingInvalid(f"{path}: camera {number} cannot be used: {error}") from error
+    if min(fx, fy) < MIN_FOCAL_PX:
+        raise RecordingInvalid(
+            f"{path}: camera {number} has the focal lengths {fx:g} and {fy:g} px; they must be at least {MIN_FOCAL_PX:g} px"
+        )
+    return Camera(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), width_px, height_px)
 
 
 class _Binary:

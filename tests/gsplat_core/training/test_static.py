@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_core.errors import InvalidSetting
-from gsplat_core.training.static import CompiledAdam, StaticConfig, StaticTrainer, TrainingCoordinates
+from gsplat_core import Camera
+from gsplat_core.errors import InvalidSetting, RecordingInvalid
+from gsplat_core.io.recordings.colmap import read_colmap
+from gsplat_core.training.static import CompiledAdam, StaticConfig, StaticTrainer, TrainingCoordinates, read_points
 from gsplat_core.training.strategies.adc import DefaultStrategy
 from gsplat_core.training.strategies.mcmc import MCMCStrategy
+from tests.colmap_writer import write_scene
 from tests.gsplat_core.training.posed_pictures import posed_pictures
 
 SHIFT = np.array([30.0, -20, 10])
@@ -108,3 +111,17 @@ def test_an_option_out_of_range_is_refused(option, value):
         StaticConfig(**{option: value})
     with pytest.raises(InvalidSetting, match="adc"):
         StaticConfig(strategy="mcmc", absgrad=True)
+
+
+@pytest.mark.parametrize(("z", "is_refused"), [(9.0, False), (-9.0, True)])
+def test_points_that_no_image_shows_are_refused(tmp_path, z, is_refused):
+    camera = Camera(np.array([[50.0, 0, 20], [0, 50.0, 15], [0, 0, 1]]), 40, 30)
+    # Only the last point can be inside the picture.
+    points = [(float(x), 0.0, 2.0, 1, 2, 3) for x in (20, 21, 22)] + [(0.0, 0.0, z, 1, 2, 3)]
+    write_scene(tmp_path / "sparse", [("0.png", camera)], text=True, points=points)
+    scene = read_colmap(tmp_path)
+    if is_refused:
+        with pytest.raises(RecordingInvalid, match=r"none of the 4 points .* do not belong together"):
+            read_points(scene)
+    else:
+        assert len(read_points(scene).positions) == 4

@@ -71,7 +71,7 @@ def test_no_scene(tmp_path):
         ("cameras.bin", lambda b: b[:12] + struct.pack("<i", 99) + b[16:], "number 99"),
         ("cameras.bin", lambda b: b[:16] + struct.pack("<Q", 2**40) + b[24:], "1099511627776x30"),
         ("cameras.bin", lambda b: b[:32] + struct.pack("<d", float("nan")) + b[40:], "must be below"),
-        ("cameras.bin", lambda b: b[:32] + struct.pack("<d", -5.0) + b[40:], "cannot be used"),
+        ("cameras.bin", lambda b: b[:32] + struct.pack("<d", -5.0) + b[40:], "at least 0.001 px"),
         ("images.bin", lambda b: b[:-1], "cut short"),
         ("images.bin", lambda b: b[:12] + struct.pack("<4d", 0, 0, 0, 0) + b[44:], "no rotation"),
         ("images.bin", lambda b: b.replace(b"set/", b"../_"), "not inside images"),
@@ -96,6 +96,9 @@ def test_a_malformed_binary_scene_is_refused_with_its_reason(tmp_path, file, cha
         ("images.txt", " 10 set", " ten set", "line 2"),
         ("images.txt", " 10 set", " set", "line 2"),
         ("images.txt", " 10 set/", " 10 /", "not inside images"),
+        ("cameras.txt", "20 PINHOLE", "10 PINHOLE", "defines camera 10 twice"),
+        ("cameras.txt", "PINHOLE 40 30 50.0", "PINHOLE 40 30 1e-4", "0.0001 and 50 px; they must be at least 0.001"),
+        ("images.txt", "set/001.png", "set/002.png", "has the image 'set/002.png' twice"),
     ],
 )
 def test_a_malformed_text_scene_is_refused_with_its_line(tmp_path, file, old, new, reason):
@@ -105,6 +108,12 @@ def test_a_malformed_text_scene_is_refused_with_its_line(tmp_path, file, old, ne
     path.write_text(path.read_text().replace(old, new))
     with pytest.raises(RecordingInvalid, match=reason):
         read_colmap(tmp_path)
+
+
+def test_points_that_no_model_can_have_are_refused(tmp_path):
+    write_scene(tmp_path / "sparse", cameras(), text=True, points=[(1.0, 2.0, 1.1e9, 255, 0, 7)])
+    with pytest.raises(RecordingInvalid, match=r"points3D.* beyond 1e\+09"):
+        read_colmap(tmp_path).points()
 
 
 @pytest.mark.parametrize("text", [True, False])
