@@ -402,7 +402,7 @@ def with_head_limits(head_s: float) -> type[H11Protocol]:
             if self.conn.our_state in (h11.IDLE, h11.SEND_RESPONSE):
                 error = sys.exception()
                 is_long = isinstance(error, h11.RemoteProtocolError) and error.error_status_hint == TOO_LONG
-                text = HEAD_TOO_LONG if is_long else f"the request is not valid HTTP/1.1: {error or msg}"
+                text = HEAD_TOO_LONG if is_long else f"the request cannot be parsed: {error or msg}"
                 self.transport.write(_refusal(TOO_LONG if is_long else 400, text))
             self.transport.close()
 
