@@ -12,6 +12,7 @@ Highlights, tools and the outside of the field of view have none.
 
 from __future__ import annotations
 
+from concurrent.futures import Executor
 from typing import Any
 
 import cv2
@@ -74,7 +75,14 @@ def local_contrast(grey: NDArray[np.uint8], usable: NDArray[np.bool_]) -> NDArra
 class ReferenceTracks:
     """Point tracker with reference pictures. Results are deterministic."""
 
-    def __init__(self) -> None:
+    def __init__(self, pool: Executor | None = None) -> None:
+        """Create a tracker without references.
+
+        Args:
+            pool: threads that search for the references in each picture, at most `MOST_REFERENCES` at once. None to
+                search for one after the other.
+        """
+        self._map = map if pool is None else pool.map
         self._flow: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
         self._before: NDArray[np.uint8] | None = None
         self._references: list[_Reference] = []
@@ -99,7 +107,8 @@ class ReferenceTracks:
         found: list[tuple[NDArray[np.int64], Points]] = []
         if self._before is not None and self._references:
             flow = self._flow.calc(self._before, picture, None)
-            found = [each for each in (one.found(picture, usable, flow) for one in self._references) if each]
+            search = lambda one: one.found(picture, usable, flow)
+            found = [each for each in self._map(search, self._references) if each]
             self._references = [one for one in self._references if one.missed <= MOST_MISSES]
         late = self._count - self._newest >= EVERY
         if not self._references or (found and (late or self._references[-1].share < RENEWED)):

@@ -20,8 +20,9 @@ robust loss. Periodic motion, such as breathing, is modelled explicitly if the r
 from __future__ import annotations
 
 from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+from copy import copy
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -30,9 +31,9 @@ from torch import Tensor
 
 from gsplat_core.endoscope.highlights import without_highlights
 from gsplat_core.errors import InvalidInput
-from gsplat_core.geometry.reference_tracks import ReferenceTracks
+from gsplat_core.geometry.reference_tracks import MOST_REFERENCES, ReferenceTracks
 from gsplat_core.geometry.tracks import Observations
-from gsplat_core.machine import one_thread
+from gsplat_core.machine import one_thread, usable_cores
 from gsplat_core.poses.breathing import BreathingTrajectory, Sightings, breathing_trajectory
 from gsplat_core.poses.bundle import Bundle, adjust, errors_px
 from gsplat_core.scene.cameras import Camera
@@ -113,13 +114,14 @@ def trajectory_of(frames: Iterable[Frame], camera: Camera, *, separate_breathing
         raise InvalidInput(
             f"poses are estimated for pinhole cameras, this one is {camera.model}: undistort the pictures"
         )
-    tracks, count = ReferenceTracks(), 0
-    times_s = []
-    for count, frame in enumerate(frames, start=1):
-        if count > MOST_FRAMES:
-            raise InvalidInput(f"poses are estimated for at most {MOST_FRAMES} frames at once: read fewer of them")
-        tracks.follow(frame.image, followed_part(frame))
-        times_s.append(frame.time_s)
+    count, times_s = 0, []
+    with ThreadPoolExecutor(min(usable_cores(), MOST_REFERENCES), thread_name_prefix="tracks") as pool:
+        tracks = ReferenceTracks(pool)
+        for count, frame in enumerate(frames, start=1):
+            if count > MOST_FRAMES:
+                raise InvalidInput(f"poses are estimated for at most {MOST_FRAMES} frames at once: read fewer of them")
+            tracks.follow(frame.image, followed_part(frame))
+            times_s.append(frame.time_s)
     if count < 3:
         raise InvalidInput(f"poses are estimated from at least 3 frames, got {count}")
     seen = tracks.observations(LEAST_SEEN if count > LEAST_SEEN else 3)
@@ -136,19 +138,6 @@ def followed_part(frame: Frame) -> NDArray[np.uint8] | None:
     """
     masks = [each for each in (frame.mask, frame.loss_mask, without_highlights(frame.image)) if each is not None]
     return np.logical_and.reduce([mask != 0 for mask in masks]).astype(np.uint8) if masks else None
-
-
-class _Followed(NamedTuple):
-    """Poses of all frames, estimated with one weight of the flatness prior."""
-
-    poses: Tensor
-    """World-to-camera poses [N, 4, 4]."""
-    points: Tensor
-    """Tissue points [P, 3] in the world."""
-    lost: list[int]
-    """Indices of frames with too few known points, which keep the pose of the frame before."""
-    error: float
-    """Robust error, summed over all observations."""
 
 
 class _Odometry:
@@ -174,9 +163,13 @@ class _Odometry:
     @one_thread()
     def run(self, separate_breathing: bool) -> Trajectory:
         """Estimate the poses once with and once without the flatness prior, and keep those with the lower robust error."""
-        found = [self._followed(flat_px) for flat_px in (0.0, FLAT_PX)]
-        best = min(found, key=lambda each: each.error)
-        self._poses, self._points, self._lost = best.poses, best.points, best.lost
+        runs = copy(self), copy(self)
+        with ThreadPoolExecutor(len(runs), thread_name_prefix="path") as pool:
+            errors = list(pool.map(_Odometry._follow, runs, (0.0, FLAT_PX)))
+        return runs[errors.index(min(errors))]._completed(separate_breathing)
+
+    def _completed(self, separate_breathing: bool) -> Trajectory:
+        """Return the estimate. Lost frames get the pose of the frame before."""
         moving = self._refined_for_breathing() if separate_breathing else None
         if moving is not None:
             self._poses = moving.poses
@@ -184,8 +177,9 @@ class _Odometry:
             self._poses[frame] = self._poses[frame - 1]
         return self._result(moving)
 
-    def _followed(self, flat_px: float) -> _Followed:
-        """Process all frames in order, then place the frames between key frames again with the final points.
+    def _follow(self, flat_px: float) -> float:
+        """Process all frames in order, then place the frames between key frames again with the final points. Return the
+        robust error, summed over all observations.
 
         Args:
             flat_px: weight of the prior that all points have similar depths; it is used until the last key frame.
@@ -210,8 +204,7 @@ class _Odometry:
         for frame in range(1, self._count):
             if not self._is_key[frame]:
                 self._place(frame)
-        error = float(torch.log1p(errors_px(self._whole()).square()).sum())
-        return _Followed(self._poses, self._points, self._lost, error)
+        return float(torch.log1p(errors_px(self._whole()).square()).sum())
 
     def _whole(self) -> Bundle:
         """Return the bundle of all frames and their known points."""
