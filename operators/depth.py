@@ -127,6 +127,25 @@ def without_depth(choice: str, fields: frozenset[str], config: ReconstructorConf
     )
 
 
+def without_right_eye(depth: str, eyes: str | None, fields: frozenset[str], name: str) -> str | None:
+    """Return a note for a run that asks for the right eye of frames that have one eye; None otherwise.
+
+    Args:
+        depth: the setting `depth`.
+        eyes: the setting `eyes`.
+        fields: names of the fields that the frames have.
+        name: name of the recording or stream, quoted in the note.
+    """
+    asked = [
+        f"{key} is {value!r}"
+        for key, value, both in (("depth", depth, "stereo"), ("eyes", eyes, "both"))
+        if value == both
+    ]
+    if not asked or "right_image" in fields:
+        return None
+    return f"{' and '.join(asked)}, but {name} has one eye, so that this has no effect"
+
+
 FEW_CORES = 4
 """Largest number of cores at which depth estimation is throttled, because training uses them all."""
 SHARE_OF_FEW = 0.25

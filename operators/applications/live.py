@@ -36,6 +36,7 @@ from operators.applications.working_size import (
     measured_frame_s,
     trial_run,
 )
+from operators.depth import without_right_eye
 from operators.frame_clock import FrameClock
 from operators.messages import DeformedScene, ShownPicture
 from operators.metrics import ScoredFrame
@@ -349,6 +350,9 @@ def prepare(settings: LiveSettings, notes: list[str]) -> FrameSource:
     )
     check_picture(source.description.camera, settings.given_scale)
     check_poses(settings.poses, source.description.camera)
-    notes.extend(source.description.notes)
+    about = source.description
+    notes.extend(about.notes)
+    if (note := without_right_eye(settings.depth, settings.eyes, about.fields, about.name)) is not None:
+        notes.append(note)
     StorageReserve(settings.out, lambda: REPORT_RESERVE_BYTES).require()
     return source

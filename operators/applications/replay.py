@@ -40,7 +40,7 @@ from operators.applications.session import (
     saves_model,
     seeded,
 )
-from operators.depth import without_depth
+from operators.depth import without_depth, without_right_eye
 from operators.metrics import ScoredFrame
 from operators.pipeline import REPORT_RESERVE_BYTES, Outputs, Pace, Pipeline
 from operators.pose import check_poses
@@ -247,8 +247,11 @@ def prepare(settings: ReplaySettings, notes: list[str], *, offline: bool = False
             "give a smaller --scale or --max-frames",
         )
     notes.extend(description.notes)
-    if (note := lacking_depth(settings, description, config)) is not None:
-        notes.append(note)
+    lacking = (
+        without_right_eye(settings.depth, settings.eyes, description.fields, description.name),
+        lacking_depth(settings, description, config),
+    )
+    notes.extend(note for note in lacking if note is not None)
     StorageReserve(settings.out, lambda: REPORT_RESERVE_BYTES).require()
     return source
 

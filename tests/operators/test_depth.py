@@ -15,7 +15,7 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_origin import BELIEVED, DEPTH_ORIGINS
 from gsplat_core.scene.frames import FrameStatus
 from gsplat_core.training.config import ReconstructorConfig
-from operators.depth import DepthCounts, DepthOp, FoundDepth, without_depth
+from operators.depth import DepthCounts, DepthOp, FoundDepth, without_depth, without_right_eye
 from operators.outcome import OutcomeBuilder
 
 CAMERA = Camera.from_focal(20.0, 24, 16)
@@ -141,6 +141,22 @@ def test_it_is_said_what_a_model_without_depth_means():
     assert "unless the two eyes show" in without_depth("auto", frozenset({"right_image"}), config)
     assert "unless the given poses show" in without_depth("auto", frozenset({"pose"}), config)
     assert "unless" not in without_depth("recorded", frozenset({"pose"}), config)
+
+
+@pytest.mark.parametrize(
+    ("depth", "eyes", "asked"),
+    [
+        ("stereo", "both", "depth is 'stereo' and eyes is 'both'"),
+        ("stereo", None, "depth is 'stereo'"),
+        ("auto", "both", "eyes is 'both'"),
+        ("auto", "left", None),
+        ("parallax", None, None),
+    ],
+)
+def test_a_right_eye_that_the_frames_lack_is_noted(depth, eyes, asked):
+    found = without_right_eye(depth, eyes, frozenset({"pose"}), "clip.mp4")
+    assert found == (None if asked is None else f"{asked}, but clip.mp4 has one eye, so that this has no effect")
+    assert without_right_eye(depth, eyes, frozenset({"right_image"}), "clip.mp4") is None
 
 
 def test_a_scene_that_depth_by_light_starts_is_not_said_to_start_on_a_plane_for_certain():
