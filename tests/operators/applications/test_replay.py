@@ -260,7 +260,7 @@ def test_all_checks_are_made_before_the_first_frame(tmp_path, monkeypatch, devic
     source, config = SimpleNamespace(description=description), object()
     settings = SimpleNamespace(
         device=device, renderer="alpha", renderer_options="options", recording="recording", given_scale=0.5, max_frames=7,
-        losses=("flow",), poses="auto", out=tmp_path,
+        losses=("flow",), poses="auto", out=tmp_path, depth="stereo", eyes=None,
         reconstructor_config=lambda pixels=None, offline=False: made.append(("config", pixels, offline)) or config,
     )  # fmt: skip
     for name in ("check_device", "check_renderer", "check_compared", "check_picture", "check_poses"):
@@ -272,7 +272,8 @@ def test_all_checks_are_made_before_the_first_frame(tmp_path, monkeypatch, devic
     monkeypatch.setattr(replay_module.StorageReserve, "require", lambda self: made.append("storage"))
     notes = []
     assert replay_module.prepare(settings, notes, offline=offline) is source
-    assert notes == ["a note", "no depth"]
+    no_eye = "depth is 'stereo', but clip has one eye, so that this has no effect"
+    assert notes == ["a note", no_eye, "no depth"]
     options = replay_module.SourceOptions(0.5, 7)
     before = [
         ("check_device", device), ("check_renderer", "alpha", device), ("config", None, offline), options,
