@@ -243,9 +243,10 @@ def end_now() -> None:
     """End the process with exit code 130 at once, without unfinished files. Threads that still compute in compiled code would
     abort an ordinary end.
     """
-    files = sys.modules.get("gsplat_core.io.files")
-    if files is not None:
-        files.remove_unfinished()
+    # Absent until the module is imported, and while an interrupt ends its import. Nothing is unfinished then.
+    remove_unfinished = getattr(sys.modules.get("gsplat_core.io.files"), "remove_unfinished", None)
+    if remove_unfinished is not None:
+        remove_unfinished()
     os._exit(INTERRUPTED)
 
 

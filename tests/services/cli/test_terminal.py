@@ -76,6 +76,23 @@ def test_a_long_word_is_shortened_in_the_middle():
     )
 
 
+@pytest.mark.parametrize("imported", ["absent", "half imported"])
+def test_an_interrupt_during_an_import_ends_without_a_traceback(imported):
+    program = (
+        "import os, signal, sys, types\n"
+        "from services.cli import terminal\n"
+        "terminal.end_on_interrupt()\n"
+        "name = 'gsplat_core.io.files'\n"
+        "sys.modules.pop(name, None)\n"
+        "if sys.argv[1] == 'half imported': sys.modules[name] = types.ModuleType(name)\n"
+        "os.kill(os.getpid(), signal.SIGINT)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, imported], capture_output=True, text=True, timeout=300, check=False
+    )
+    assert (done.returncode, done.stderr) == (130, "interrupted\n")
+
+
 PROGRAM = """
 import os, signal, sys, threading, time
 from services.cli import terminal
