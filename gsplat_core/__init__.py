@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from gsplat_core.models import Model, Snapshot, SnapshotSlots
     from gsplat_core.ops.compositing import accumulate, rasterize_to_indices_in_range, rasterize_to_pixels
     from gsplat_core.ops.covariance import quat_scale_to_covar_preci
-    from gsplat_core.ops.projection.projection import fully_fused_projection
-    from gsplat_core.ops.projection.separate_steps import proj, world_to_cam
+    from gsplat_core.ops.plain_torch import proj, world_to_cam
+    from gsplat_core.ops.projection import fully_fused_projection
     from gsplat_core.ops.spherical_harmonics import spherical_harmonics
     from gsplat_core.ops.ssim import fused_ssim
     from gsplat_core.ops.surfel_blending import (
@@ -143,7 +143,7 @@ _HOME = {
     "accumulate": "ops.compositing",
     "accumulate_2dgs": "ops.surfel_blending",
     "export_splats": "io.exports.export",
-    "fully_fused_projection": "ops.projection.projection",
+    "fully_fused_projection": "ops.projection",
     "fully_fused_projection_2dgs": "ops.surfel_projection",
     "fully_fused_projection_with_ut": "ops.unscented_projection",
     "fused_ssim": "ops.ssim",
@@ -153,7 +153,7 @@ _HOME = {
     "load_ply": "io.ply",
     "new_renderer": "rendering.renderer",
     "open_recording": "io.recordings",
-    "proj": "ops.projection.separate_steps",
+    "proj": "ops.plain_torch",
     "quat_scale_to_covar_preci": "ops.covariance",
     "rasterization": "rendering.rasterization",
     "rasterization_2dgs": "rendering.surfels",
@@ -169,7 +169,7 @@ _HOME = {
     "save_gaussians": "io.exports.export",
     "save_ply": "io.ply",
     "spherical_harmonics": "ops.spherical_harmonics",
-    "world_to_cam": "ops.projection.separate_steps",
+    "world_to_cam": "ops.plain_torch",
 }
 """Import path of the module that defines each public name."""
 

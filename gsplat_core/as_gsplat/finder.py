@@ -37,12 +37,12 @@ _CUDA = {
     "FThetaPolynomialType": "gsplat_core.scene.distortion",
     "RollingShutterType": "gsplat_core.poses.rolling_shutter",
     "UnscentedTransformParameters": "gsplat_core.ops.unscented_projection",
-    "fully_fused_projection": "gsplat_core.ops.projection.projection",
+    "fully_fused_projection": "gsplat_core.ops.projection",
     "fully_fused_projection_2dgs": "gsplat_core.ops.surfel_projection",
     "fully_fused_projection_with_ut": "gsplat_core.ops.unscented_projection",
     "isect_offset_encode": "gsplat_core.ops.tiles",
     "isect_tiles": "gsplat_core.ops.tiles",
-    "proj": "gsplat_core.ops.projection.separate_steps",
+    "proj": "gsplat_core.ops.plain_torch",
     "quat_scale_to_covar_preci": "gsplat_core.ops.covariance",
     "rasterize_to_indices_in_range": "gsplat_core.ops.compositing",
     "rasterize_to_indices_in_range_2dgs": "gsplat_core.ops.surfel_blending",
@@ -50,7 +50,7 @@ _CUDA = {
     "rasterize_to_pixels_2dgs": "gsplat_core.ops.surfel_blending",
     "rasterize_to_pixels_eval3d": "gsplat_core.ops.world_blending",
     "spherical_harmonics": "gsplat_core.ops.spherical_harmonics",
-    "world_to_cam": "gsplat_core.ops.projection.separate_steps",
+    "world_to_cam": "gsplat_core.ops.plain_torch",
 }
 _RENDERING = {
     "rasterization": "gsplat_core.rendering.rasterization",

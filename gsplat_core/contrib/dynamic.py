@@ -16,8 +16,8 @@ from torch import Tensor
 
 from gsplat_core.deformation.field import ops_for
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.hexplane import hexplane as compiled
-from gsplat_core.ops.hexplane import plain_torch
+from gsplat_core.ops import hexplane as compiled
+from gsplat_core.ops import plain_torch
 from gsplat_core.training.strategies.adc import DefaultStrategy
 from gsplat_core.training.strategies.strategy import Optimizers, Params
 

@@ -31,9 +31,9 @@ from gsplat_core.deformation.field import Capabilities, Continuation, Deformatio
 from gsplat_core.deformation.kinds import PARAMETER_BYTES, FieldKind, FieldRates, NewField
 from gsplat_core.deformation.regularisers import least_squares_weights, towards_neighbours_, towards_others_
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.basis_field import basis_field as compiled
-from gsplat_core.ops.basis_field import plain_torch
-from gsplat_core.ops.basis_field.plain_torch import BASIS_CHANNELS
+from gsplat_core.ops import basis_field as compiled
+from gsplat_core.ops import plain_torch
+from gsplat_core.ops.plain_torch import BASIS_CHANNELS
 from gsplat_core.scene.gaussians import POSITION, ROTATION, Gaussians
 from gsplat_core.transfers import copy_each
 from gsplat_core.value_ranges import IntegerIn, NumberIn

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gsplat_core.deformation.field import ContinuedField, checked_window
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.basis_field.plain_torch import BASIS_CHANNELS, BUMP_REACH
+from gsplat_core.ops.plain_torch import BASIS_CHANNELS, BUMP_REACH
 from gsplat_core.scene.gaussians import Gaussians, RowMoves
 
 

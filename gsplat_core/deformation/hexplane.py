@@ -20,9 +20,8 @@ from gsplat_core.deformation.field import Capabilities, DeformationField, WholeF
 from gsplat_core.deformation.kinds import FieldKind, NewField, OneRate
 from gsplat_core.deformation.regularisers import towards_neighbours_
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.hexplane import hexplane as compiled
-from gsplat_core.ops.hexplane import plain_torch
-from gsplat_core.ops.hexplane.plain_torch import HEAD_COLUMNS, HEAD_GROUPS, PLANE_AXES
+from gsplat_core.ops import hexplane as compiled
+from gsplat_core.ops import plain_torch
 from gsplat_core.ops.hexplane_deltas import hexplane_deltas, takes_layers
 from gsplat_core.ops.hexplane_training import (
     AdamOnDevice,
@@ -33,6 +32,7 @@ from gsplat_core.ops.hexplane_training import (
     hexplane_train_backward,
     network_adam_,
 )
+from gsplat_core.ops.plain_torch import HEAD_COLUMNS, HEAD_GROUPS, PLANE_AXES
 from gsplat_core.scene.gaussians import Gaussians, width_of
 from gsplat_core.value_ranges import IntegerIn, ListOf
 

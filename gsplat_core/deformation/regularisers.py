@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.machine import one_thread
-from gsplat_core.ops.basis_field.plain_torch import basis_field
+from gsplat_core.ops.plain_torch import basis_field
 
 ROWS_AT_ONCE = 1 << 14
 """Number of rows processed at once, to bound memory."""

@@ -1,14 +1,19 @@
-"""Loader of the compiled core and, if built, of the CUDA kernels.
+"""The compiled core: loader of its library and, if built, of the CUDA kernels, and registration of the ops' gradients.
 
-Reports the remedy if a library is missing.
+Importing this module loads the libraries. An error about a missing one states the remedy.
 """
 
 from __future__ import annotations
 
 import ctypes
+import functools
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import torch
+from torch import Tensor
+from torch.autograd import Function
 
 from gsplat_core.errors import NativeLibraryMissing
 
@@ -82,3 +87,44 @@ def cuda_refusal() -> str | None:
 load_native()
 CUDA_MISSING = load_cuda()
 """Reason why the CUDA kernels are unavailable; None if they are loaded."""
+
+
+class _Unfollowed(Function):
+    """Gradients that are part of a graph, so that differentiating them fails instead of giving zero."""
+
+    @staticmethod
+    def forward(ctx: Any, anchor: Tensor, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+        return tuple(None if each is None else each.clone() for each in gradients)
+
+    @staticmethod
+    def backward(ctx: Any, *v: Tensor | None) -> Any:
+        raise NotImplementedError(
+            "compiled operations have first derivatives only; detach the gradient, leave create_graph out, or take differences"
+            " of first derivatives"
+        )
+
+
+def differentiable_once(backward: Callable[..., Any]) -> Callable[..., Any]:
+    """Return `backward` of an operation whose result raises NotImplementedError if it is differentiated again.
+
+    torch would take gradients of compiled code for constants, and sum up second derivatives without them.
+    `once_differentiable` of torch is not enough: it raises only if the given gradients are differentiated, too.
+    """
+
+    @functools.wraps(backward)
+    def called(ctx: Any, *v: Any) -> Any:
+        if not torch.is_grad_enabled():  # without create_graph
+            return backward(ctx, *v)
+        with torch.no_grad():
+            found = backward(ctx, *v)
+        anchor = torch.zeros((), requires_grad=True)
+        if isinstance(found, tuple):
+            return _Unfollowed.apply(anchor, *found)
+        return _Unfollowed.apply(anchor, found)[0]
+
+    return called
+
+
+def register_gradient(name: str, backward: Callable[..., Any], *, setup_context: Callable[..., None]) -> None:
+    """Register the backward function of an operation, as `torch.library.register_autograd`, for first derivatives."""
+    torch.library.register_autograd(name, differentiable_once(backward), setup_context=setup_context)

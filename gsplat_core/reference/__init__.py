@@ -3,14 +3,12 @@
 They are the reference for tests of the compiled ops.
 """
 
-from gsplat_core.ops.basis_field.plain_torch import (
+from gsplat_core.ops.plain_torch import (
     basis_field,
     basis_field_add_colours_,
     basis_field_backward,
     basis_field_backward_adam_,
     basis_field_move_to_,
-)
-from gsplat_core.ops.hexplane.plain_torch import (
     hexplane_decode,
     hexplane_deltas,
     hexplane_features,

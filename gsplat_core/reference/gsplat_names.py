@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.ops.arguments import DenseProjection, DenseSurfels
-from gsplat_core.ops.projection.separate_steps import proj, world_to_cam
+from gsplat_core.ops.plain_torch import proj, world_to_cam
 from gsplat_core.reference.compositing import rasterize_to_pixels
 from gsplat_core.reference.projection import (
     fully_fused_projection,

@@ -23,7 +23,7 @@ from gsplat_core.ops.arguments import (
     check_projection_tensors,
     check_sparse_gradient,
 )
-from gsplat_core.ops.projection.separate_steps import PROJECTIONS
+from gsplat_core.ops.plain_torch import PROJECTIONS
 
 TRIU_ROWS = (0, 0, 0, 1, 1, 2)
 TRIU_COLUMNS = (0, 1, 2, 1, 2, 2)

@@ -21,7 +21,7 @@ from gsplat_core.geometry.registration import nearest_others
 from gsplat_core.ops.arguments import DenseProjection, TileGrid
 from gsplat_core.ops.flow_blending import blend_flow
 from gsplat_core.ops.neighbour_motion import neighbour_motion
-from gsplat_core.ops.projection.projection import fully_fused_projection
+from gsplat_core.ops.projection import fully_fused_projection
 from gsplat_core.ops.splat_rays import RAY_NUMBERS, splat_rays
 from gsplat_core.ops.tiles import bin_splats
 from gsplat_core.rendering.settings import TILE_SIZE

@@ -16,7 +16,7 @@ from gsplat_core.ops.arguments import require_shape
 from gsplat_core.ops.compositing import rasterize_to_pixels
 from gsplat_core.ops.frame import STATUS_NEEDED, STATUS_OVERFLOW, View, render_frame
 from gsplat_core.ops.packed_projection import values_of_rows, visible_harmonics
-from gsplat_core.ops.projection.projection import fully_fused_projection
+from gsplat_core.ops.projection import fully_fused_projection
 from gsplat_core.ops.spherical_harmonics import spherical_harmonics
 from gsplat_core.ops.tiles import bin_splats
 from gsplat_core.rendering.pipeline import Operations

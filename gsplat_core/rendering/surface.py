@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.ops.arguments import DenseProjection, TileGrid, View, require_shape
-from gsplat_core.ops.projection.projection import fully_fused_projection
+from gsplat_core.ops.projection import fully_fused_projection
 from gsplat_core.ops.tiles import bin_splats
 from gsplat_core.rendering.depth_maps import depth_normals
 from gsplat_core.rendering.settings import TILE_SIZE

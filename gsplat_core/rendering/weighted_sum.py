@@ -18,7 +18,7 @@ from torch import Tensor
 from gsplat_core.errors import InvalidInput
 from gsplat_core.models import Model, Snapshot
 from gsplat_core.ops.arguments import DenseProjection, TileGrid
-from gsplat_core.ops.projection.projection import fully_fused_projection
+from gsplat_core.ops.projection import fully_fused_projection
 from gsplat_core.ops.spherical_harmonics import spherical_harmonics
 from gsplat_core.ops.tiles import bin_splats
 from gsplat_core.ops.weighted_sum import weighted_sums

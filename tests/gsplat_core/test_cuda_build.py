@@ -24,7 +24,7 @@ from gsplat_core.ops.frame_gradients import (
     render_frame_backward_adam_,
 )
 from gsplat_core.ops.image_loss import frame_loss
-from gsplat_core.ops.projection.projection import fully_fused_projection
+from gsplat_core.ops.projection import fully_fused_projection
 from gsplat_core.ops.spherical_harmonics import spherical_harmonics
 from gsplat_core.ops.tiles import bin_splats
 

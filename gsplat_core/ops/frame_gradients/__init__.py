@@ -13,9 +13,8 @@ import torch
 from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
 from gsplat_core.ops.arguments import GAUSSIAN_TENSORS, View, check_inputs, require_shape
-from gsplat_core.ops.derivatives import register_gradient
+from gsplat_core.ops.native import register_gradient
 from gsplat_core.scene.gaussians import COLOUR, LOG_SCALE, OPACITY, POSITION, RAW_COLUMNS, ROTATION
 
 if TYPE_CHECKING:

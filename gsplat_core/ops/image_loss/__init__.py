@@ -11,9 +11,8 @@ import torch
 from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops import native  # noqa: F401  registers the compiled op
 from gsplat_core.ops.arguments import ImageLoss
-from gsplat_core.ops.derivatives import register_gradient
+from gsplat_core.ops.native import register_gradient
 from gsplat_core.ops.ssim import MAX_CHANNELS
 
 STEEP_AS_L1 = 0.01

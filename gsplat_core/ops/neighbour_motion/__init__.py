@@ -11,9 +11,8 @@ import torch
 from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops import native  # noqa: F401  registers the compiled op
 from gsplat_core.ops.arguments import require_float32, require_shape
-from gsplat_core.ops.derivatives import register_gradient
+from gsplat_core.ops.native import register_gradient
 
 
 def neighbour_motion(before: Tensor, after: Tensor, turned: Tensor, neighbours: Tensor, stiffness: float) -> Tensor:

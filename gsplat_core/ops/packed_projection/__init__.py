@@ -16,10 +16,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsplat_core.ops import native  # noqa: F401  registers the compiled op
 from gsplat_core.ops.arguments import FOV_MARGIN, PackedProjection, Pairs, check_spherical_harmonics_arguments
 from gsplat_core.ops.covariance import quat_scale_to_covar_preci
-from gsplat_core.ops.derivatives import differentiable_once
+from gsplat_core.ops.native import differentiable_once
 from gsplat_core.scene.cameras import CAMERA_MODELS
 
 NEAR_AXIS = 0.0625

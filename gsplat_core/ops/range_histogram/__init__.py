@@ -8,9 +8,8 @@ import torch
 from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops import native  # noqa: F401  registers the compiled op
 from gsplat_core.ops.arguments import check_max_alpha, require_float32, require_tiled_splats
-from gsplat_core.ops.derivatives import register_gradient
+from gsplat_core.ops.native import register_gradient
 from gsplat_core.ops.splat_rays import RAY_NUMBERS
 
 MOST_BINS = 65536

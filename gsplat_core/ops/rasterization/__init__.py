@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 from torch.autograd import Function
 
-from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
-from gsplat_core.ops.derivatives import differentiable_once
+from gsplat_core.ops.native import differentiable_once
 
 PLAIN_COLORS = -1
 """Value of `Options.degree` for plain colours without spherical harmonics, at most `MOST_PLAIN_COLORS` channels."""

@@ -16,9 +16,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
 from gsplat_core.ops.arguments import require_float32, require_shape
-from gsplat_core.ops.derivatives import register_gradient
+from gsplat_core.ops.native import register_gradient
 from gsplat_core.scene.cameras import CameraModel
 
 RAY_NUMBERS = 10

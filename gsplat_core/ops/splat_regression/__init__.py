@@ -8,9 +8,8 @@ import torch
 from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops import native  # noqa: F401  registers the compiled op
 from gsplat_core.ops.arguments import require_float32
-from gsplat_core.ops.derivatives import register_gradient
+from gsplat_core.ops.native import register_gradient
 
 MOST_DIMENSIONS = 4
 """Largest number of dimensions of the points at which a splat regression is evaluated."""

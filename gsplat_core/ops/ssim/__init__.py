@@ -6,8 +6,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops import native  # noqa: F401  registers the compiled op
-from gsplat_core.ops.derivatives import register_gradient
+from gsplat_core.ops.native import register_gradient
 
 MAX_CHANNELS = 32
 WINDOW_RADIUS_PX = 5

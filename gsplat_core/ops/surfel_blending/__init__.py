@@ -13,10 +13,9 @@ import torch
 from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops import native  # noqa: F401  registers the compiled ops
 from gsplat_core.ops.arguments import require_shape, require_trailing
 from gsplat_core.ops.compositing import MAX_ALPHA, MIN_ALPHA, blend_pairs, blended_pairs
-from gsplat_core.ops.derivatives import register_gradient
+from gsplat_core.ops.native import register_gradient
 
 MAX_CHANNELS = 16
 """Colour channels of one call of the compiled op; more of them are blended in several calls."""

@@ -8,7 +8,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsplat_core.ops import native  # noqa: F401  registers the compiled op
 from gsplat_core.ops.arguments import (
     DenseSurfels,
     PackedSurfels,
@@ -16,7 +15,7 @@ from gsplat_core.ops.arguments import (
     pack_surfels,
     require_float32,
 )
-from gsplat_core.ops.derivatives import register_gradient
+from gsplat_core.ops.native import register_gradient
 
 
 def fully_fused_projection_2dgs(

@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops import native  # noqa: F401  registers the compiled op
 from gsplat_core.ops.arguments import (
     ALPHA_CUTOFF,
     COMPENSATION_FLOOR,
@@ -26,7 +25,7 @@ from gsplat_core.ops.arguments import (
     require_same_kind,
     require_shape,
 )
-from gsplat_core.ops.derivatives import register_gradient
+from gsplat_core.ops.native import register_gradient
 from gsplat_core.poses.rolling_shutter import RollingShutterType, Shutter
 from gsplat_core.scene.cameras import CAMERA_MODELS
 from gsplat_core.scene.distortion import FThetaCameraDistortionParameters, Lens

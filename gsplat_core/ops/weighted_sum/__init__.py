@@ -10,9 +10,8 @@ import torch
 from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops import native  # noqa: F401  registers the compiled op
 from gsplat_core.ops.arguments import require_float32, require_shape, require_tiled_splats
-from gsplat_core.ops.derivatives import register_gradient
+from gsplat_core.ops.native import register_gradient
 
 MOST_CHANNELS = 32
 """Largest number of channels; `kMostChannels` of `weighted_sum.h`."""

@@ -24,7 +24,7 @@ from gsplat_core.errors import InvalidSetting
 from gsplat_core.ops.correct_colours import correct_colours
 from gsplat_core.ops.frame_gradients import ColourCorrection
 from gsplat_core.ops.image_loss import STEEP_AS_L1, image_loss
-from gsplat_core.ops.projection.projection import fully_fused_projection
+from gsplat_core.ops.projection import fully_fused_projection
 from gsplat_core.ops.spherical_harmonics import spherical_harmonics
 from gsplat_core.ops.tiles import bin_splats
 from gsplat_core.rendering.pipeline import ColoredSplats, Geometry, RenderedSplats, StepOperations, render_splats

@@ -5,8 +5,8 @@ import itertools
 import torch
 
 from gsplat_core import reference
-from gsplat_core.ops.hexplane.plain_torch import HEAD_COLUMNS, PLANE_AXES
 from gsplat_core.ops.hexplane_training import hexplane_train, hexplane_train_backward
+from gsplat_core.ops.plain_torch import HEAD_COLUMNS, PLANE_AXES
 from gsplat_core.scene.gaussians import RAW_COLUMNS
 
 BOX = torch.tensor([[-2.0, -1.0, 0.5], [2.0, 3.0, 1.5]])

@@ -7,7 +7,7 @@ import torch
 
 from gsplat_core import reference
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.hexplane.hexplane import hexplane_decode, hexplane_features, hexplane_modulate, hexplane_space
+from gsplat_core.ops.hexplane import hexplane_decode, hexplane_features, hexplane_modulate, hexplane_space
 from gsplat_core.ops.hexplane_deltas import hexplane_deltas, takes_layers
 
 AXES = ((0, 1), (0, 2), (1, 2), (0, 3), (1, 3), (2, 3))

@@ -7,9 +7,9 @@ import time
 
 import torch
 
-from gsplat_core.ops.hexplane.plain_torch import PLANE_AXES
 from gsplat_core.ops.hexplane_training import hexplane_train
 from gsplat_core.ops.native import CUDA_LIBRARY_PATH
+from gsplat_core.ops.plain_torch import PLANE_AXES
 
 
 def resources() -> int:

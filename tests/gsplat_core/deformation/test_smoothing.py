@@ -12,7 +12,7 @@ from gsplat_core.deformation.regularisers import (
     towards_neighbours_,
     towards_others_,
 )
-from gsplat_core.ops.basis_field.plain_torch import basis_field
+from gsplat_core.ops.plain_torch import basis_field
 
 
 @pytest.mark.parametrize("amount", [0.0, 0.3, 1.0])

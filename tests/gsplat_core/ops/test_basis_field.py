@@ -5,7 +5,7 @@ import torch
 
 from gsplat_core import reference
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.basis_field.basis_field import (
+from gsplat_core.ops.basis_field import (
     basis_field,
     basis_field_backward,
     basis_field_backward_adam_,

@@ -5,8 +5,8 @@ import torch
 
 from gsplat_core import reference
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.basis_field import basis_field as compiled
-from gsplat_core.ops.basis_field.basis_field import basis_field, basis_field_add_colours_
+from gsplat_core.ops import basis_field as compiled
+from gsplat_core.ops.basis_field import basis_field, basis_field_add_colours_
 from tests.gsplat_core.ops.test_basis_field import bumps, gradient_of
 
 

@@ -5,7 +5,7 @@ import torch
 
 from gsplat_core import reference
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.basis_field.basis_field import basis_field, basis_field_move_to_
+from gsplat_core.ops.basis_field import basis_field, basis_field_move_to_
 from tests.gsplat_core.ops.test_basis_field import bumps, gradient_of
 
 

@@ -7,7 +7,7 @@ import torch
 
 from gsplat_core import reference
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.hexplane.hexplane import hexplane_decode, hexplane_features, hexplane_modulate, hexplane_space
+from gsplat_core.ops.hexplane import hexplane_decode, hexplane_features, hexplane_modulate, hexplane_space
 
 
 def level(channels=32, sizes=(9, 7, 8, 5), dtype=torch.float32, seed=0):

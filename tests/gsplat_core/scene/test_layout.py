@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 import gsplat_core
-from gsplat_core.ops.basis_field.plain_torch import BASIS_CHANNELS
-from gsplat_core.ops.hexplane.plain_torch import HEAD_COLUMNS
+from gsplat_core.ops.plain_torch import BASIS_CHANNELS, HEAD_COLUMNS
 from gsplat_core.scene import gaussians
 
 HEADER = Path(gsplat_core.__file__).parent / "native" / "raw_layout.h"

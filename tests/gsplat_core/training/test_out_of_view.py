@@ -140,7 +140,7 @@ def test_only_what_lies_on_tissue_in_the_picture_is_seen():
 
 @pytest.mark.parametrize("model", ["pinhole", "fisheye", "ortho"])
 def test_pixels_are_those_of_the_renderer(model):
-    from gsplat_core.ops.projection.projection import fully_fused_projection
+    from gsplat_core.ops.projection import fully_fused_projection
 
     camera = Camera(CAMERA.K if model != "ortho" else np.diag([0.8, 0.8, 1.0]) + np.array([[0, 0, 24.0], [0, 0, 20], [0, 0, 0]]),
                     WIDTH, HEIGHT, model=model)  # fmt: skip
