@@ -27,7 +27,7 @@ from gsplat_core.io.recordings.truth import GroundTruth
 from gsplat_core.scene.cameras import Camera, at_pixels, inverse, moved, pixel_rays, pixels_of, points_of
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.metrics import PSNR_CAP_DB, ScoredMean
-from gsplat_core.training.right_eye import right_tissue, typical_shift
+from gsplat_core.training.observations import right_tissue, typical_shift
 
 SAME_DEPTH = 0.02
 """Relative depth tolerance within which two cameras see the same point."""

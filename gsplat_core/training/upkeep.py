@@ -25,11 +25,18 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.growth.covering import Covering, OutOfView, fill_new_tissue, grid_spacing, has_moved
-from gsplat_core.training.growth.initialisation import SIGMA_IN_SPACINGS
-from gsplat_core.training.growth.unseen import LastSeen, around_cells, depth_of, pixels_of, value_at
+from gsplat_core.training.covering import (
+    Covering,
+    LastSeen,
+    OutOfView,
+    around_cells,
+    fill_new_tissue,
+    grid_spacing,
+    has_moved,
+)
+from gsplat_core.training.initialisation import SIGMA_IN_SPACINGS
 from gsplat_core.training.motion.prior import Following
-from gsplat_core.training.observations import Observation
+from gsplat_core.training.observations import Observation, depth_of, pixels_of, value_at
 from gsplat_core.training.steps.step import TrainingStep
 from gsplat_core.training.strategies.streaming import halves
 

@@ -23,9 +23,9 @@ from gsplat_core.models import Model
 from gsplat_core.poses.camera_path import MOVING_SHARE, CameraPath, camera_path_of, rigid_share
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training import validation
+from gsplat_core.training.observations import BothEyes
 from gsplat_core.training.offline import ToFit
 from gsplat_core.training.reconstructor import Reconstructor
-from gsplat_core.training.right_eye import BothEyes
 from gsplat_core.training.schedule import Budget, ObserveReport
 from gsplat_core.training.validation import (
     INPUT_GAIN_DB,

@@ -12,7 +12,7 @@ import pytest
 from gsplat_core.models import Model
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
-from gsplat_core.training.growth.initialisation import gaussians_from_frame
+from gsplat_core.training.initialisation import gaussians_from_frame
 from operators.messages import RenderedFrame
 
 WIDTH, HEIGHT = 24, 16

@@ -16,9 +16,8 @@ from gsplat_core.ops.image_loss import image_loss
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.rendering.surface import SEMANTICS
 from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.training.growth.unseen import depth_of
 from gsplat_core.training.losses.rays import EVERY, RenderedRays, rays_of
-from gsplat_core.training.observations import Observation
+from gsplat_core.training.observations import Observation, depth_of
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from gsplat_core.models import Model
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.growth.initialisation import gaussians_from_frame
+from gsplat_core.training.initialisation import gaussians_from_frame
 from gsplat_core.training.reconstructor import Reconstructor
 
 WIDTH, HEIGHT = 24, 16

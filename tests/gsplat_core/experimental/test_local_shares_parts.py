@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from gsplat_core.experimental.learned_prior import LocalShares, SharesSettings, cells_for
-from gsplat_core.training.growth.initialisation import blur_sigma_px, jittered_grid, unprojected
+from gsplat_core.training.initialisation import blur_sigma_px, jittered_grid
+from gsplat_core.training.observations import unprojected
 
 SETTINGS = SharesSettings(at_first=(0.6,), decay=0.5, around_cells=2.0, pull=3.0, ridge=0.25)
 

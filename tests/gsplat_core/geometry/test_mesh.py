@@ -9,7 +9,7 @@ from gsplat_core import Camera, Model
 from gsplat_core.errors import ExportError
 from gsplat_core.geometry.mesh import mesh_of, mesh_of_depth, vertex_normals
 from gsplat_core.io.recordings.synthetic.rendered import RenderSettings, render_recording
-from gsplat_core.training.growth.initialisation import gaussians_from_frame
+from gsplat_core.training.initialisation import gaussians_from_frame
 
 CAMERA = Camera.from_focal(50.0, 20, 14)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gsplat_core.training.growth.covering import are_worth_filling, uncovered_pixels
+from gsplat_core.training.covering import are_worth_filling, uncovered_pixels
 
 
 def test_tissue_of_which_less_than_half_is_covered_is_uncovered() -> None:

@@ -11,8 +11,8 @@ import torch
 from gsplat_core.deformation.basis import BasisField
 from gsplat_core.errors import InvalidInput
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.growth.covering import Covering
-from gsplat_core.training.growth.initialisation import gaussians_from_frame
+from gsplat_core.training.covering import Covering
+from gsplat_core.training.initialisation import gaussians_from_frame
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.steps.step import TrainingStep
 

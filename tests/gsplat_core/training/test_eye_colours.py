@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gsplat_core.scene.frames import Frame
-from gsplat_core.training.right_eye import LOOK_EVERY, NOISE_LEVELS, EyeColours, best_shift, line_between
+from gsplat_core.training.observations import LOOK_EVERY, NOISE_LEVELS, EyeColours, best_shift, line_between
 from tests.gsplat_core.training.two_eyes import LEFT, RIGHT, seen, stereo_frame
 
 GAIN, OFFSET = np.array([0.8, 1.1, 1.25]), np.array([12.0, -6.0, 4.0])

@@ -6,8 +6,8 @@ import torch
 
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.growth.covering import uncovered_tissue
-from gsplat_core.training.growth.initialisation import gaussians_from_frame
+from gsplat_core.training.covering import uncovered_tissue
+from gsplat_core.training.initialisation import gaussians_from_frame
 from gsplat_core.training.observations import Observation
 
 CONFIG = ReconstructorConfig(gaussians=400, default_depth_mm=60.0)

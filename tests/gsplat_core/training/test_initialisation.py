@@ -8,7 +8,7 @@ import torch
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
-from gsplat_core.training.growth.initialisation import (
+from gsplat_core.training.initialisation import (
     colours_beside_tools,
     facing,
     gaussians_from_frame,

@@ -10,8 +10,8 @@ import torch
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
-from gsplat_core.training.growth import initialisation
-from gsplat_core.training.growth.initialisation import (
+from gsplat_core.training import initialisation
+from gsplat_core.training.initialisation import (
     StartOnDevice,
     blur_sigma_px,
     colours_beside_tools,
@@ -20,8 +20,8 @@ from gsplat_core.training.growth.initialisation import (
     jittered_grid,
     tissue_colours,
     tissue_depth,
-    unprojected,
 )
+from gsplat_core.training.observations import unprojected
 
 K = np.array([[50.0, 0, 40], [0, 60, 30], [0, 0, 1]])
 

@@ -11,8 +11,7 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.growth.covering import NewTissue, entered, has_moved
-from gsplat_core.training.growth.unseen import around_cells
+from gsplat_core.training.covering import NewTissue, around_cells, entered, has_moved
 from gsplat_core.training.metrics import psnr_tissue_db
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.reconstructor import Reconstructor

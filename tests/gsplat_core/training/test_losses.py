@@ -9,7 +9,7 @@ from gsplat_core.choices import LOSSES
 from gsplat_core.deformation import BasisField, HexPlaneField
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.training.config import LearningRates, ReconstructorConfig
-from gsplat_core.training.growth.initialisation import gaussians_from_frame
+from gsplat_core.training.initialisation import gaussians_from_frame
 from gsplat_core.training.losses.loss import LossContext, loss_weights
 from gsplat_core.training.losses.rays import EVERY
 from gsplat_core.training.observations import Observation

@@ -12,12 +12,11 @@ import torch
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians, RowMoves
+from gsplat_core.training import covering
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.growth import covering
-from gsplat_core.training.growth.covering import OutOfView
-from gsplat_core.training.growth.unseen import Archive, LastSeen, pixels_of
+from gsplat_core.training.covering import Archive, LastSeen, OutOfView
 from gsplat_core.training.metrics import psnr_tissue_db
-from gsplat_core.training.observations import Observation
+from gsplat_core.training.observations import Observation, pixels_of
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.schedule import Budget, LiveTraining
 from operators.display import share_of

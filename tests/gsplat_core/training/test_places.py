@@ -12,7 +12,7 @@ import torch
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.growth.initialisation import gaussians_from_frame
+from gsplat_core.training.initialisation import gaussians_from_frame
 from gsplat_core.training.metrics import psnr_tissue_db
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.schedule import Budget, LiveTraining

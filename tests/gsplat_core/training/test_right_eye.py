@@ -9,8 +9,8 @@ import torch
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.observations import BothEyes, right_tissue
 from gsplat_core.training.reconstructor import Reconstructor
-from gsplat_core.training.right_eye import BothEyes, right_tissue
 from gsplat_core.training.schedule import LiveTraining
 from gsplat_core.training.strategies import streaming
 from tests.gsplat_core.training.two_eyes import HEIGHT, LEFT, RIGHT, THIRD, WIDTH, seen, stereo_frame

@@ -9,7 +9,7 @@ import torch
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import SH_C0
-from gsplat_core.training.growth.initialisation import StartOnDevice, filled, gaussians_from_frame
+from gsplat_core.training.initialisation import StartOnDevice, filled, gaussians_from_frame
 from gsplat_core.training.observations import Observation
 
 TURNED = np.array([[0.0, 0, 1, 5], [0, 1, 0, -3], [-1, 0, 0, 80], [0, 0, 0, 1]])

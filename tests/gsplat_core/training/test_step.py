@@ -8,7 +8,7 @@ import torch
 
 from gsplat_core.deformation import FIELDS, BasisField, HexPlaneField
 from gsplat_core.training.config import LearningRates, ReconstructorConfig
-from gsplat_core.training.growth.initialisation import gaussians_from_frame
+from gsplat_core.training.initialisation import gaussians_from_frame
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.steps.photometric import LossWeights, loss_and_gradients
 from gsplat_core.training.steps.step import TrainingStep

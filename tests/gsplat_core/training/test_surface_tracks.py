@@ -15,7 +15,7 @@ from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.growth.initialisation import gaussians_from_frame
+from gsplat_core.training.initialisation import gaussians_from_frame
 from gsplat_core.training.motion.image_motion import Seen
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.offline import SurfaceDepth, SurfaceTracks, between_known, steady_course

@@ -10,7 +10,7 @@ import torch
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.training.growth import initialisation
+from gsplat_core.training import initialisation
 from gsplat_core.training.losses import triangulation
 from gsplat_core.training.losses.loss import LossContext, loss_weights
 from gsplat_core.training.losses.triangulation import (

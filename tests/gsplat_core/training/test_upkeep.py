@@ -11,9 +11,10 @@ import torch
 
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.growth.initialisation import SIGMA_IN_SPACINGS
-from gsplat_core.training.growth.unseen import LastSeen, pixels_of
+from gsplat_core.training.covering import LastSeen
+from gsplat_core.training.initialisation import SIGMA_IN_SPACINGS
 from gsplat_core.training.metrics import psnr_tissue_db
+from gsplat_core.training.observations import pixels_of
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.schedule import Budget, LiveTraining
 from gsplat_core.training.upkeep import MOST_SPLIT, RELAX_EVERY, RENEW_EVERY, SURFACE_STEPS, THINNEST_PX, Upkeep

@@ -12,7 +12,7 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.training.growth.initialisation import gaussians_from_frame
+from gsplat_core.training.initialisation import gaussians_from_frame
 
 WIDTH, HEIGHT, MARGIN = 64, 48, 16
 LEFT = Camera.from_focal(60.0, WIDTH, HEIGHT)

@@ -23,7 +23,7 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
 from gsplat_core.training.motion.image_motion import beside
-from gsplat_core.training.observations import Observation
+from gsplat_core.training.observations import Observation, unprojected
 from gsplat_core.transfers import tensor_of
 
 SIGMA_IN_SPACINGS = 0.7
@@ -37,9 +37,6 @@ TOOL_MARGIN_PX = 2
 
 NEAR_TOOL_CELLS = 5
 """Width in cells of four pixels of the neighbourhood whose tissue gives the colours at the edge of a tool."""
-
-MAX_ANGLE_RAD = math.radians(85)
-"""Largest angle to the axis at which a fisheye pixel is placed; larger ones are clamped."""
 
 
 def gaussians_from_frame(
@@ -121,26 +118,6 @@ def gaussians_at_pixels(
         logit_opacities=torch.from_numpy(np.full(count, math.log(FIRST_OPACITY / (1 - FIRST_OPACITY)), np.float32)),
         sh=torch.from_numpy(sh),
     )
-
-
-def unprojected(
-    pixels: NDArray[np.float64], z: NDArray[np.float64], camera: Camera
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Unproject pixels [M, 2] at depths `z` [M]. Returns points in camera coordinates [M, 3] and
-    the size of a pixel there [M].
-    """
-    plane = (pixels - camera.K[:2, 2]) / np.diag(camera.K)[:2]
-    if camera.model == "ortho":
-        return np.concatenate([plane, z[:, None]], 1), np.full_like(z, 1 / camera.K[0, 0])
-    pixel = z / camera.K[0, 0]
-    if camera.model == "fisheye":
-        # The plane holds angles here. A pixel is stretched by 1 / cos² radially and tan / angle
-        # tangentially; use the geometric mean.
-        angle = np.clip(np.linalg.norm(plane, axis=1), 1e-9, MAX_ANGLE_RAD)
-        stretch = np.tan(angle) / np.maximum(np.linalg.norm(plane, axis=1), 1e-9)
-        plane = plane * stretch[:, None]
-        pixel = pixel * np.sqrt(stretch) / np.cos(angle)
-    return np.concatenate([plane * z[:, None], z[:, None]], 1), pixel
 
 
 def facing(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
