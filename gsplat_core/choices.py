@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from gsplat_core.depth.maps import Estimator
     from gsplat_core.rendering.renderer import OutputKind, RendererKind
     from gsplat_core.scene.range_sensors import RangeSensor
-    from gsplat_core.training.losses.loss import LossKind
+    from gsplat_core.training.losses import LossKind
     from gsplat_core.training.strategies.strategy import StrategyKind
 
 FIELDS: Registry[FieldKind[Any]] = Registry(
@@ -94,16 +94,16 @@ MOTION_PRIORS: Registry[Callable[[Any], Any]] = Registry(
 LOSSES: Registry[LossKind] = Registry(
     "loss",
     {
-        "photometric": "gsplat_core.training.losses.loss:Photometric",
-        "depth": "gsplat_core.training.losses.loss:Depth",
-        "ray_depth": "gsplat_core.training.losses.rays:RayDepth",
-        "normal_consistency": "gsplat_core.training.losses.rays:NormalConsistency",
-        "semantics": "gsplat_core.training.losses.loss:Semantics",
-        "flow": "gsplat_core.training.losses.flow:FlowLoss",
-        "triangulation": "gsplat_core.training.losses.triangulation:TriangulationLoss",
-        "range": "gsplat_core.training.losses.ranges:RangeLoss",
-        "opacity": "gsplat_core.training.losses.loss:MeanOpacity",
-        "scale": "gsplat_core.training.losses.loss:MeanScale",
+        "photometric": "gsplat_core.training.losses:Photometric",
+        "depth": "gsplat_core.training.losses:Depth",
+        "ray_depth": "gsplat_core.training.losses:RayDepth",
+        "normal_consistency": "gsplat_core.training.losses:NormalConsistency",
+        "semantics": "gsplat_core.training.losses:Semantics",
+        "flow": "gsplat_core.training.measured_losses:FlowLoss",
+        "triangulation": "gsplat_core.training.measured_losses:TriangulationLoss",
+        "range": "gsplat_core.training.measured_losses:RangeLoss",
+        "opacity": "gsplat_core.training.losses:MeanOpacity",
+        "scale": "gsplat_core.training.losses:MeanScale",
     },
 )
 """Losses of training by name. Every step computes `photometric` and `depth`; others are added when a user names them."""

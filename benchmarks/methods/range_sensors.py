@@ -22,8 +22,8 @@ from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
 from gsplat_core.scene.range_sensors import simulate_scan
-from gsplat_core.training.losses.loss import LossContext
-from gsplat_core.training.losses.ranges import RangeLoss, render_ranges
+from gsplat_core.training.losses import LossContext
+from gsplat_core.training.measured_losses import RangeLoss, render_ranges
 from gsplat_core.training.observations import Observation
 
 DISTANCE, RELIEF, BASELINE, VIEWS = 60.0, 8.0, 1.0, 8

@@ -36,7 +36,7 @@ from gsplat_core.rendering.surface import render_surface
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.initialisation import gaussians_from_frame
-from gsplat_core.training.losses.rays import EVERY
+from gsplat_core.training.losses import EVERY
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.steps.step import TrainingStep

@@ -26,7 +26,7 @@ from gsplat_core.io.recordings.synthetic.tissue import NO_TUG
 from gsplat_core.rendering.flow import render_depth
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.losses.triangulation import consensus_loss, triangulated
+from gsplat_core.training.measured_losses import consensus_loss, triangulated
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.reconstructor import Reconstructor
 

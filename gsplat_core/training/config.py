@@ -12,7 +12,7 @@ from gsplat_core.deformation.kinds import FieldRates, check_rates
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.depth_origin import RELATIVE_DISTANCE
 from gsplat_core.scene.frames import Frame
-from gsplat_core.training.losses.loss import loss_weights
+from gsplat_core.training.losses import loss_weights
 from gsplat_core.training.motion.image_motion import Detail
 
 

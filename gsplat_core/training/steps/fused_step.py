@@ -34,8 +34,7 @@ from gsplat_core.rendering.frame_renderer import (
 )
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import COLOUR, LOG_SCALE, OPACITY, POSITION, ROTATION, Gaussians
-from gsplat_core.training.losses.loss import WeightedLosses
-from gsplat_core.training.losses.rays import compared_rays
+from gsplat_core.training.losses import WeightedLosses, compared_rays
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.steps.optimiser import FusedAdam
 from gsplat_core.training.steps.photometric import LEFT, RIGHT, LossWeights, ResidualTarget

@@ -22,7 +22,7 @@ from gsplat_core.rendering.renderer import TrainableRenderer
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import EXTRA_PREFIX, GaussianRows, Gaussians, RowMoves
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.losses.loss import LossContext, WeightedLosses, loss_weights
+from gsplat_core.training.losses import LossContext, WeightedLosses, loss_weights
 from gsplat_core.training.observations import Observation, depth_of
 from gsplat_core.training.steps.fused_step import FusedStep
 from gsplat_core.training.steps.optimiser import FusedAdam

@@ -9,8 +9,7 @@ import torch
 
 from gsplat_core import Camera, Gaussians, render
 from gsplat_core.deformation.field import displaced
-from gsplat_core.training.losses.loss import WeightedLosses
-from gsplat_core.training.losses.rays import EVERY
+from gsplat_core.training.losses import EVERY, WeightedLosses
 from gsplat_core.training.observations import Observation, RightEye
 from gsplat_core.training.steps.fused_step import FusedStep
 from gsplat_core.training.steps.optimiser import FusedAdam
@@ -290,7 +289,7 @@ def slanted_wall(slope: float, distance: float) -> Gaussians:
 @pytest.mark.parametrize("relaxation", [0.0, 1.5])
 def test_losses_of_rays_are_captured_and_learn_as_on_the_cpu(wall_seen, relaxation):
     """Steps with and without rays by turns, one of them with colour correction, on a deformed scene."""
-    from gsplat_core.training.losses.loss import LossContext
+    from gsplat_core.training.losses import LossContext
     from gsplat_core.training.steps.photometric import loss_and_gradients, with_losses
 
     chosen = {"ray_depth": 2.0, "normal_consistency": 1.0}

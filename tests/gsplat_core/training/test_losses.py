@@ -10,8 +10,7 @@ from gsplat_core.deformation import BasisField, HexPlaneField
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.training.config import LearningRates, ReconstructorConfig
 from gsplat_core.training.initialisation import gaussians_from_frame
-from gsplat_core.training.losses.loss import LossContext, loss_weights
-from gsplat_core.training.losses.rays import EVERY
+from gsplat_core.training.losses import EVERY, LossContext, loss_weights
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.steps.photometric import LossWeights, loss_and_gradients

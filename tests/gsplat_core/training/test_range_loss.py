@@ -14,8 +14,8 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.range_sensors import OctLine, RangeScan, StructuredLight, TimeOfFlight, simulate_scan
-from gsplat_core.training.losses.loss import LossContext
-from gsplat_core.training.losses.ranges import RangeLoss, range_loss, render_ranges
+from gsplat_core.training.losses import LossContext
+from gsplat_core.training.measured_losses import RangeLoss, range_loss, render_ranges
 from gsplat_core.training.observations import Observation
 
 SIZE = 24

@@ -9,7 +9,7 @@ import torch
 from gsplat_core import Camera, InvalidInput, load_bundle, save_bundle
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.losses.loss import LossContext, Semantics
+from gsplat_core.training.losses import LossContext, Semantics
 from gsplat_core.training.reconstructor import Reconstructor
 from tests.gsplat_core.training.test_surface_losses import SMALL, observation, wall
 

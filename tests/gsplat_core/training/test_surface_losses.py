@@ -8,8 +8,15 @@ import torch
 
 from gsplat_core import Camera, Gaussians
 from gsplat_core.rendering.surface import view_of
-from gsplat_core.training.losses.loss import LossContext, WeightedLosses
-from gsplat_core.training.losses.rays import EVERY, NormalConsistency, RayDepth, compared_rays, rays_of
+from gsplat_core.training.losses import (
+    EVERY,
+    LossContext,
+    NormalConsistency,
+    RayDepth,
+    WeightedLosses,
+    compared_rays,
+    rays_of,
+)
 from gsplat_core.training.observations import Observation
 
 SMALL, LARGE = (90, 74), (256, 200)

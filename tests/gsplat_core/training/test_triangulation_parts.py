@@ -10,15 +10,15 @@ import torch
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.training import initialisation
-from gsplat_core.training.losses import triangulation
-from gsplat_core.training.losses.loss import LossContext, loss_weights
-from gsplat_core.training.losses.triangulation import (
+from gsplat_core.training import initialisation, measured_losses
+from gsplat_core.training.losses import LossContext, loss_weights
+from gsplat_core.training.measured_losses import (
     Triangulated,
     TriangulationLoss,
     chosen_views,
     consensus_loss,
     triangulate,
+    triangulated,
 )
 
 CAMERA = Camera(np.array([[100.0, 0, 60], [0, 100, 45], [0, 0, 1]]), 120, 90)
@@ -105,27 +105,27 @@ def test_pixels_are_compared_every_four(monkeypatch):
     def flow(image, other, mask, of_other):
         return np.full((90, 120, 2), [-5.0 if other[0, 0, 0] < 0.5 else -10.0, 0.0])
 
-    monkeypatch.setattr(triangulation, "consistent_flow", flow)
+    monkeypatch.setattr(measured_losses, "consistent_flow", flow)
     first, second, third = seen(0.0), seen(0.0), seen(0.0)
     second.camera, third.camera = at(2.0), at(4.0)
     third.image = torch.ones(90, 120, 3)
-    found = triangulation.triangulated(first, [second, third])
+    found = triangulated(first, [second, third])
     assert found is not None and len(found.pixels) == 30 * 22
     assert sorted(set(found.pixels[:, 0].tolist())) == [2.5 + 4 * number for number in range(30)]
     assert sorted(set(found.pixels[:, 1].tolist())) == [2.5 + 4 * number for number in range(22)]
     torch.testing.assert_close(found.points[:, 2], torch.full((660,), 40.0), rtol=1e-3, atol=0)
-    assert triangulation.triangulated(first, [second]) is None
+    assert triangulated(first, [second]) is None
 
 
 def test_points_of_512_frames_are_kept_and_frames_without_any_are_tried_with_more_views(monkeypatch):
     tried = []
-    monkeypatch.setattr(triangulation, "render_depth", lambda scene, camera: torch.full((4, 4), 40.0))
-    monkeypatch.setattr(triangulation, "consensus_loss", lambda depth, target, camera: target)
-    monkeypatch.setattr(triangulation, "check_parallax", lambda observation, others: None)
+    monkeypatch.setattr(measured_losses, "render_depth", lambda scene, camera: torch.full((4, 4), 40.0))
+    monkeypatch.setattr(measured_losses, "consensus_loss", lambda depth, target, camera: target)
+    monkeypatch.setattr(measured_losses, "check_parallax", lambda observation, others: None)
     answer = lambda observation, others: (
         tried.append(observation.seq) or (None if observation.seq < 0 else observation.seq)
     )
-    monkeypatch.setattr(triangulation, "triangulated", answer)
+    monkeypatch.setattr(measured_losses, "triangulated", answer)
     loss, scene = TriangulationLoss(), SimpleNamespace(detach=lambda: None)
     frames = [seen(2.0 + 0.01 * number, number) for number in range(513)]
     context = LossContext(frames[:3], None)
