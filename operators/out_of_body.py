@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from gsplat_core.endoscope.out_of_body import BodyGate
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.frames import Frame
-from operators.choices import Policy
 from operators.graph import Operator, OperatorSpec
 from operators.outcome import OutcomeBuilder
+from operators.settings import Policy
 
 log = logging.getLogger(__name__)
 

@@ -33,7 +33,6 @@ from operators.checks import (
     StageOp,
     picture_stages,
 )
-from operators.choices import SINKS, Policy
 from operators.compare_shown import CompareShownOp
 from operators.depth import DepthOp
 from operators.display import DisplayOp
@@ -47,7 +46,7 @@ from operators.out_of_body import OutOfBodyGateOp
 from operators.pose import pose_operators
 from operators.rasterize import DeformOp, RasterizeOp, Rasterizer
 from operators.reconstruct import ReconstructOp
-from operators.settings import EngineOptions, JobOptions, OutputSection
+from operators.settings import SINKS, EngineOptions, JobOptions, OutputSection, Policy
 from operators.side_by_side import SideBySideOp
 from operators.sinks.registry import CallbackSinkOp, SinkOptions, input_of
 from operators.sinks.session_recorder import (

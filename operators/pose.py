@@ -16,9 +16,9 @@ from gsplat_core.poses.live_odometry import MOSTLY, LiveOdometry
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.depth_origin import RELATIVE_DISTANCE
 from gsplat_core.scene.frames import Frame, FrameStatus
-from operators.choices import Poses
 from operators.graph import Operator, OperatorSpec
 from operators.outcome import OutcomeBuilder
+from operators.settings import Poses
 
 
 @dataclass(frozen=True)

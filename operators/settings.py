@@ -7,12 +7,14 @@ processes and the forms of the console are derived from these fields.
 
 A new option is one field of a section, and its use in the operator or application that needs it. An option whose name is a
 field of `ReconstructorConfig` reaches the reconstructor without further code.
+
+`TOOL_MASKS` and `SINKS` are the registries of the operators that a user selects by name.
 """
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -33,12 +35,51 @@ from gsplat_core.choices import (
     check_strategy,
 )
 from gsplat_core.errors import InvalidSetting
-from operators.choices import SINKS, TOOL_MASKS, TOOL_MASKS_WITH_ADDRESS, Device, Policy, Poses
+from gsplat_core.registry import Registry
 from operators.graph.application import Engine
 from operators.options import Command, Declared, Names, Option, Section, for_callers, listed, options_for, options_of
 
 if TYPE_CHECKING:
     from gsplat_core.rendering.renderer import RendererOptions
+    from operators.graph import Operator
+
+TOOL_MASKS: Registry[Callable[[Any, str, str], Operator]] = Registry(
+    "tool mask",
+    {
+        "recorded": "operators.tool_mask:recorded_tool_mask",
+        "builtin": "operators.tool_mask:builtin_tool_mask",
+        "classical": "operators.tool_mask:classical_tool_mask",
+        "onnx": "operators.tool_mask:onnx_tool_mask",
+        "none": "operators.tool_mask:no_tool_mask",
+    },
+)
+"""Factories of tool mask operators, by method.
+
+A factory takes the fragment, the operator's name and the text after the colon of the setting, or "". It raises a
+UserError for an invalid text. Input and output of the operator are named `frame`.
+"""
+TOOL_MASKS_WITH_ADDRESS = {"onnx": "onnx:FILE"}
+"""Tool mask methods that are followed by a colon and an address, with an example of the syntax."""
+
+SINKS: Registry[Callable[[Any, str, Any], Operator]] = Registry(
+    "sink",
+    {
+        "video": "operators.sinks.video:video_sink",
+        "keyframes": "operators.sinks.keyframes:keyframes_sink",
+    },
+)
+"""Factories of sinks for the frames of a run, by name.
+
+A factory takes the fragment, the operator's name and `SinkOptions`. The input of the operator takes `RenderedFrame` or
+`ScoredFrame`.
+"""
+
+Device = Literal["cpu", "cuda"]
+"""Devices for training and rendering."""
+Poses = Literal["given", "auto", "estimated"]
+"""Camera poses: recorded with the frames; as recorded or, while the scope moves, estimated; or estimated from the pictures."""
+Policy = Literal["withhold", "off"]
+"""Pictures from outside of the body: replace them by black, or pass all frames without a check."""
 
 TRAINING_RUNS: tuple[Command, ...] = ("replay", "batch", "reconstruct", "job")
 REPLAYS: tuple[Command, ...] = ("replay", "batch", "job")

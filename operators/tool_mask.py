@@ -18,9 +18,9 @@ from gsplat_core.endoscope.tool_network import NetworkToolFinder
 from gsplat_core.endoscope.tools import ToolFinder
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.frames import Frame
-from operators.choices import TOOL_MASKS
 from operators.graph import Operator, OperatorSpec
 from operators.outcome import OutcomeBuilder
+from operators.settings import TOOL_MASKS
 
 log = logging.getLogger(__name__)
 

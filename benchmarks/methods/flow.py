@@ -36,7 +36,7 @@ from gsplat_core.scene.gaussians import rotations
 from operators.applications.evaluate import SeenFromAnywhere, measure_geometry
 from operators.applications.reconstruct import reconstruct
 from operators.applications.replay import ReplaySettings
-from operators.choices import Device
+from operators.settings import Device
 
 CAMERA = Camera.from_focal(350.0, 320, 256)
 DISTANCE_MM, TILT_DEG, SPACING_MM = 100.0, 25.0, 1.0

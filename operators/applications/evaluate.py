@@ -53,9 +53,8 @@ from operators.applications.evaluated import (
 from operators.applications.limits import check_picture, render_bytes, replay_bytes, require_memory
 from operators.applications.replay import ReplaySettings
 from operators.applications.session import Progress, ProgressCallback, check_device, seeded
-from operators.choices import Device
 from operators.frame_log import FRAMES_FILE, FrameLog, is_live_log, read_frames, read_live_log
-from operators.settings import check_option
+from operators.settings import Device, check_option
 from operators.sources.source import FrameSource, SourceDescription
 
 PROTOCOLS = ("heldout", "live", "retention", "second_eye", "geometry", "causal")

@@ -1,4 +1,4 @@
-"""Parameters and inputs of sinks, which `operators.choices.SINKS` lists, and the sink that calls a function."""
+"""Parameters and inputs of sinks, which `operators.settings.SINKS` lists, and the sink that calls a function."""
 
 from __future__ import annotations
 

@@ -11,9 +11,16 @@ from pydantic import BaseModel, ValidationError
 from gsplat_core.choices import DEPTHS, DEPTHS_WITH_ADDRESS, FIELDS, LOSSES, OUTPUTS, RENDERERS, STRATEGIES
 from gsplat_core.errors import InvalidSetting
 from operators.applications.reconstruct import ReconstructSettings
-from operators.choices import SINKS, TOOL_MASKS, TOOL_MASKS_WITH_ADDRESS
 from operators.options import options_for
-from operators.settings import JobOptions, LiveOptions, ReconstructOptions, ReplayOptions
+from operators.settings import (
+    SINKS,
+    TOOL_MASKS,
+    TOOL_MASKS_WITH_ADDRESS,
+    JobOptions,
+    LiveOptions,
+    ReconstructOptions,
+    ReplayOptions,
+)
 from operators.sources.registry import SOURCES
 from services.api import streams
 from services.cli import app as command_line

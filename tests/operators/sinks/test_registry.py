@@ -6,9 +6,9 @@ import pytest
 
 from gsplat_core.errors import InvalidInput, InvalidSetting
 from operators.applications.replay import ReplaySettings
-from operators.choices import SINKS
 from operators.messages import RenderedFrame
 from operators.metrics import ScoredFrame
+from operators.settings import SINKS
 from operators.sinks.registry import CallbackSinkOp, SinkOptions, input_of
 from operators.sources.recording import RecordingSource
 from operators.storage import StorageReserve
