@@ -28,6 +28,7 @@ from gsplat_core.training.reconstructor import Reconstructor
 from operators.applications.session import scheduler_for
 from operators.checks import (
     MaskAndDepthStage,
+    OutOfBodyGateOp,
     PictureStagesOp,
     SceneNumberStage,
     StageOp,
@@ -42,7 +43,6 @@ from operators.graph import Application, GreedyScheduler, MultiThreadScheduler, 
 from operators.ingest import SourceOp
 from operators.messages import RenderedFrame, ShownPicture
 from operators.metrics import MetricsOp, ScoredFrame
-from operators.out_of_body import OutOfBodyGateOp
 from operators.pose import pose_operators
 from operators.rasterize import DeformOp, RasterizeOp, Rasterizer
 from operators.reconstruct import ReconstructOp

@@ -14,15 +14,14 @@ from gsplat_core.evaluation.scores import finite
 from gsplat_core.training.metrics import QualityTracker
 from gsplat_core.training.validation import ChosenSteps
 from operators.applications.session import RunOutcome
-from operators.checks import StageCounts
+from operators.checks import WITHHELD as OUT_OF_BODY
+from operators.checks import OutOfBodyFrames, StageCounts
 from operators.display import LiveDisplayResult
 from operators.errors import NothingShown
 from operators.frame_log import LogLine
 from operators.graph.tracking import DurationSummary
 from operators.ingest import SourceResult
 from operators.metrics import NextFrameResult, OnScreenResult, QualityResult
-from operators.out_of_body import WITHHELD as OUT_OF_BODY
-from operators.out_of_body import OutOfBodyFrames
 from operators.reconstruct import ModelResult, TrainedEyes
 from operators.sinks.keyframes import KeyframesResult
 from operators.sinks.video import DisplayResult

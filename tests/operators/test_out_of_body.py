@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gsplat_core.errors import InvalidSetting
-from operators.out_of_body import NOT_EXAMINED, WITHHELD, OutOfBodyFrames, OutOfBodyGateOp
+from operators.checks import NOT_EXAMINED, WITHHELD, OutOfBodyFrames, OutOfBodyGateOp
 from operators.outcome import OutcomeBuilder
 
 

@@ -15,13 +15,12 @@ from operators import display
 from operators.applications import live as live_module
 from operators.applications.live import live
 from operators.applications.live_settings import LiveSettings
-from operators.checks import CutCounts, MaskAndDepthCounts, SequenceCounts
+from operators.checks import CutCounts, MaskAndDepthCounts, OutOfBodyFrames, SequenceCounts
 from operators.display import COLOURS, LiveDisplayResult
 from operators.frame_clock import ClockSettings
 from operators.ingest import SourceResult
 from operators.messages import PictureState, Reconstruction
 from operators.metrics import OnScreenResult
-from operators.out_of_body import OutOfBodyFrames
 from operators.sources.live import FrameOrder
 from operators.training import Learner, TrainingCounts
 from tests.operators.applications.scripted import (

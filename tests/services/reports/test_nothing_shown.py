@@ -8,12 +8,11 @@ import pytest
 
 from gsplat_core.scene.cameras import Camera
 from operators.applications.session import RunOutcome, RunSettings
-from operators.checks import PICTURE_STAGES, MaskAndDepthStage
+from operators.checks import PICTURE_STAGES, MaskAndDepthStage, OutOfBodyFrames
 from operators.display import LiveDisplayResult
 from operators.errors import NothingShown
 from operators.ingest import SourceResult
 from operators.metrics import QualityResult
-from operators.out_of_body import OutOfBodyFrames
 from operators.sinks.video import DisplayResult
 from operators.sources.source import SourceDescription
 from operators.training import TrainingCounts
