@@ -29,8 +29,7 @@ from operators.frame_clock import ClockSettings, FrameClock
 from operators.graph import Application
 from operators.messages import PictureState, RenderedFrame, ShownPicture
 from operators.metrics import MetricsOp
-from operators.pipeline import analysis_operator
-from operators.side_by_side import through, with_findings
+from operators.pipeline import analysis_operator, through, with_findings
 from operators.sources.registry import SourceOptions, open_source
 from operators.sources.source import SourceState
 

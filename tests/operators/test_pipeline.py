@@ -9,8 +9,7 @@ import pytest
 from operators.applications.replay import ReplaySettings
 from operators.frame_clock import ClockSettings, FrameClock
 from operators.graph import Application, GreedyScheduler, MultiThreadScheduler
-from operators.pipeline import Pace, Pipeline, analysis_operator
-from operators.side_by_side import SideBySideOp
+from operators.pipeline import Pace, Pipeline, SideBySideOp, analysis_operator
 from operators.sources.recording import RecordingSource
 from operators.tool_mask import BuiltInToolMaskOp
 from operators.training import EveryFrame, RecordedCalls, UntilDisplay

@@ -10,7 +10,7 @@ import pytest
 from gsplat_core.scene.frames import Frame
 from operators.graph import Operator
 from operators.outcome import OutcomeBuilder
-from operators.side_by_side import SideBySideOp
+from operators.pipeline import SideBySideOp
 
 
 class Changes(Operator):

@@ -15,7 +15,7 @@ from operators.checks import (
     picture_stages,
 )
 from operators.outcome import OutcomeBuilder
-from operators.side_by_side import through
+from operators.pipeline import through
 from tests.gsplat_core.endoscope.clips import clip
 from tests.operators.endoscope.test_stages import frames
 
