@@ -37,7 +37,6 @@ from operators.checks import (
     StageOp,
     picture_stages,
 )
-from operators.compare_shown import CompareShownOp
 from operators.depth import DepthOp
 from operators.display import DisplayOp
 from operators.frame_clock import BehindGuard, FrameClock
@@ -45,7 +44,7 @@ from operators.frame_log import FRAMES_FILE, FrameLog
 from operators.graph import Application, GreedyScheduler, MultiThreadScheduler, Operator, OperatorSpec
 from operators.ingest import SourceOp
 from operators.messages import RenderedFrame, ShownPicture
-from operators.metrics import MetricsOp, ScoredFrame
+from operators.metrics import CompareShownOp, MetricsOp, ScoredFrame
 from operators.outcome import Contributor, OutcomeBuilder
 from operators.pose import pose_operators
 from operators.rasterize import DeformOp, RasterizeOp, Rasterizer
@@ -59,7 +58,6 @@ from operators.storage import StorageReserve
 from operators.tool_mask import RecordedToolMaskOp, new_tool_mask
 from operators.training import EveryFrame, RecordedCalls, Training, UntilDisplay
 from operators.truth import TruthOp
-
 
 REPORT_RESERVE_BYTES = 8 * 2**20
 """Disk space reserved for the video's index and the report, in bytes."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 from hashlib import sha256
 
 from gsplat_core.io.sessions.records import ShownLine
-from operators.compare_shown import CompareShownOp, ShownComparison
 from operators.graph import Application
+from operators.metrics import CompareShownOp, ShownComparison
 from tests.operators.conftest import make_rendered, run_once
 
 

@@ -23,9 +23,8 @@ from operators.applications.live import live_graph, warm_up
 from operators.applications.live_settings import LiveSettings
 from operators.applications.replay import ReplaySettings, replay
 from operators.applications.session import RunOutcome, Session
-from operators.compare_shown import ShownComparison
 from operators.depth import FoundDepth, TakenDepth
-from operators.metrics import QualityResult
+from operators.metrics import QualityResult, ShownComparison
 from operators.sinks.session_recorder import RecordingResult
 from operators.sources.source import SourceDescription, ThreadedSource
 
