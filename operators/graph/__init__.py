@@ -5,23 +5,6 @@ imported only by `run(app, engine="holoscan")`.
 """
 
 from operators.graph.application import Application, Engine, Fragment, run
-from operators.graph.conditions import (
-    AsynchronousCondition,
-    AsynchronousEventState,
-    BooleanCondition,
-    Clock,
-    Condition,
-    CountCondition,
-    DownstreamMessageAffordableCondition,
-    EdgeStats,
-    ManualClock,
-    MessageAvailableCondition,
-    MessageOrTimeoutCondition,
-    PeriodicCondition,
-    PeriodicConditionPolicy,
-    RealtimeClock,
-    SchedulingStatus,
-)
 from operators.graph.graph import RunResult, StopReason
 from operators.graph.operator import (
     DISABLE_BRANCH,
@@ -35,8 +18,30 @@ from operators.graph.operator import (
     Operator,
     OutputContext,
 )
+from operators.graph.ports import (
+    REQUIRED,
+    AsynchronousCondition,
+    AsynchronousEventState,
+    BooleanCondition,
+    Clock,
+    Condition,
+    ConditionType,
+    ConnectorType,
+    CountCondition,
+    DownstreamMessageAffordableCondition,
+    EdgeStats,
+    IOSpec,
+    ManualClock,
+    MessageAvailableCondition,
+    MessageOrTimeoutCondition,
+    OperatorSpec,
+    PeriodicCondition,
+    PeriodicConditionPolicy,
+    QueuePolicy,
+    RealtimeClock,
+    SchedulingStatus,
+)
 from operators.graph.schedulers import GreedyScheduler, MultiThreadScheduler
-from operators.graph.spec import REQUIRED, ConditionType, ConnectorType, IOSpec, OperatorSpec, QueuePolicy
 from operators.graph.tracking import DurationSummary, FlowTracker
 
 __all__ = [

@@ -8,11 +8,10 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Literal
 
 from operators.errors import GraphBusy, GraphInvalid
-from operators.graph.conditions import EdgeStats
 from operators.graph.graph import Flow, Graph, RunResult, Scheduler
 from operators.graph.operator import Fault, Operator
+from operators.graph.ports import EdgeStats, QueuePolicy, queue_policy
 from operators.graph.schedulers import GreedyScheduler
-from operators.graph.spec import QueuePolicy, queue_policy
 from operators.graph.tracking import FlowTracker
 
 Engine = Literal["embedded", "holoscan"]

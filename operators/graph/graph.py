@@ -16,9 +16,18 @@ from typing import Any, Protocol, Union, get_args, get_origin
 
 from gsplat_core.errors import UserError
 from operators.errors import GraphDeadlock, GraphInvalid, OperatorFailed, OperatorStuck
-from operators.graph.conditions import Clock, Edge, EdgeStats, Message, MessageOrTimeoutCondition, SchedulingStatus
 from operators.graph.operator import ExecutionContext, Fault, FaultAction, InputContext, Operator, OutputContext
-from operators.graph.spec import ConditionType, IOSpec, QueuePolicy
+from operators.graph.ports import (
+    Clock,
+    ConditionType,
+    Edge,
+    EdgeStats,
+    IOSpec,
+    Message,
+    MessageOrTimeoutCondition,
+    QueuePolicy,
+    SchedulingStatus,
+)
 from operators.graph.tracking import FlowTracker, Trail
 
 logger = logging.getLogger(__name__)

@@ -27,11 +27,10 @@ import threading
 from typing import Any, cast
 
 from operators.errors import EngineError, EngineUnsupported
-from operators.graph.conditions import CarriedEdge, ManualClock, SchedulingStatus
 from operators.graph.graph import Graph, OperatorTask, Scheduler
+from operators.graph.ports import CarriedEdge, ManualClock, QueuePolicy, SchedulingStatus
 from operators.graph.schedulers import GreedyScheduler, MultiThreadScheduler, interruptible_wait
 from operators.graph.sdk import keep_signals, load_sdk
-from operators.graph.spec import QueuePolicy
 
 _sdk = load_sdk()
 _Operator: Any = _sdk.core.Operator

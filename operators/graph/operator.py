@@ -10,15 +10,18 @@ from enum import Enum
 from typing import Any, ClassVar
 
 from operators.errors import GraphInvalid, MetadataConflict, OperatorFailed, PortError
-from operators.graph.conditions import (
+from operators.graph.ports import (
+    REQUIRED,
     Clock,
     Condition,
+    ConditionType,
     DownstreamMessageAffordableCondition,
     Edge,
+    IOSpec,
     Message,
     MessageAvailableCondition,
+    OperatorSpec,
 )
-from operators.graph.spec import REQUIRED, ConditionType, IOSpec, OperatorSpec
 from operators.graph.tracking import Trail
 
 

@@ -8,9 +8,8 @@ from functools import partial
 from typing import Any
 
 from operators.errors import GraphInvalid, OperatorStuck
-from operators.graph.conditions import Clock, Edge, LockedEdge, ManualClock, RealtimeClock, SchedulingStatus
 from operators.graph.graph import Graph, OperatorTask
-from operators.graph.spec import QueuePolicy
+from operators.graph.ports import Clock, Edge, LockedEdge, ManualClock, QueuePolicy, RealtimeClock, SchedulingStatus
 
 _LOOK_S = 0.25
 
