@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 
 from gsplat_core.io.recordings import open_recording
-from operators.sinks.writers import VideoFile
+from operators.sinks.video import VideoFile
 
 
 def main() -> int:

@@ -88,7 +88,7 @@ def _npy(file: BinaryIO) -> bool:
 def _mp4(file: BinaryIO) -> bool:
     import av
 
-    from operators.sinks.writers import MARK
+    from operators.sinks.video import MARK
 
     try:
         with av.open(file, format="mp4") as container:

@@ -39,7 +39,7 @@ from operators.layer_pictures import OutputPictures, mark_unobserved
 from operators.output_folder import OutputFolder, check_file_path
 from operators.rasterize import displayed
 from operators.settings import check_option
-from operators.sinks.writers import VideoFile, write_png
+from operators.sinks.video import VideoFile, write_png
 from operators.storage import StorageReserve, storage_errors
 
 VIEWS = ("recorded", "orbit", "stereo")

@@ -25,7 +25,7 @@ from operators.applications.limits import check_picture, render_bytes, require_m
 from operators.applications.session import Progress, ProgressCallback, check_device, seeded
 from operators.rasterize import displayed
 from operators.settings import TrainOptions, check_images_folder, check_option
-from operators.sinks.writers import write_png
+from operators.sinks.video import write_png
 from operators.storage import storage_errors, write_whole
 
 EVALUATION_FILE = "evaluation.json"

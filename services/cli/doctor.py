@@ -160,7 +160,7 @@ def _video() -> list[Check]:
     import numpy as np
 
     from operators.errors import OutputError
-    from operators.sinks.writers import CODEC, VideoFile
+    from operators.sinks.video import CODEC, VideoFile
 
     try:
         with tempfile.TemporaryDirectory() as folder, VideoFile(Path(folder) / "probe.mp4", 64, 48, 30.0) as video:

@@ -60,7 +60,7 @@ def main(arguments: list[str] | None = None) -> int:
 def render(folder: Path, file: Path, wish: RenderWish) -> None:
     """Render a picture or a video. Imports here take seconds, and packing does not need them."""
     from operators.applications.render import ViewWish, render_model, render_picture
-    from operators.sinks.writers import write_png
+    from operators.sinks.video import write_png
 
     options = wish.options
     wanted: dict[str, Any] = {

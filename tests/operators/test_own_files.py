@@ -15,7 +15,7 @@ from gsplat_core.io.exports.files import ROW
 from gsplat_core.io.ply_header import MARK_LINE
 from gsplat_core.io.recordings.calibration import TRAILER
 from operators.output_folder import is_own_file
-from operators.sinks.writers import VideoFile
+from operators.sinks.video import VideoFile
 
 
 def glb(magic=b"glTF", kind=b"JSON", generator="IntraSplat", length=None):

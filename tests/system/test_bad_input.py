@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from operators.sinks.writers import VideoFile
+from operators.sinks.video import VideoFile
 from services.reports.schema import RunReport
 
 QUICK = ("--steps-per-frame", "2")

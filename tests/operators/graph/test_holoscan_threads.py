@@ -8,7 +8,7 @@ import time
 import pytest
 
 from operators.graph import BooleanCondition, MultiThreadScheduler, Operator, StopReason
-from operators.graph.conditions import LockedEdge
+from operators.graph.ports import LockedEdge
 
 pytestmark = [
     pytest.mark.holoscan,

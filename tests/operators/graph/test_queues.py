@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from operators.errors import EngineError, QueueFull
 from operators.graph import QueuePolicy
-from operators.graph.conditions import CarriedEdge, Edge, Message
+from operators.graph.ports import CarriedEdge, Edge, Message
 
 OPERATIONS = st.lists(st.sampled_from(["push", "push", "push", "pop", "pop", "close"]), max_size=60)
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gsplat_core.errors import InvalidInput
-from operators.sinks.writers import write_png
+from operators.sinks.video import write_png
 
 
 @pytest.mark.parametrize(("shape", "dtype"), [((7, 5, 3), np.uint8), ((7, 5), np.uint8), ((7, 5), np.uint16)])

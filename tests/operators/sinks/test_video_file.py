@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from operators.errors import OutputError, StorageFull
-from operators.sinks.writers import VideoFile
+from operators.sinks.video import VideoFile
 from operators.storage import StorageReserve
 
 
