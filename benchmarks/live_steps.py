@@ -37,7 +37,7 @@ from operators.graph import Application
 from operators.ingest import SourceOp
 from operators.pipeline import analysis_operator
 from operators.rasterize import without_surround
-from operators.sinks.registry import CallbackSinkOp
+from operators.sinks.sink import CallbackSinkOp
 from operators.sources.registry import SourceOptions, open_source
 
 FIRST_STEPS = {"cpu": 4, "cuda": 60}

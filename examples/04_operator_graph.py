@@ -24,7 +24,7 @@ from operators.graph import (
     run,
 )
 from operators.ingest import SourceOp
-from operators.sinks.registry import CallbackSinkOp
+from operators.sinks.sink import CallbackSinkOp
 from operators.sources.recording import RecordingSource
 from operators.tool_mask import RecordedToolMaskOp
 

@@ -50,8 +50,8 @@ from operators.pose import pose_operators
 from operators.rasterize import DeformOp, RasterizeOp, Rasterizer
 from operators.reconstruct import ReconstructOp
 from operators.settings import SINKS, EngineOptions, JobOptions, OutputSection, Policy
-from operators.sinks.registry import CallbackSinkOp, SinkOptions, input_of
 from operators.sinks.session_recorder import RecordFramesOp, RecordPicturesOp, RecordPreparationOp, SessionRecorder
+from operators.sinks.sink import CallbackSinkOp, SinkOptions, input_of
 from operators.sinks.video import OutputVideosOp
 from operators.sources.source import FrameSource
 from operators.storage import StorageReserve

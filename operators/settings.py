@@ -65,7 +65,7 @@ SINKS: Registry[Callable[[Any, str, Any], Operator]] = Registry(
     "sink",
     {
         "video": "operators.sinks.video:video_sink",
-        "keyframes": "operators.sinks.keyframes:keyframes_sink",
+        "keyframes": "operators.sinks.sink:keyframes_sink",
     },
 )
 """Factories of sinks for the frames of a run, by name.

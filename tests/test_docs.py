@@ -28,7 +28,7 @@ from gsplat_core.io.recordings.truth import open_views
 from gsplat_core.models import Model
 from operators.graph import Application, Operator, OperatorSpec
 from operators.ingest import SourceOp
-from operators.sinks.registry import CallbackSinkOp
+from operators.sinks.sink import CallbackSinkOp
 from operators.sources.source import SourceDescription, ThreadedSource
 from services import api as service_routes
 from services.cli.app import app

@@ -30,7 +30,7 @@ from operators.graph import Operator, OperatorSpec
 from operators.layer_pictures import OutputPictures
 from operators.messages import RenderedFrame
 from operators.outcome import OutcomeBuilder
-from operators.sinks.registry import SinkOptions
+from operators.sinks.sink import SinkOptions
 from operators.storage import StorageReserve, storage_errors, write_whole
 
 CODEC = "libvpx-vp9"

@@ -23,7 +23,7 @@ from operators.graph.tracking import DurationSummary
 from operators.ingest import SourceResult
 from operators.metrics import NextFrameResult, OnScreenResult, QualityResult
 from operators.reconstruct import ModelResult, TrainedEyes
-from operators.sinks.keyframes import KeyframesResult
+from operators.sinks.sink import KeyframesResult
 from operators.sinks.video import DisplayResult
 from operators.training import TrainingCounts
 from operators.truth import TruthResult

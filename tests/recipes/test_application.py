@@ -18,7 +18,7 @@ from operators.errors import RunFailed, StorageFull
 from operators.graph import Application, Operator, OperatorSpec
 from operators.ingest import SourceOp, SourceResult
 from operators.outcome import OutcomeBuilder
-from operators.sinks.registry import CallbackSinkOp
+from operators.sinks.sink import CallbackSinkOp
 from operators.sources.registry import open_source
 from operators.sources.source import FrameSource
 from operators.storage import write_whole

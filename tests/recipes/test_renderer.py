@@ -27,7 +27,7 @@ from gsplat_core.scene.gaussians import SH_C0
 from operators.applications.replay import ReplaySettings, replay
 from operators.metrics import QualityResult
 from operators.reconstruct import ModelResult
-from operators.sinks.keyframes import KeyframesResult
+from operators.sinks.sink import KeyframesResult
 
 
 class PointRenderer:

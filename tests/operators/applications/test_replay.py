@@ -25,7 +25,7 @@ from operators.graph import MultiThreadScheduler
 from operators.ingest import SourceResult
 from operators.metrics import NextFrameResult, QualityResult
 from operators.reconstruct import ModelResult
-from operators.sinks.keyframes import KeyframesResult
+from operators.sinks.sink import KeyframesResult
 from operators.sinks.video import DisplayResult
 from operators.training import TrainingCounts
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from operators.sinks.registry import CallbackSinkOp
+from operators.sinks.sink import CallbackSinkOp
 
 
 def test_a_callback_gets_each_message(rendered, compute):

@@ -9,7 +9,7 @@ import pytest
 
 from operators.metrics import MetricsOp
 from operators.outcome import OutcomeBuilder
-from operators.sinks.keyframes import KeyframesOp, KeyframesResult
+from operators.sinks.sink import KeyframesOp, KeyframesResult
 
 
 def keep(count, length, rendered, compute, worst=None):

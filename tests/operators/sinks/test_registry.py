@@ -9,7 +9,7 @@ from operators.applications.replay import ReplaySettings
 from operators.messages import RenderedFrame
 from operators.metrics import ScoredFrame
 from operators.settings import SINKS
-from operators.sinks.registry import CallbackSinkOp, SinkOptions, input_of
+from operators.sinks.sink import CallbackSinkOp, SinkOptions, input_of
 from operators.sources.recording import RecordingSource
 from operators.storage import StorageReserve
 
