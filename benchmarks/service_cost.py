@@ -24,8 +24,7 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame, FrameStatus
 from operators.sources.live import LiveSource
 from operators.sources.source import SourceDescription
-from services.bus.messages import CommandServer, Heartbeats
-from services.bus.pictures import PicturePublisher, picture_from, subscribe
+from services.bus.messages import CommandServer, Heartbeats, PicturePublisher, picture_from, subscribe
 from services.bus.runtime import RuntimeFolder
 from services.display import encoded
 from services.supervisor.capture import CapturedSource

@@ -23,7 +23,7 @@ import zmq
 from service_server import STREAM, Server
 from service_watchers import quantiles
 
-from services.bus.pictures import picture_from, subscribe
+from services.bus.messages import picture_from, subscribe
 
 SOURCE = "synthetic:?width=640&height=512&frames=24&fps=30"
 

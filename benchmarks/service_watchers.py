@@ -8,8 +8,7 @@ from typing import Any
 
 import zmq
 
-from services.bus.messages import parsed_json
-from services.bus.pictures import subscribe
+from services.bus.messages import parsed_json, subscribe
 
 
 class Watch:

@@ -25,8 +25,7 @@ import zmq.asyncio
 from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidSetting
-from services.bus.messages import Durations
-from services.bus.pictures import Picture, picture_from, subscribe
+from services.bus.messages import Durations, Picture, picture_from, subscribe
 from services.bus.runtime import LAYERS, Layer, StreamFolder
 from services.errors import BadMessage
 

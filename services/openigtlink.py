@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidSetting
 from operators.errors import OutputError
-from services.bus.pictures import Picture, picture_from, subscribe
+from services.bus.messages import Picture, picture_from, subscribe
 from services.bus.runtime import StreamFolder
 from services.errors import BadMessage
 

@@ -175,7 +175,6 @@ def test_import_opens_no_socket_starts_no_process_and_compiles_nothing():
 
 WITHOUT_TORCH = [
     "services.bus.messages",
-    "services.bus.pictures",
     "services.bus.runtime",
     "services.supervisor.launcher",
     "services.supervisor.process",

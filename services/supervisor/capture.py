@@ -29,8 +29,7 @@ from operators.sources.derived import scaled_description
 from operators.sources.live import Backoff, FrameOrder, LiveSource
 from operators.sources.registry import STUCK_AFTER_S, open_source, split_address
 from operators.sources.source import FrameSource, ReportingSource, SourceDescription, SourceState
-from services.bus.messages import ask, parsed_json
-from services.bus.pictures import PicturePublisher, frame_from, subscribe
+from services.bus.messages import PicturePublisher, ask, frame_from, parsed_json, subscribe
 from services.bus.runtime import StreamFolder
 from services.errors import BadMessage, BusError, CommandRefused
 from services.private_files import keep_files_private

@@ -38,8 +38,7 @@ from operators.pipeline import Pipeline
 from operators.reconstruct import ReconstructOp
 from operators.settings import EngineOptions, check_option
 from operators.sources.source import SourceDescription
-from services.bus.messages import BOUNDS_S, text_of
-from services.bus.pictures import PicturePublisher
+from services.bus.messages import BOUNDS_S, PicturePublisher, text_of
 from services.bus.runtime import StreamFolder, read_json, write_json
 from services.errors import BadMessage, CommandRefused
 from services.private_files import keep_files_private

@@ -14,8 +14,7 @@ from typing import Any, Literal
 import zmq
 import zmq.asyncio
 
-from services.bus.messages import ANSWER_S, ask_async, parsed_json
-from services.bus.pictures import subscribe
+from services.bus.messages import ANSWER_S, ask_async, parsed_json, subscribe
 from services.bus.runtime import ProcessIdentity, Role, StreamFolder
 from services.errors import BadMessage, BusError, NoAnswer
 from services.supervisor.launcher import Start, cause_of, is_of_no_use, last_words

@@ -32,8 +32,7 @@ from operators.messages import PictureState, ShownPicture
 from operators.metrics import ScoredFrame
 from operators.rasterize import displayed
 from operators.sources.source import SourceState
-from services.bus.messages import Durations
-from services.bus.pictures import PicturePublisher, WatchedPublisher, wait_for_readers
+from services.bus.messages import Durations, PicturePublisher, WatchedPublisher, wait_for_readers
 from services.bus.runtime import LAYERS, Layer, StreamFolder
 from services.errors import BadMessage
 

@@ -4,8 +4,7 @@ import json
 
 import zmq
 
-from services.bus.messages import Heartbeats
-from services.bus.pictures import subscribe
+from services.bus.messages import Heartbeats, subscribe
 
 
 def test_changes_and_the_last_state_are_heard(runtime):

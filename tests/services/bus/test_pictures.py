@@ -12,8 +12,17 @@ import zmq
 
 from gsplat_core.io.frame_codec import encode
 from gsplat_core.scene.frames import Frame
-from services.bus.messages import MOST_BYTES, packed_json, parsed_json
-from services.bus.pictures import HIGH_WATER, MAX_PARTS, PicturePublisher, picture_from, split, subscribe
+from services.bus.messages import (
+    HIGH_WATER,
+    MAX_PARTS,
+    MOST_BYTES,
+    PicturePublisher,
+    packed_json,
+    parsed_json,
+    picture_from,
+    split,
+    subscribe,
+)
 from services.errors import BadMessage
 
 
@@ -76,7 +85,7 @@ def test_a_reader_that_was_there_before_the_sender_hears_it(runtime, context):
 
 READER = """
 import sys, zmq
-from services.bus.pictures import subscribe
+from services.bus.messages import subscribe
 socket = subscribe(zmq.Context.instance().socket(zmq.SUB), sys.argv[1])
 socket.recv_multipart()
 print("reads", flush=True)

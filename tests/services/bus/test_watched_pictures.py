@@ -7,7 +7,7 @@ import time
 import numpy as np
 import zmq
 
-from services.bus.pictures import WatchedPublisher, picture_from, subscribe, wait_for_readers
+from services.bus.messages import WatchedPublisher, picture_from, subscribe, wait_for_readers
 
 IMAGE = np.zeros((2, 3, 3), np.uint8)
 

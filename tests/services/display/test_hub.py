@@ -10,7 +10,7 @@ import simplejpeg
 
 from gsplat_core.errors import InvalidSetting
 from services import display as hubs
-from services.bus.pictures import PicturePublisher
+from services.bus.messages import PicturePublisher
 from services.display import SLOW, DisplayHub
 
 IMAGE = np.full((16, 24, 3), (200, 100, 50), np.uint8)

@@ -15,7 +15,7 @@ import pytest
 from gsplat_core.errors import InvalidSetting
 from operators.errors import OutputError
 from services import openigtlink
-from services.bus.pictures import PicturePublisher
+from services.bus.messages import PicturePublisher
 from services.openigtlink import MessageServer, StreamMessages, folder_of, ijk_to_camera, send
 
 pyigtl = pytest.importorskip("pyigtl", reason="pip install 'intrasplat[igtl]'")

@@ -10,8 +10,7 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame, FrameStatus
 from operators.errors import SourceUnavailable
 from operators.sources.source import SourceDescription, SourceState
-from services.bus.messages import CommandServer, Heartbeats
-from services.bus.pictures import PicturePublisher
+from services.bus.messages import CommandServer, Heartbeats, PicturePublisher
 from services.supervisor.capture import CapturedSource
 
 SOON_S = 300.0
@@ -120,7 +119,7 @@ def test_a_message_that_is_no_frame_is_counted(folder, monkeypatch):
     source.open()
     first(source, capture)
     with monkeypatch.context() as patch:
-        patch.setattr("services.bus.pictures.encode", lambda frame: [b"nonsense"])
+        patch.setattr("services.bus.messages.encode", lambda frame: [b"nonsense"])
         capture.send(1)
     until(lambda: source.counts().get("bad_messages") == 1)
     capture.publisher.publish({"seq": 1}, np.zeros((4, 6, 3), np.uint8))

@@ -10,7 +10,7 @@ import pytest
 import zmq
 
 from gsplat_core.errors import InvalidSetting
-from services.bus.pictures import picture_from, subscribe
+from services.bus.messages import picture_from, subscribe
 from services.errors import BadMessage
 from services.supervisor import screen as layers_module
 from services.supervisor.screen import Layers

@@ -19,7 +19,7 @@ from gsplat_core.io.bundle import save_bundle
 from gsplat_core.models import Model
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
-from services.bus.pictures import picture_from, subscribe
+from services.bus.messages import picture_from, subscribe
 from services.bus.runtime import ProcessIdentity, RuntimeFolder
 from services.settings import StreamSettings
 from services.supervisor.launcher import ByLauncher, Direct
