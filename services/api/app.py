@@ -25,8 +25,7 @@ from services.api.pages import ABOUT, describe
 from services.api.problems import answer_with_problems
 from services.api.state import ControlState, Parts, Storage, ViewerCount, folders_of
 from services.audit import AuditLog, AuditUnwritable, Keeping
-from services.auth.keys import KeyStore, changed_outside, first_admin_key, keys_read_again
-from services.auth.roles import Tickets
+from services.auth.keys import KeyStore, Tickets, changed_outside, first_admin_key, keys_read_again
 from services.settings import ServiceSettings, SettingsInvalid
 
 if TYPE_CHECKING:

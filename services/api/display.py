@@ -21,7 +21,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 from services.api.guard import CallerOf, new_router, requires, still_valid
 from services.api.problems import Unavailable, problem_answer
 from services.api.state import ControlState, control_of, part
-from services.auth.roles import Caller
+from services.auth.keys import Caller
 from services.display import BOUNDARY, EncodedPicture, PictureKind
 from services.settings import ResourceName
 

@@ -31,8 +31,7 @@ from services.api.problems import (
 from services.api.state import KEYS_UNREADABLE, ControlState, control_of
 from services.audit import AuditUnwritable
 from services.audit.files import Detail, Outcome
-from services.auth.keys import KeysUnreadable
-from services.auth.roles import ANYBODY, Caller, Role
+from services.auth.keys import ANYBODY, Caller, KeysUnreadable, Role
 
 JSON = "application/json"
 MOST_TOKEN_LENGTH = 256

@@ -12,8 +12,7 @@ from starlette.requests import Request
 from services.api.guard import CallerOf, new_router, recorded, requires
 from services.api.problems import Conflicting, Missing
 from services.api.state import ControlState, control_of
-from services.auth.keys import ApiKey, KeyConflict, limits_of
-from services.auth.roles import Role
+from services.auth.keys import ApiKey, KeyConflict, Role, limits_of
 from services.schemas import CallerView, KeyView, MadeKey, NewKey, Ticket, TicketFor
 
 router = new_router("keys")

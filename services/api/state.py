@@ -29,8 +29,7 @@ from services.api.observability import Measures
 from services.api.problems import Missing, NotBuiltIn, Problem, Unprocessable
 from services.audit import AuditError, AuditLog
 from services.audit.log import SystemEvents
-from services.auth.keys import KeyStore
-from services.auth.roles import Tickets
+from services.auth.keys import KeyStore, Tickets
 from services.schemas import CheckResult
 from services.settings import ServiceSettings
 

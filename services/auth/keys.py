@@ -1,6 +1,7 @@
-"""API keys, stored as digests, and audit entries for changes by `intrasplat keys`.
+"""Callers and their credentials: roles, API keys, and single-use tickets for URLs.
 
-A key has 256 random bits, so one SHA-256 is as safe as a slow password hash.
+Keys are stored as digests in a file, and changes of the file by `intrasplat keys` get audit entries. A key has 256 random bits, so one SHA-256 is as
+safe as a slow password hash. A ticket stands in for a key where a browser cannot send one. It is valid for one path, once, and for a short time.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager, contextmanager, suppress
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
+from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
@@ -27,9 +29,92 @@ from gsplat_core.errors import UserError
 from gsplat_core.io.files import read_regular
 from services.audit import AuditLog, AuditUnwritable
 from services.audit.files import Detail
-from services.auth.roles import Role
 
 log = logging.getLogger(__name__)
+
+
+class Role(StrEnum):
+    """Caller role, in ascending order. Each role includes the permissions of the previous ones. `public` needs no key and no key has it."""
+
+    PUBLIC = "public"
+    VIEWER = "viewer"
+    OPERATOR = "operator"
+    ADMIN = "admin"
+
+    def may(self, needed: Role) -> bool:
+        """Return True if this role includes `needed`."""
+        order = list(Role)
+        return order.index(self) >= order.index(needed)
+
+
+@dataclass(frozen=True)
+class Caller:
+    """Authenticated caller: name and id of a key or an OpenID Connect user, and the role."""
+
+    name: str
+    key_id: str
+    role: Role
+    federated: bool = False
+    """True for an OpenID Connect user, where `key_id` is not the id of an API key."""
+    streams: frozenset[str] | None = None
+    """Streams that the key is limited to; None for all."""
+    expires_at: float | None = None
+    """Unix time in seconds at which the user's token expires; None for an API key."""
+
+    def may_use(self, stream: str) -> bool:
+        """Return True if the key's limits include the stream, regardless of whether it exists."""
+        return self.streams is None or stream in self.streams
+
+    def __str__(self) -> str:
+        return f"{self.name} ({self.key_id})" if self.key_id else self.name
+
+
+ANYBODY = Caller("anybody", "", Role.PUBLIC)
+MOST_TICKETS = 10_000
+
+
+@dataclass(frozen=True)
+class _Ticket:
+    caller: Caller
+    path: str
+    until_s: float
+
+
+class Tickets:
+    """Unused tickets, held in memory; a restart invalidates them."""
+
+    def __init__(self, lifetime_s: float, clock: Callable[[], float] = time.monotonic) -> None:
+        self.lifetime_s = lifetime_s
+        self._clock = clock
+        self._waiting: dict[str, _Ticket] = {}
+
+    def give(self, caller: Caller, path: str) -> str:
+        """Create a ticket with the caller's role for one path."""
+        self._forget_old()
+        ticket = secrets.token_urlsafe(32)
+        self._waiting[_digest(ticket)] = _Ticket(caller, path, self._clock() + self.lifetime_s)
+        return ticket
+
+    def use(self, ticket: str, path: str) -> Caller | None:
+        """Consume a ticket.
+
+        Returns:
+            The caller, or None if the ticket is unknown, used, expired or for another path.
+        """
+        # Lookup by digest, so the lookup time reveals nothing about existing tickets.
+        found = self._waiting.pop(_digest(ticket), None)
+        if found is None or found.path != path or self._clock() > found.until_s:
+            return None
+        return found.caller
+
+    def _forget_old(self) -> None:
+        now_s = self._clock()
+        for digest in [digest for digest, ticket in self._waiting.items() if ticket.until_s < now_s]:
+            del self._waiting[digest]
+        while len(self._waiting) >= MOST_TICKETS:
+            del self._waiting[next(iter(self._waiting))]
+
+
 PREFIX = "intrasplat"
 MOST_LIVE = 2
 """Largest number of valid keys per name: old and new key during a change-over."""
@@ -170,7 +255,7 @@ class KeyStore:
         Raises:
             KeyConflict: if the key is not permitted.
         """
-        token = f"{PREFIX}_{secrets.token_hex(4)}_{secrets.token_urlsafe(32)}"
+        token = _new_token()
         return self.add(name, role, token, expires_at=expires_at, streams=streams), token
 
     def add(
@@ -318,7 +403,7 @@ def first_admin_key(store: KeyStore, file: Path) -> bool:
         except KeyConflict as error:
             raise KeyConflict(f"{file} holds no API key: {error}") from error
         return False
-    token = f"{PREFIX}_{secrets.token_hex(4)}_{secrets.token_urlsafe(32)}"
+    token = _new_token()
     file.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
     with open(file, "x", opener=_private) as out:
         out.write(token + "\n")
@@ -326,6 +411,10 @@ def first_admin_key(store: KeyStore, file: Path) -> bool:
         os.fsync(out.fileno())
     store.add("admin", Role.ADMIN, token)
     return True
+
+
+def _new_token() -> str:
+    return f"{PREFIX}_{secrets.token_hex(4)}_{secrets.token_urlsafe(32)}"
 
 
 def _now() -> str:

@@ -20,7 +20,7 @@ import httpx2
 import jwt
 
 from services.api.problems import Forbidden, Unauthenticated, Unavailable
-from services.auth.roles import Caller, Role
+from services.auth.keys import Caller, Role
 from services.settings.sections import OidcSettings
 
 log = logging.getLogger(__name__)

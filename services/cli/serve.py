@@ -19,8 +19,7 @@ from services.api.observability import log_to_stderr, say_start
 from services.api.server import bind, certificate_of, serve
 from services.api.service import bind_probe
 from services.audit import AuditInUse, AuditLog, AuditUnwritable, Keeping, verify
-from services.auth.keys import ApiKey, KeyConflict, KeyStore, append_key_change
-from services.auth.roles import Role
+from services.auth.keys import ApiKey, KeyConflict, KeyStore, Role, append_key_change
 from services.backup import Backup, check_backup, make_backup, refuse_unfinished_restore, restore_backup
 from services.cli.exit_codes import BAD_INPUT, OK
 from services.cli.terminal import KEY_COLUMNS, printable, table

@@ -101,8 +101,7 @@ def test_tls_replaces_the_port_and_the_plain_text(composed, tool, tmp_path):
 
 
 def test_secrets_are_made_once_and_the_service_takes_the_key(tmp_path):
-    from services.auth.keys import KeyStore, first_admin_key
-    from services.auth.roles import Role
+    from services.auth.keys import KeyStore, Role, first_admin_key
 
     script = shutil.copy(DEPLOY / "new_secrets.sh", tmp_path)
     subprocess.run([script], check=True)

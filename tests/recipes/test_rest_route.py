@@ -9,7 +9,7 @@ from starlette.testclient import TestClient
 
 from services.api import Parts, new_app
 from services.api.guard import CallerOf, new_router, recorded, requires
-from services.auth.roles import Role
+from services.auth.keys import Role
 from services.console import FILES, PAGE
 from services.settings import ServiceSettings
 

@@ -23,8 +23,7 @@ from services.api.app import AUDIT_FILE, KEYS_FILE
 from services.api.assembly import Archive, new_archive, registry_of
 from services.audit import AuditLog, verify
 from services.audit.log import SystemEvents
-from services.auth.keys import KeyStore
-from services.auth.roles import Role
+from services.auth.keys import KeyStore, Role
 from services.backup import MANIFEST, BackupFailed, check_backup, make_backup, refuse_unfinished_restore, restore_backup
 from services.cli.serve import backup_command, restore_command
 from services.errors import StoreUnavailable

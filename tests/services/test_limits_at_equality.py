@@ -12,9 +12,8 @@ import pytest
 
 from services.api import middleware, state, streams
 from services.api.problems import Unprocessable
-from services.auth import keys, roles
-from services.auth.keys import KeyConflict, KeyStore
-from services.auth.roles import Role
+from services.auth import keys
+from services.auth.keys import KeyConflict, KeyStore, Role, Tickets
 from services.client import requests
 from services.errors import ClientError, Rejected
 from services.jobs import store as jobs
@@ -100,8 +99,8 @@ def test_a_name_and_a_store_have_so_many_keys_and_a_key_so_many_streams(
 
 
 def test_the_oldest_ticket_makes_room(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(roles, "MOST_WAITING", 3)
-    tickets = roles.Tickets(60.0, clock=lambda: 0.0)
+    monkeypatch.setattr(keys, "MOST_TICKETS", 3)
+    tickets = Tickets(60.0, clock=lambda: 0.0)
     made = [tickets.give(f"caller {number}", "/path") for number in range(4)]
     assert [tickets.use(each, "/path") for each in made] == [None, "caller 1", "caller 2", "caller 3"]
 

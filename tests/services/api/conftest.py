@@ -15,7 +15,7 @@ from starlette.testclient import TestClient
 
 from services.api import Parts, new_app
 from services.api.state import ControlState
-from services.auth.roles import Role
+from services.auth.keys import Role
 from services.settings import ServiceSettings
 
 _spec = importlib.util.spec_from_file_location("control_fakes", Path(__file__).with_name("fakes.py"))

@@ -16,7 +16,7 @@ from services.api.guard import rule_of
 from services.api.pages import SWAGGER_FILES, SWAGGER_UI
 from services.api.problems import PROBLEM_JSON, Problem
 from services.api.state import Parts
-from services.auth.roles import Role
+from services.auth.keys import Role
 from services.schemas import CheckResult
 
 ROOT = Path(__file__).resolve().parents[3]

@@ -16,8 +16,7 @@ from starlette.websockets import WebSocketDisconnect
 from services.api import display as display_module
 from services.api.app import KEYS_FILE
 from services.api.guard import still_valid
-from services.auth.keys import KeyStore
-from services.auth.roles import Caller, Role
+from services.auth.keys import Caller, KeyStore, Role
 
 SOCKET = "/v1/streams/endoscope/display"
 MJPEG = "/v1/streams/endoscope/mjpeg"

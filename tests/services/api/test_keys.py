@@ -14,8 +14,7 @@ from starlette.testclient import WebSocketDenialResponse
 
 from services.api.guard import rule_of, still_valid
 from services.auth import keys as keys_module
-from services.auth.keys import KeyConflict, KeyStore, first_admin_key
-from services.auth.roles import Caller, Role, Tickets
+from services.auth.keys import Caller, KeyConflict, KeyStore, Role, Tickets, first_admin_key
 
 
 def test_only_the_digest_of_a_key_is_kept(tmp_path):
