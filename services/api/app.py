@@ -18,12 +18,11 @@ from services import product_version
 from services.api import audit as audit_routes
 from services.api import display, models, pages, recordings, replays, service, snapshots, streams
 from services.api import keys as key_routes
-from services.api.guard import operation_id
-from services.api.middleware import AddressRate, HeadLength, KnownHosts, Observed, SecurityHeaders, TokenBuckets
-from services.api.observability import Measures
+from services.api.guard import AddressRate, HeadLength, KnownHosts, SecurityHeaders, operation_id
+from services.api.observability import Measures, Observed
 from services.api.pages import ABOUT, describe
 from services.api.problems import answer_with_problems
-from services.api.state import ControlState, Parts, Storage, ViewerCount, folders_of
+from services.api.state import ControlState, Parts, Storage, TokenBuckets, ViewerCount, folders_of
 from services.audit import AuditLog, AuditUnwritable, Keeping
 from services.auth.keys import KeyStore, Tickets, changed_outside, first_admin_key, keys_read_again
 from services.settings import ServiceSettings, SettingsInvalid

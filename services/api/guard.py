@@ -1,43 +1,56 @@
-"""Access check of every route, and audit entries of changes.
+"""Checks of every request before its route runs: access, body, host, head and rate; and the audit entries of changes.
 
-Every route declares its role, which is checked before any byte of the body is read. A change is written to the audit log before the caller gets the answer.
+Every route declares its role, which is checked before any byte of the body is read. Bodies have limits on size and speed, and JSON is parsed strictly.
+The middleware checks what is independent of the route. A change is written to the audit log before the caller gets the answer.
 """
 
 from __future__ import annotations
 
 import asyncio
+import ipaddress
+import json
+import re
 import time
 from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from typing import Annotated, Any, Literal, TypeVar
 
 from fastapi import APIRouter, Depends
 from fastapi.routing import APIRoute
+from starlette.datastructures import MutableHeaders
 from starlette.requests import ClientDisconnect, HTTPConnection, Request
 from starlette.responses import Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from services.api.json_body import JsonRequest
-from services.api.middleware import BoundedBody, refuse_by_length
+from services.api.observability import Measures
 from services.api.problems import (
+    BadRequest,
     Forbidden,
+    HeadTooLarge,
+    Misdirected,
     Problem,
+    TooLarge,
     TooManyRequests,
+    TooSlow,
     Unauthenticated,
     Unavailable,
     Unprocessable,
     WrongContent,
+    refuse,
 )
-from services.api.state import KEYS_UNREADABLE, ControlState, control_of
+from services.api.state import KEYS_UNREADABLE, ControlState, TokenBuckets, control_of, known_problem
 from services.audit import AuditUnwritable
 from services.audit.files import Detail, Outcome
 from services.auth.keys import ANYBODY, Caller, KeysUnreadable, Role
+from services.settings.sections import LimitSettings, ServerSettings
 
 JSON = "application/json"
 MOST_TOKEN_LENGTH = 256
 BodyLimit = Literal["body_bytes", "model_bytes", "recording_bytes"]
 """Names of the settings in `limits` that limit the size of a request body."""
-Scope = Literal["all", "stream", "any"]
+KeyScope = Literal["all", "stream", "any"]
 """Access of stream-limited keys to a route. `all`: none. `stream`: if the path parameter `name` is
 one of the key's streams. `any`: always, because the route itself checks `Caller.streams`."""
 Endpoint = TypeVar("Endpoint", bound=Callable[..., Any])
@@ -53,7 +66,7 @@ class Rule:
     takes: str | None = None
     """Content type of the body. None: JSON if the route declares a body, otherwise any."""
     most: BodyLimit = "body_bytes"
-    scope: Scope = "all"
+    scope: KeyScope = "all"
 
 
 def requires(
@@ -62,7 +75,7 @@ def requires(
     ticket: bool = False,
     takes: str | None = None,
     most: BodyLimit = "body_bytes",
-    scope: Scope = "all",
+    scope: KeyScope = "all",
 ) -> Callable[[Endpoint], Endpoint]:
     """Declare the access rule of a route. Place it between the route decorator and the function.
 
@@ -328,5 +341,272 @@ def _status_of(request: Request, error: Exception) -> int:
         return error.status
     if isinstance(error, ClientDisconnect):
         return 400
-    known = control_of(request).parts.errors
-    return next((known[each].status for each in type(error).__mro__ if each in known), 500)
+    kind = known_problem(control_of(request), error)
+    return 500 if kind is None else kind.status
+
+
+GRACE_S = 5.0
+"""Grace period, in seconds, before the rate of a body is checked."""
+
+
+def refuse_by_length(request: Request, most_bytes: int) -> None:
+    """Refuse a body by its headers, before any byte is read.
+
+    Raises:
+        TooLarge: if Content-Length exceeds `most_bytes`.
+        BadRequest: if Content-Length is not a number, or is sent together with Transfer-Encoding. A
+            proxy in front may have trusted the other header (request smuggling).
+    """
+    stated = request.headers.get("content-length")
+    if stated is not None and "transfer-encoding" in request.headers:
+        raise BadRequest("Content-Length and Transfer-Encoding were both sent; send one")
+    if stated is None:
+        return
+    if not stated.isascii() or not stated.isdigit():
+        raise BadRequest(f"Content-Length is {stated!r:.40}; give a number of bytes")
+    if int(stated) > most_bytes:
+        raise TooLarge(f"the body has {stated} bytes; at most {most_bytes} are taken here")
+
+
+class BoundedBody:
+    """ASGI `receive` that raises TooLarge after `most_bytes` and TooSlow for a body that stalls or trickles."""
+
+    def __init__(self, scope: Scope, receive: Receive, most_bytes: int, limits: LimitSettings) -> None:
+        self._scope = scope
+        self._receive = receive
+        self._most_bytes = most_bytes
+        self._limits = limits
+        self._bytes = 0
+        self._started_s = time.monotonic()
+
+    async def __call__(self) -> Message:
+        if self._scope["state"].get("body_read"):
+            return await self._receive()  # blocks until the client disconnects
+        try:
+            async with asyncio.timeout(self._limits.stall_s):
+                message = await self._receive()
+        except TimeoutError:
+            raise TooSlow(f"no part of the body came for {self._limits.stall_s:g} s; {self._bytes} bytes had") from None
+        if message["type"] == "http.request":
+            self._count(len(message.get("body", b"")))
+            if not message.get("more_body", False):
+                self._scope["state"]["body_read"] = True
+        return message
+
+    def _count(self, received: int) -> None:
+        self._bytes += received
+        if self._bytes > self._most_bytes:
+            raise TooLarge(f"the body has more than {self._most_bytes} bytes, which is what is taken here")
+        elapsed_s = time.monotonic() - self._started_s
+        if elapsed_s > GRACE_S and self._bytes < self._limits.slowest_bytes_per_s * (elapsed_s - GRACE_S):
+            raise TooSlow(f"the body came with {self._bytes / elapsed_s:.0f} bytes a second; send it faster")
+
+
+class JsonRequest(Request):
+    """Request whose JSON body must be UTF-8 and give each key of an object once."""
+
+    async def json(self) -> Any:
+        """Return the parsed body.
+
+        Raises:
+            BadRequest: if the body is not JSON, or gives a key twice.
+        """
+        if not hasattr(self, "_json"):
+            self._json = parsed(await self.body())
+        return self._json
+
+
+def parsed(body: bytes) -> Any:
+    """Parse a JSON body.
+
+    Raises:
+        BadRequest: if it is not UTF-8 or not JSON, is nested too deeply, has a number that is too long, or gives a key of an
+            object twice.
+    """
+    try:
+        return json.loads(body.decode(), object_pairs_hook=_object)
+    except UnicodeDecodeError as error:
+        raise BadRequest(f"the body is not UTF-8 text at byte {error.start}; send JSON in UTF-8") from error
+    except json.JSONDecodeError as error:
+        place = f"line {error.lineno}, column {error.colno}"
+        raise BadRequest(f"the body is not JSON at {place}: {error.msg}") from error
+    except RecursionError as error:
+        raise BadRequest("the body has too many lists and objects inside each other; send JSON as in /docs") from error
+    except ValueError as error:  # Python's limit on the digits of a whole number
+        raise BadRequest("the body has a whole number with thousands of digits; send JSON as in /docs") from error
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in found:
+            raise BadRequest(f"the body gives the key {key!r:.60} twice in one object; give it once")
+        found[key] = value
+    return found
+
+
+CONTENT_SECURITY_POLICY = "; ".join(
+    [
+        "default-src 'none'",
+        "script-src 'self'",
+        "style-src 'self'",
+        "img-src 'self' data: blob:",
+        "media-src blob:",
+        "font-src 'self'",
+        "connect-src 'self'",
+        "worker-src 'self'",
+        "base-uri 'none'",
+        "form-action 'none'",
+        "frame-ancestors 'none'",
+    ]
+)
+"""Policy that blocks external and inline content. Display pictures and replay videos arrive as
+blobs, Swagger UI's icons as data URLs."""
+HEADERS = {
+    "Content-Security-Policy": CONTENT_SECURITY_POLICY,
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Permissions-Policy": "camera=(), microphone=(), geolocation=()",
+    "Cache-Control": "no-store",
+}
+
+
+class SecurityHeaders:
+    """Middleware that adds missing security headers, and Strict-Transport-Security over TLS."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] == "lifespan":
+            return await self._app(scope, receive, send)
+
+        async def send_with_headers(message: Message) -> None:
+            if message["type"] in ("http.response.start", "websocket.http.response.start"):
+                headers = MutableHeaders(scope=message)
+                for name, value in HEADERS.items():
+                    headers.setdefault(name, value)
+                if scope.get("scheme") in ("https", "wss"):
+                    headers.setdefault("Strict-Transport-Security", "max-age=31536000")
+            await send(message)
+
+        await self._app(scope, receive, send_with_headers)
+
+
+_HOST = re.compile(r"(?P<name>[a-z0-9._-]{1,253}|\[[0-9a-f:.]{2,45}\])(:\d{1,5})?")
+
+
+class KnownHosts:
+    """Middleware that answers 421 to a request for an unknown host.
+
+    IP addresses are always accepted, because a browser sends one only for a page served from that address. `localhost`
+    and `server.host` are accepted too. Other names must be in `server.allowed_hosts`. With TLS and an empty list every
+    name is accepted, because the certificate restricts the names.
+    """
+
+    def __init__(self, app: ASGIApp, server: ServerSettings, measures: Measures) -> None:
+        self._app = app
+        self._measures = measures
+        self._any_name = server.certfile is not None and not server.allowed_hosts
+        self._names = {"localhost", server.host.lower(), *server.allowed_hosts}
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] == "lifespan":
+            return await self._app(scope, receive, send)
+        given = [value.decode("latin-1").lower() for name, value in scope["headers"] if name == b"host"]
+        # A request without a Host header does not come from a browser: HTTP/1.1 requires the
+        # header, and the parser refuses such requests.
+        if len(given) < 2 and all(self.knows(host) for host in given):
+            return await self._app(scope, receive, send)
+        self._measures.refused.labels("host").inc()
+        named = f"{', '.join(given):.100}"
+        problem = Misdirected(
+            f"this server is not known as {named!r}; ask for its address, or add the name to server.allowed_hosts"
+        )
+        await refuse(problem, scope, receive, send)
+
+    def knows(self, host: str) -> bool:
+        """Return True if a lower-case Host header names this server."""
+        match = _HOST.fullmatch(host)
+        if match is None:
+            return False
+        name = match["name"]
+        return self._any_name or _is_address(name) or any(fnmatchcase(name.rstrip("."), each) for each in self._names)
+
+
+def _is_address(name: str) -> bool:
+    try:
+        ipaddress.ip_address(name.strip("[]"))
+    except ValueError:
+        return False
+    return True
+
+
+MOST_HEAD_BYTES = 32 * 1024
+_BETWEEN = len(": \r\n")
+
+
+class HeadLength:
+    """Middleware that answers 431 to a request whose head is longer than `MOST_HEAD_BYTES`.
+
+    The HTTP parser limits only incomplete heads; a long head that arrives in one piece passes the parser.
+    """
+
+    def __init__(self, app: ASGIApp, measures: Measures) -> None:
+        self._app = app
+        self._measures = measures
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] == "lifespan" or length_of(scope) <= MOST_HEAD_BYTES:
+            return await self._app(scope, receive, send)
+        self._measures.refused.labels("head").inc()
+        problem = HeadTooLarge(
+            f"the head of the request has {length_of(scope)} bytes; at most {MOST_HEAD_BYTES} are taken"
+        )
+        await refuse(problem, scope, receive, send)
+
+
+def length_of(scope: Scope) -> int:
+    """Return the length of a head in bytes, without method and version."""
+    target = scope.get("raw_path") or scope["path"].encode()
+    fields = sum(len(name) + len(value) + _BETWEEN for name, value in scope["headers"])
+    return len(target) + len(scope["query_string"]) + fields
+
+
+class AddressRate:
+    """Middleware that answers 429 to a client whose IP address (/64 network for IPv6) exceeds its request rate."""
+
+    def __init__(self, app: ASGIApp, buckets: TokenBuckets, measures: Measures) -> None:
+        self._app = app
+        self._buckets = buckets
+        self._measures = measures
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] == "lifespan":
+            return await self._app(scope, receive, send)
+        wait_s = self._buckets.wait_s(network_of(scope))
+        if wait_s == 0:
+            return await self._app(scope, receive, send)
+        self._measures.refused.labels("address rate").inc()
+        problem = TooManyRequests(f"too many requests from this address; wait {wait_s:.1f} s", wait_s)
+        await refuse(problem, scope, receive, send)
+
+
+def network_of(scope: Scope) -> str:
+    """Return the network of a request's client, used as rate limit key."""
+    return network_of_address((scope.get("client") or ("unknown", 0))[0])
+
+
+def network_of_address(host: str) -> str:
+    """Return the network of an address: the /64 for IPv6, since one host can use a whole /64, otherwise the address."""
+    try:
+        address = ipaddress.ip_address(host)
+    except ValueError:
+        return host
+    mapped = getattr(address, "ipv4_mapped", None)
+    if mapped is not None:
+        return str(mapped)
+    return str(ipaddress.ip_network((address, 64), strict=False)) if address.version == 6 else host

@@ -24,7 +24,7 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 from websockets.exceptions import SecurityError
 
 from services.api.certificate import ServerCertificate
-from services.api.middleware import MOST_HEAD_BYTES, network_of_address
+from services.api.guard import MOST_HEAD_BYTES, network_of_address
 from services.api.service import ProbeListener
 from services.api.state import ControlState
 from services.audit.log import SystemEvents

@@ -11,6 +11,7 @@ import asyncio
 import logging
 import os
 import shutil
+import time
 from collections import Counter, OrderedDict
 from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager, contextmanager
@@ -24,7 +25,6 @@ from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.registry import Collector
 from starlette.requests import HTTPConnection
 
-from services.api.middleware import TokenBuckets
 from services.api.observability import Measures
 from services.api.problems import Missing, NotBuiltIn, Problem, Unprocessable
 from services.audit import AuditError, AuditLog
@@ -89,6 +89,34 @@ class ViewerCount:
             yield
         finally:
             self._open -= 1
+
+
+MOST_BUCKETS = 20_000
+
+
+class TokenBuckets:
+    """Token bucket per caller: `rate_per_s` tokens are added per second, at most `burst` are kept."""
+
+    def __init__(self, rate_per_s: float, burst: float, clock: Callable[[], float] = time.monotonic) -> None:
+        self._rate = rate_per_s
+        self._burst = max(1.0, burst)
+        self._clock = clock
+        self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()
+
+    def wait_s(self, caller: str, tokens: float = 1.0) -> float:
+        """Take tokens from a caller's bucket.
+
+        Returns:
+            0 if there were enough tokens; otherwise the seconds until there are, and none is taken.
+        """
+        now_s = self._clock()
+        left, at_s = self._buckets.pop(caller, (self._burst, now_s))
+        left = min(self._burst, left + (now_s - at_s) * self._rate)
+        enough = left >= tokens
+        self._buckets[caller] = (left - tokens if enough else left, now_s)
+        if len(self._buckets) > MOST_BUCKETS:
+            self._buckets.popitem(last=False)  # least recently used: this bucket has refilled, or nearly
+        return 0.0 if enough else (tokens - left) / self._rate
 
 
 IdempotencyKey = Annotated[

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from services.api import middleware, state, streams
+from services.api import state, streams
 from services.api.problems import Unprocessable
 from services.auth import keys
 from services.auth.keys import KeyConflict, KeyStore, Role, Tickets
@@ -106,8 +106,8 @@ def test_the_oldest_ticket_makes_room(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_least_recently_used_bucket_makes_room(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(middleware, "MOST_BUCKETS", 2)
-    buckets = middleware.TokenBuckets(1, 60, clock=lambda: 0.0)
+    monkeypatch.setattr(state, "MOST_BUCKETS", 2)
+    buckets = state.TokenBuckets(1, 60, clock=lambda: 0.0)
     for caller in ("a", "b", "a", "c"):
         buckets.wait_s(caller)
     assert list(buckets._buckets) == ["a", "c"]

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from services.api import Parts, new_app
-from services.api.middleware import network_of_address
+from services.api.guard import network_of_address
 from services.api.server import AddressBound, BoundedListener, DrainingServer, bind, config_of
 from services.api.service import MOST_CONNECTIONS, MOST_HEAD_BYTES, ProbeListener, bind_probe
 from services.errors import CannotServe

@@ -8,7 +8,7 @@ import pytest
 from pydantic import ValidationError
 from starlette.testclient import WebSocketDenialResponse
 
-from services.api.middleware import KnownHosts
+from services.api.guard import KnownHosts
 from services.api.observability import Measures
 from services.api.problems import PROBLEM_JSON
 from services.settings.sections import ServerSettings

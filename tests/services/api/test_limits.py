@@ -7,8 +7,9 @@ import gzip
 
 import pytest
 
-from services.api.middleware import MOST_BUCKETS, BoundedBody, TokenBuckets, network_of
+from services.api.guard import BoundedBody, network_of
 from services.api.problems import PROBLEM_JSON, TooLarge, TooSlow
+from services.api.state import MOST_BUCKETS, TokenBuckets
 from services.settings.sections import LimitSettings
 
 
@@ -155,7 +156,7 @@ def test_bounded_bodies(monkeypatch):
         bounded([b"a" * 50, b"b" * 51])
     with pytest.raises(TooSlow, match=r"for 0\.05 s"):
         bounded([b"a", 5.0, b"b"], stall_s=0.05)
-    monkeypatch.setattr("services.api.middleware.GRACE_S", 0.05)
+    monkeypatch.setattr("services.api.guard.GRACE_S", 0.05)
     with pytest.raises(TooSlow, match="send it faster"):
         bounded([b"a", 0.1, b"b", b"c"], slowest_bytes_per_s=1000)
     assert bounded([b"a" * 60, 0.1, b"b", b"c"], slowest_bytes_per_s=1) == b"a" * 60 + b"bc"
