@@ -185,7 +185,6 @@ WITHOUT_TORCH = [
     "services.recordings.store",
     "services.jobs.pool",
     "services.jobs.store",
-    "services.api.assembly",
     "services.api.pages",
     "services.exports.snapshots",
     "services.exports.cache",

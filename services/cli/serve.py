@@ -13,8 +13,7 @@ from pathlib import Path
 import typer
 
 from gsplat_core.errors import UserError
-from services.api.app import AUDIT_FILE, KEYS_FILE, new_app
-from services.api.assembly import assembled
+from services.api.app import AUDIT_FILE, KEYS_FILE, assembled, new_app
 from services.api.observability import log_to_stderr, say_start
 from services.api.server import bind, certificate_of, serve
 from services.api.service import bind_probe

@@ -19,8 +19,7 @@ import pytest
 import sqlalchemy as sa
 
 from services import backup as backups
-from services.api.app import AUDIT_FILE, KEYS_FILE
-from services.api.assembly import Archive, new_archive, registry_of
+from services.api.app import AUDIT_FILE, KEYS_FILE, Archive, new_archive, registry_of
 from services.audit import AuditLog, verify
 from services.audit.log import SystemEvents
 from services.auth.keys import KeyStore, Role

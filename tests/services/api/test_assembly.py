@@ -7,7 +7,7 @@ import tempfile
 
 import pytest
 
-from services.api.assembly import assembled, event_receiver
+from services.api.app import assembled, event_receiver
 from services.api.observability import StreamMeasures
 from services.audit.log import SystemEvents
 from services.schemas import StreamView

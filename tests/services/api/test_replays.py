@@ -9,7 +9,7 @@ from control_fakes import NotNow, NotThere, fake_parts
 from starlette.testclient import WebSocketDenialResponse
 from starlette.websockets import WebSocketDisconnect
 
-from services.api.assembly import ERRORS
+from services.api.app import ERRORS
 from services.api.problems import PROBLEM_JSON, Conflicting, Missing
 from services.api.replays import REPORT_POLICY
 from services.errors import NotFound

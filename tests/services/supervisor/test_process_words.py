@@ -6,7 +6,7 @@ import logging
 
 import pytest
 
-from services.api.assembly import event_receiver
+from services.api.app import event_receiver
 from services.api.observability import StreamMeasures
 from services.audit.log import SystemEvents
 from services.supervisor import process as processes
