@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from services.api.certificate import ServerCertificate
 from services.api.observability import STATES, Measures, StreamMeasures
+from services.api.server import ServerCertificate
 from services.api.state import Storage
 from services.audit import AuditLog
 from services.audit.log import SystemEvents

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from services.api.certificate import ServerCertificate, expiry_of
+from services.api.server import ServerCertificate, expiry_of
 from services.audit.log import SystemEvents
 
 x509 = pytest.importorskip("cryptography.x509", reason="cryptography comes with the extra oidc")
@@ -225,7 +225,7 @@ def test_what_prometheus_gets(tmp_path):
 
 
 def test_a_change_is_seen_by_itself_and_is_in_the_audit_log(tmp_path, monkeypatch):
-    from services.api import certificate as module
+    from services.api import server as module
     from services.audit import AuditLog
 
     monkeypatch.setattr(module, "LOOK_S", 0.01)
