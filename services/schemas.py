@@ -23,7 +23,7 @@ from pydantic import (
 
 from operators.settings import CallerJobOptions, CallerRenderOptions, stream_options_schema
 from services.auth.keys import MOST_STREAMS, Role
-from services.exports.cache import PICTURES, RenderWish
+from services.exports.files import PICTURES, RenderWish
 from services.settings import ResourceName, StreamSettings
 from services.settings.sections import masked_address
 

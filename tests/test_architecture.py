@@ -187,7 +187,7 @@ WITHOUT_TORCH = [
     "services.jobs.store",
     "services.api.pages",
     "services.exports.snapshots",
-    "services.exports.cache",
+    "services.exports.files",
     "services.client",
     "services.audit",
     "services.api",

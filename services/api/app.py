@@ -45,7 +45,7 @@ from services.errors import (
     Rejected,
     StoreUnavailable,
 )
-from services.exports.cache import ExportCache
+from services.exports.files import ExportCache
 from services.exports.snapshots import ModelExports, SnapshotStore, StreamSnapshots
 from services.jobs.pool import PoolKeeper, PoolProcess, PoolSettings
 from services.jobs.replays import RecordingRetention, ReplayRetention, Replays

@@ -19,12 +19,12 @@ from services.api.models import Number, check_soon, registry_of
 from services.api.problems import Forbidden, Unprocessable, problem_answer
 from services.api.state import IdempotencyKey, control_of, part
 from services.api.streams import streams_of
-from services.exports.cache import ALL, PICTURES
+from services.exports.files import ALL, PICTURES
 from services.schemas import RenderRequest, SnapshotRequest, SnapshotView, VersionView
 from services.settings import ResourceName
 
 if TYPE_CHECKING:
-    from services.exports.cache import Exported, Wish
+    from services.exports.files import Exported, Wish
     from services.exports.snapshots import ModelExports, StreamSnapshots
 
 router = new_router("snapshots")

@@ -24,7 +24,7 @@ from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.exports.formats import ExportWish
 from gsplat_core.io.files import sync_folder, write_durably
 from services.errors import CommandRefused, Conflict, ExportFailed, NoSnapshot, Rejected
-from services.exports.cache import ExportCache, Exported, Wish
+from services.exports.files import ExportCache, Exported, Wish
 from services.registry.bundle_file import SUFFIX, pack
 from services.registry.models import ModelRegistry
 from services.registry.records import State, VersionRecord

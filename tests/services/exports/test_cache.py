@@ -17,7 +17,7 @@ from gsplat_core.io.bundle import save_bundle
 from gsplat_core.io.exports.formats import FORMATS, ExportWish
 from operators.settings import RenderOptions
 from services.errors import ExportBusy, ExportFailed, ExportRefused
-from services.exports.cache import PICTURES, ExportCache, ExportPrograms, RenderWish
+from services.exports.files import PICTURES, ExportCache, ExportPrograms, RenderWish
 from tests.services.supervisor.test_model_show import uniform
 
 STUB = (sys.executable, str(Path(__file__).with_name("stub_make.py")))
@@ -159,7 +159,7 @@ def test_the_program_itself(tmp_path):
         cache.get("a", lambda: tmp_path / "model", ExportWish(FORMATS["glb"], 9.0))
 
 
-@pytest.mark.parametrize("module", ["services.exports.cache", "services.exports.snapshots"])
+@pytest.mark.parametrize("module", ["services.exports.files", "services.exports.snapshots"])
 @pytest.mark.slow
 def test_this_process_loads_no_torch(module):
     program = f"import sys, {module}; assert not {{'torch', 'cv2'}} & set(sys.modules)"

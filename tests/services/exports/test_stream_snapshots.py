@@ -11,7 +11,7 @@ import pytest
 from gsplat_core.errors import InvalidSetting
 from services.errors import CommandRefused, Conflict, Rejected
 from services.exports import snapshots as parts
-from services.exports.cache import ALL, ExportWish
+from services.exports.files import ALL, ExportWish
 from services.exports.snapshots import ModelExports, StreamSnapshots
 from services.registry.records import State
 

@@ -11,8 +11,8 @@ import pytest
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.bundle import save_bundle
-from services.exports import make
-from services.exports.cache import ALL
+from services.exports import files
+from services.exports.files import ALL
 from tests.services.supervisor.test_model_show import uniform
 
 
@@ -20,19 +20,19 @@ from tests.services.supervisor.test_model_show import uniform
 def ran(monkeypatch):
     """Run the program with fakes in place of the writers; `calls` has what it did."""
     calls: dict[str, tuple] = {}
-    monkeypatch.setattr(make, "keep_files_private", lambda: calls.update(private=()))
-    monkeypatch.setattr(make.os, "nice", lambda by: calls.update(nice=(by,)))
-    monkeypatch.setattr(make.resource, "setrlimit", lambda *limit: calls.update(limit=limit))
-    monkeypatch.setattr(make, "pack", lambda *paths: calls.update(pack=paths))
-    monkeypatch.setattr(make, "export", lambda *wanted: calls.update(export=wanted))
+    monkeypatch.setattr(files, "keep_files_private", lambda: calls.update(private=()))
+    monkeypatch.setattr(files.os, "nice", lambda by: calls.update(nice=(by,)))
+    monkeypatch.setattr(files.resource, "setrlimit", lambda *limit: calls.update(limit=limit))
+    monkeypatch.setattr(files, "pack", lambda *paths: calls.update(pack=paths))
+    monkeypatch.setattr(files, "export", lambda *wanted: calls.update(export=wanted))
     return calls
 
 
 def test_a_packed_model_and_other_formats_have_their_own_writers(ran, tmp_path):
     folder, file = tmp_path / "model", tmp_path / "file"
-    assert make.main([str(folder), str(file), "--format", "isplat"]) == 0
+    assert files.main([str(folder), str(file), "--format", "isplat"]) == 0
     assert ran.pop("pack") == (folder, file) and "export" not in ran
-    assert make.main([str(folder), str(file), "--format", "ply", "--time", "1.5"]) == 0
+    assert files.main([str(folder), str(file), "--format", "ply", "--time", "1.5"]) == 0
     assert "pack" not in ran
     asked_folder, asked_file, wish = ran["export"]
     assert (asked_folder, asked_file) == (folder, file)
@@ -40,7 +40,7 @@ def test_a_packed_model_and_other_formats_have_their_own_writers(ran, tmp_path):
 
 
 def test_it_gives_way_to_streams_and_writes_no_core_file(ran, tmp_path):
-    make.main([str(tmp_path), "file", "--format", "isplat"])
+    files.main([str(tmp_path), "file", "--format", "isplat"])
     assert "private" in ran and ran["limit"] == (resource.RLIMIT_CORE, (0, 0)) and ran["nice"][0] > 0
 
 
@@ -48,8 +48,8 @@ def test_a_refusal_is_a_sentence_without_the_folder(ran, tmp_path, monkeypatch, 
     def refuse(*wanted):
         raise InvalidSetting(f"{tmp_path}/model.safetensors is damaged")
 
-    monkeypatch.setattr(make, "export", refuse)
-    assert make.main([str(tmp_path), "file", "--format", "ply"]) == make.REFUSED
+    monkeypatch.setattr(files, "export", refuse)
+    assert files.main([str(tmp_path), "file", "--format", "ply"]) == files.REFUSED
     assert capsys.readouterr().err == "model.safetensors is damaged\n"
 
 
@@ -60,7 +60,7 @@ def test_a_model_is_loaded_and_exported(monkeypatch, tmp_path):
     made = []
     monkeypatch.setattr(bundle, "load_bundle", lambda folder: ("model of", folder))
     monkeypatch.setattr(export, "export_model", lambda *wanted: made.append(wanted))
-    make.export(tmp_path, tmp_path / "file", "wish")
+    files.export(tmp_path, tmp_path / "file", "wish")
     assert made == [(("model of", tmp_path), tmp_path / "file", "wish")]
 
 
@@ -70,7 +70,7 @@ def test_a_rendering_has_the_requested_outputs(ran, tmp_path, name):
     file, outputs = tmp_path / f"file.{name}", ["image", "normals"]
     wanted = {"view": "recorded", "time_s": None, "options": {"outputs": outputs, "fps": 1.0}}
     arguments = [str(tmp_path / "model"), str(file), f"--format={name}", f"--render={json.dumps(wanted)}"]
-    assert make.main(arguments) == 0
+    assert files.main(arguments) == 0
     camera = uniform((0.2, 0.5, 0.8)).camera
     if name == "png":
         shown = cv2.imread(str(file))

@@ -1,15 +1,18 @@
-"""Exports and renderings of models: formats, the export program with its limits, and the cache of its files.
+"""Exports and renderings of models as files: formats, the program that makes a file, its limits in the service, and the cache of the files.
 
-A separate process creates an export, so this module does not import torch. The cache finds it by the digest of its input, and evicts the
-oldest.
+The service runs the program `python -m services.exports.files FOLDER FILE --format glb` for each new file, so this module imports torch only in the
+functions that need it. Exit code 0: the file was written. Exit code 2: the export was refused, with the reason on standard error. The cache finds a
+file by the digest of its input, and evicts the oldest.
 """
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import hashlib
 import json
 import os
+import resource
 import secrets
 import shutil
 import signal
@@ -20,14 +23,15 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, Literal, get_args
+from typing import Any, BinaryIO, Literal, get_args
 
-from gsplat_core.errors import InvalidSetting
+from gsplat_core.errors import InvalidSetting, UserError
 from gsplat_core.io.exports.formats import FORMATS, ExportFormat, ExportWish
 from gsplat_core.value_ranges import check_seen_at
 from operators.settings import RenderOptions
 from services.errors import ExportBusy, ExportFailed, ExportRefused
-from services.registry.bundle_file import SUFFIX
+from services.private_files import keep_files_private
+from services.registry.bundle_file import SUFFIX, pack
 
 PictureView = Literal["recorded", "orbit", "stereo"]
 PICTURES: Mapping[str, ExportFormat] = {
@@ -72,8 +76,6 @@ class RenderWish:
 ISPLAT = ExportFormat("isplat", SUFFIX, "application/octet-stream")
 """Format of the complete model with its deformation. Unlike the other formats it needs no point in time."""
 ALL: Mapping[str, ExportFormat] = {**FORMATS, ISPLAT.name: ISPLAT}
-
-
 Wish = ExportWish | RenderWish
 
 
@@ -87,8 +89,9 @@ def arguments_of(wish: Wish) -> list[str]:
     return [f"--format={wish.format.name}", *named]
 
 
-PROGRAM = (sys.executable, "-P", "-m", "services.exports.make")
+PROGRAM = (sys.executable, "-P", "-m", "services.exports.files")
 REFUSED = 2
+"""Exit code of the program after a refused export."""
 MOST_S = 300.0
 PASSED_ON = (
     "PATH", "PYTHONPATH", "LD_LIBRARY_PATH", "LANG", "LC_ALL", "TMPDIR", "HOME", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS",
@@ -303,3 +306,65 @@ class ExportCache:
             total -= path.stat().st_size
             path.with_suffix(".json").unlink(missing_ok=True)
             path.unlink()
+
+
+NICENESS = 10
+"""Nice value of an export; running streams have priority."""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Create one export file. Return the exit code: 0, or `REFUSED` after a UserError."""
+    keep_files_private()
+    parser = argparse.ArgumentParser(prog="python -m services.exports.files", description="Export an unpacked model.")
+    parser.add_argument("folder", type=Path, metavar="FOLDER")
+    parser.add_argument("file", type=Path, metavar="FILE")
+    parser.add_argument("--format", choices=[*ALL, *PICTURES], required=True)
+    parser.add_argument("--time", type=float)
+    parser.add_argument("--times", type=int)
+    parser.add_argument("--render", help="view, time and options of a rendering, as JSON")
+    given = parser.parse_args(arguments)
+    os.nice(NICENESS)
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # a core file would contain patient data
+    try:
+        if given.format == ISPLAT.name:
+            pack(given.folder, given.file)
+        elif given.format in PICTURES:
+            wanted = json.loads(given.render)
+            options = RenderOptions(**wanted["options"])
+            render(
+                given.folder, given.file, RenderWish(PICTURES[given.format], options, wanted["view"], wanted["time_s"])
+            )
+        else:
+            export(given.folder, given.file, ExportWish(ALL[given.format], given.time, given.times))
+    except UserError as error:
+        sys.stderr.write(f"{str(error).replace(f'{given.folder}/', '')}\n")
+        return REFUSED
+    return 0
+
+
+def render(folder: Path, file: Path, wish: RenderWish) -> None:
+    """Render a picture or a video. Imports here take seconds, and packing does not need them."""
+    from operators.applications.render import ViewWish, render_model, render_picture
+    from operators.sinks.video import write_png
+
+    options = wish.options
+    wanted: dict[str, Any] = {
+        "scale": options.scale, "renderer": options.renderer, "options": options.renderer_options,
+        "outputs": options.outputs, "view": ViewWish(wish.view),
+    }  # fmt: skip
+    if wish.format.name == "png":
+        write_png(file, render_picture(folder, wish.time_s, **wanted))
+    else:
+        render_model(folder, file, fps=options.fps, **wanted)
+
+
+def export(folder: Path, file: Path, wish: ExportWish) -> None:
+    """Export to a format of other programs. Imports here take seconds, and packing does not need them."""
+    from gsplat_core.io.bundle import load_bundle
+    from gsplat_core.io.exports.export import export_model
+
+    export_model(load_bundle(folder), file, wish)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
