@@ -19,7 +19,6 @@ from services.errors import CheckFailed
 from services.registry.records import CHECK_PASSED_S
 
 PROGRAM = (sys.executable, "-P", "-m", "services.registry.check")
-CONVERTER = (sys.executable, "-P", "-m", "services.registry.convert")
 MOST_LINE_BYTES = 1 << 16
 MOST_REASON = 500
 

@@ -17,7 +17,7 @@ import sqlalchemy as sa
 
 from services.errors import Conflict, NotFound, Rejected, StillActive, StoreUnavailable
 from services.registry.bundle_file import SUFFIX
-from services.registry.checking import CONVERTER, PROGRAM, RunningChecks, Verdict, run_check, run_conversion
+from services.registry.checking import PROGRAM, RunningChecks, Verdict, run_check, run_conversion
 from services.registry.database import Database
 from services.registry.folder import (
     FolderLock,
@@ -255,7 +255,7 @@ class ModelRegistry:
         device: str = "cpu",
         reached: Callable[[str], None] = _nothing,
         check_program: tuple[str, ...] = PROGRAM,
-        convert_program: tuple[str, ...] = CONVERTER,
+        convert_program: tuple[str, ...] = PROGRAM,
     ) -> None:
         """Open the registry in `folder`, create it if missing, and migrate its database.
 

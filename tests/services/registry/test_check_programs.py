@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from gsplat_core.errors import BundleCorrupt, BundleError
-from services.registry import check, convert, records
+from services.registry import check, records
 from services.registry.records import limit_resources, says_out_of_memory
 
 FREE = resource.RLIM_INFINITY
@@ -86,14 +86,11 @@ def test_only_what_the_file_is_to_blame_for_is_a_verdict(
     def fail(*_: Any) -> None:
         raise raised
 
-    for module in (check, convert):
-        monkeypatch.setattr(module, "limit_resources", lambda device: None)
+    monkeypatch.setattr(check, "limit_resources", lambda device: None)
     monkeypatch.setattr(check, "_read", fail)
-    monkeypatch.setattr(convert, "convert", fail)
-    if program == "check":
-        found = check.main([str(tmp_path), "--json"])
-    else:
-        found = convert.main([str(tmp_path / "scene.ply"), str(tmp_path / "target"), "--json"])
+    monkeypatch.setattr(check, "convert", fail)
+    arguments = [str(tmp_path)] if program == "check" else [str(tmp_path / "scene.ply"), str(tmp_path / "target")]
+    found = check.main([*arguments, "--json"])
     out, err = capsys.readouterr()
     assert found == code and said in (out + err) and str(tmp_path) not in out
     assert (json.loads(out)["stage"] if out else None) == stage
@@ -104,13 +101,12 @@ def test_other_errors_are_faults_of_the_program(monkeypatch: pytest.MonkeyPatch,
     def fail(*_: Any) -> None:
         raise RuntimeError("shapes differ")
 
-    for module in (check, convert):
-        monkeypatch.setattr(module, "limit_resources", lambda device: None)
+    monkeypatch.setattr(check, "limit_resources", lambda device: None)
     monkeypatch.setattr(check, "_read", fail)
-    monkeypatch.setattr(convert, "convert", fail)
+    monkeypatch.setattr(check, "convert", fail)
     arguments = [str(tmp_path)] if program == "check" else [str(tmp_path / "a"), str(tmp_path / "b")]
     with pytest.raises(RuntimeError, match="shapes differ"):
-        (check if program == "check" else convert).main([*arguments, "--json"])
+        check.main([*arguments, "--json"])
 
 
 def test_a_gpu_without_memory_says_nothing_about_the_model(
@@ -136,18 +132,18 @@ def test_values_that_no_model_can_have_are_the_files_fault(
     def save(model: Any, folder: Path) -> None:
         raise BundleError("not saved") from (BundleCorrupt("a scale is infinite") if values else OSError("full"))
 
-    monkeypatch.setattr(convert, "load_model", lambda file: Model)
-    monkeypatch.setattr(convert, "save_bundle", save)
+    monkeypatch.setattr(check, "load_model", lambda file: Model)
+    monkeypatch.setattr(check, "save_bundle", save)
     with pytest.raises(kind, match="a scale is infinite" if values else "not saved") as raised:
-        convert.convert(tmp_path / "scene.ply", tmp_path / "target")
+        check.convert(tmp_path / "scene.ply", tmp_path / "target")
     assert type(raised.value) is kind
-    monkeypatch.setattr(convert, "save_bundle", lambda model, folder: None)
-    monkeypatch.setattr(convert, "pack", lambda folder, target: None)
-    assert convert.convert(tmp_path / "scene.ply", tmp_path / "target") == {"gaussians": 5, "sh_degree": 0}
+    monkeypatch.setattr(check, "save_bundle", lambda model, folder: None)
+    monkeypatch.setattr(check, "pack", lambda folder, target: None)
+    assert check.convert(tmp_path / "scene.ply", tmp_path / "target") == {"gaussians": 5, "sh_degree": 0}
     for most, is_refused in ((5, False), (4, True)):
-        monkeypatch.setattr(convert, "MOST_GAUSSIANS", most)
+        monkeypatch.setattr(check, "MOST_GAUSSIANS", most)
         if is_refused:
             with pytest.raises(BundleCorrupt, match="has 5 Gaussians; at most 4"):
-                convert.convert(tmp_path / "scene.ply", tmp_path / "target")
+                check.convert(tmp_path / "scene.ply", tmp_path / "target")
         else:
-            convert.convert(tmp_path / "scene.ply", tmp_path / "target")
+            check.convert(tmp_path / "scene.ply", tmp_path / "target")

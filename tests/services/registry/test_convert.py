@@ -15,7 +15,7 @@ from gsplat_core.io.bundle import load_bundle
 from gsplat_core.io.exports.export import export_model
 from gsplat_core.io.exports.formats import FORMATS, ExportWish
 from services.errors import CheckFailed, Rejected
-from services.registry import convert
+from services.registry import check
 from services.registry.bundle_file import unpack
 from services.registry.models import ModelRegistry
 from services.registry.records import State
@@ -34,11 +34,11 @@ def written(folder: Path, format_name: str) -> Path:
 @pytest.fixture
 def converted(monkeypatch, capsys, tmp_path):
     """Return the program's result in this process, without resource limits."""
-    monkeypatch.setattr(convert, "limit_resources", lambda device: None)
-    monkeypatch.setattr(convert, "keep_files_private", lambda: None)
+    monkeypatch.setattr(check, "limit_resources", lambda device: None)
+    monkeypatch.setattr(check, "keep_files_private", lambda: None)
 
     def result(file: Path) -> dict[str, object]:
-        assert convert.main([str(file), str(tmp_path / "made.isplat"), "--json"]) == 0
+        assert check.main([str(file), str(tmp_path / "made.isplat"), "--json"]) == 0
         return json.loads(capsys.readouterr().out)
 
     return result
@@ -80,7 +80,7 @@ def test_a_file_that_is_something_else_is_refused_in_one_sentence(converted, tmp
 
 
 def test_too_many_gaussians_are_refused(converted, tmp_path, monkeypatch):
-    monkeypatch.setattr(convert, "MOST_GAUSSIANS", 100)
+    monkeypatch.setattr(check, "MOST_GAUSSIANS", 100)
     assert "144 Gaussians; at most 100" in converted(written(tmp_path, "ply"))["reason"]
 
 
