@@ -21,8 +21,7 @@ from typing import Any
 import sqlalchemy as sa
 
 from gsplat_core.io.files import sync_folder
-from services.errors import CheckFailed, Conflict, NotFound, StoreUnavailable, disk_advice
-from services.recordings.archives import ARCHIVE, MOST_UNPACKED_BYTES, kind_of
+from services.errors import CheckFailed, Conflict, NotFound, Rejected, StoreUnavailable, disk_advice
 from services.registry.checking import BroughtDown, RunningChecks, run_program
 from services.registry.database import Database, Schema
 from services.registry.records import now
@@ -104,9 +103,33 @@ RECORDINGS = sa.Table(
 the current size."""
 PROGRAM = (sys.executable, "-P", "-m", "services.recordings.check")
 UPLOAD = "upload"
+ARCHIVE = "archive"
+MOST_UNPACKED_BYTES = 64 << 30
+"""Default for the total unpacked size of an archive in bytes."""
 MOST_REASON = 1000
 GONE = "its files are not on the disk; restore them from a backup, or delete the recording and upload it again"
 log = logging.getLogger(__name__)
+
+
+def kind_of(file: Path) -> str:
+    """Return `archive`, or the suffix of a video (`.mp4`, `.avi`, `.mkv`).
+
+    Raises:
+        Rejected: if the type is unknown.
+    """
+    with open(file, "rb") as opened:
+        head = opened.read(16)
+    if head.startswith((b"PK\x03\x04", b"PK\x05\x06")):
+        return ARCHIVE
+    if head[4:8] in (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide"):
+        return ".mp4"
+    if head.startswith(b"RIFF") and head[8:12] == b"AVI ":
+        return ".avi"
+    if head.startswith(b"\x1a\x45\xdf\xa3"):
+        return ".mkv"
+    raise Rejected(
+        "the file is neither a video (MP4, AVI, Matroska) nor a zip archive; pack a recording's folder with `zip -r`"
+    )
 
 
 def _never_in_use(_: sa.Connection, __: str) -> bool:

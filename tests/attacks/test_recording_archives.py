@@ -11,15 +11,15 @@ from pathlib import Path
 
 import pytest
 
-from services.recordings import archives
-from services.recordings.archives import MOST_LIST_BYTES, ArchiveInvalid, unpack
+from services.recordings import check
+from services.recordings.check import MOST_LIST_BYTES, ArchiveInvalid, unpack
 
 SMALL = 3 << 20
 
 
 @pytest.fixture(autouse=True)
 def five_entries(monkeypatch):
-    monkeypatch.setattr(archives, "MOST_ENTRIES", 5)
+    monkeypatch.setattr(check, "MOST_ENTRIES", 5)
 
 
 def archive(*entries: tuple[str | zipfile.ZipInfo, bytes], method: int = zipfile.ZIP_STORED) -> bytes:

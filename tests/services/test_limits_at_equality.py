@@ -17,7 +17,7 @@ from services.auth.keys import KeyConflict, KeyStore, Role, Tickets
 from services.client import requests
 from services.errors import ClientError, Rejected
 from services.jobs import store as jobs
-from services.recordings import archives
+from services.recordings import check
 from services.registry import models
 from services.settings.sections import SourceRules
 
@@ -39,7 +39,7 @@ def submit(count: int) -> Any:
 LENGTHS: list[tuple[str, Callable[[int], Any], int, int, type[Exception]]] = [
     ("name of a caller", lambda n: models.check_by("x" * n), 1, models.MOST_BY, Rejected),
     ("key of a client", lambda n: requests.checked_key("x" * n), 1, requests.MOST_KEY_CHARACTERS, ClientError),
-    ("folders of an archive", lambda n: archives._check_entry(entry(n), 0), 1, archives.MOST_PARTS, archives.ArchiveInvalid),
+    ("folders of an archive", lambda n: check._check_entry(entry(n), 0), 1, check.MOST_PARTS, check.ArchiveInvalid),
     (
         "address of a source", lambda n: streams.check_source("synthetic:" + "x" * (n - 10), SourceRules()), 10,
         streams.MOST_LENGTH, Unprocessable,

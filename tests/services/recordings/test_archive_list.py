@@ -10,16 +10,16 @@ from pathlib import PurePosixPath
 
 import pytest
 
-from services.recordings import archives
-from services.recordings.archives import ArchiveInvalid, check_end, entries_of
+from services.recordings import check
+from services.recordings.check import ArchiveInvalid, check_end, entries_of
 
 MOST_BYTES = 100
 
 
 @pytest.fixture(autouse=True)
 def small_limits(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(archives, "MOST_ENTRIES", 3)
-    monkeypatch.setattr(archives, "MOST_RATIO", 10)
+    monkeypatch.setattr(check, "MOST_ENTRIES", 3)
+    monkeypatch.setattr(check, "MOST_RATIO", 10)
 
 
 def packed(*files: tuple[str | zipfile.ZipInfo, bytes], method: int = zipfile.ZIP_STORED) -> io.BytesIO:
@@ -142,7 +142,7 @@ def test_the_packing_ratio_is_bounded_for_files_over_one_mebibyte(
     if refused:
         with pytest.raises(ArchiveInvalid, match="over 10 times as many"):
             listed(file, wide)
-        monkeypatch.setattr(archives, "MOST_RATIO", 2000)
+        monkeypatch.setattr(check, "MOST_RATIO", 2000)
         assert listed(file, wide) == ["a"]
     else:
         assert listed(file, wide) == ["a"]
@@ -174,9 +174,9 @@ def test_encrypted_files_are_refused(bits: int, refused: bool) -> None:
     info.flag_bits = bits
     if refused:
         with pytest.raises(ArchiveInvalid, match="encrypted"):
-            archives._check_entry(info, 0)
+            check._check_entry(info, 0)
     else:
-        archives._check_entry(info, 0)
+        check._check_entry(info, 0)
 
 
 def test_other_methods_of_packing_are_refused() -> None:
@@ -194,20 +194,20 @@ def test_a_file_lies_where_the_list_says(offset: int, size: int, why: str | None
         info, start = archive.infolist()[0], archive.start_dir
     info.header_offset, info.compress_size = offset, size
     if why is None:
-        archives._check_places([info], file, start)
+        check._check_places([info], file, start)
     else:
         with pytest.raises(ArchiveInvalid, match=why):
-            archives._check_places([info], file, start)
+            check._check_places([info], file, start)
 
 
 def test_two_files_in_the_same_place_are_refused() -> None:
     file = packed(("a.png", b"x"), ("b.png", b"y"))
     with zipfile.ZipFile(file) as archive:
         infos, start = archive.infolist(), archive.start_dir
-    archives._check_places(infos[::-1], file, start)
+    check._check_places(infos[::-1], file, start)
     infos[1].header_offset = infos[0].header_offset
     with pytest.raises(ArchiveInvalid, match="in the same place"):
-        archives._check_places(infos, file, start)
+        check._check_places(infos, file, start)
 
 
 def test_a_leading_folder_is_removed_from_paths_alone() -> None:

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 from services.recordings import check
-from services.recordings.archives import ArchiveInvalid
+from services.recordings.check import ArchiveInvalid
 
 
 @pytest.fixture

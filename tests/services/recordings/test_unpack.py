@@ -9,8 +9,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from services.recordings import archives as unpacking
-from services.recordings.archives import ArchiveInvalid
+from services.recordings import check as unpacking
+from services.recordings.check import ArchiveInvalid
 
 
 def test_files_are_private_and_whole_also_beyond_one_piece(tmp_path, monkeypatch):
