@@ -20,9 +20,8 @@ from operators.output_folder import OutputFolder
 from services.cli.exit_codes import INTERRUPTED, OK
 from services.cli.options import EvaluateOptions, renderer_options
 from services.cli.terminal import InterruptRequest, ProgressPrinter, printable
-from services.reports.evaluation_build import build_evaluation, write_evaluation
-from services.reports.evaluation_html import decibels, future, geometry_lines, measured
-from services.reports.evaluation_schema import EvaluationReport, load_evaluated
+from services.reports.evaluation import EvaluationReport, build_evaluation, load_evaluated
+from services.reports.evaluation_html import decibels, future, geometry_lines, measured, write_evaluation
 
 ONLY_WITH_SCENE = ("scene", "images", "every", "samples", "supersampling", "order")
 ONLY_WITH_RECORDING = ("protocol", "max_frames", "steps_per_frame", "motion_prior", "place", "poses")

@@ -1,4 +1,6 @@
-"""Self-contained page `evaluation.html`: curves, tiles and tables, and the rows of scores that the terminal prints, too."""
+"""Files of an evaluation: the self-contained page `evaluation.html` with curves, tiles and tables, next to `evaluation.json`; and the rows of scores
+that the terminal prints, too.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,7 @@ from pathlib import Path
 
 from gsplat_core.evaluation.live import MOST_BEHIND
 from operators.storage import write_whole
-from services.reports.evaluation_schema import BaselineFacts, EndPointFacts, EvaluationReport, GeometryFacts, ScoreFacts
+from services.reports.evaluation import BaselineFacts, EndPointFacts, EvaluationReport, GeometryFacts, ScoreFacts
 from services.reports.figures import NARROW, Chart, Line
 from services.reports.html import facts_table, notes_section, page, tile
 
@@ -550,6 +552,19 @@ def facts_section(report: EvaluationReport) -> str:
             f"{causal.steps_per_frame} steps a frame, {causal.field} field, motion prior {causal.motion_prior}, seed {causal.seed}"
         )
     return facts_table("Evaluation", facts, {"Recording": recording.digest, "Model": model.sha256})
+
+
+def write_evaluation(report: EvaluationReport, folder: Path) -> EvaluationReport:
+    """Write `evaluation.json` and `evaluation.html`, each atomically.
+
+    Raises:
+        OutputError: if a file cannot be written, for example because the disk is full (StorageFull).
+    """
+    outputs = {**report.outputs, "report": "evaluation.json", "page": "evaluation.html"}
+    report = report.model_copy(update={"outputs": outputs})
+    report.write(folder / "evaluation.json")
+    write_evaluation_html(report, folder / "evaluation.html")
+    return report
 
 
 def write_evaluation_html(report: EvaluationReport, path: Path) -> None:

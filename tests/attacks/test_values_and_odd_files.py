@@ -19,7 +19,7 @@ from services.audit import AuditLog
 from services.auth import keys as keys_module
 from services.cli.app import run
 from services.cli.exit_codes import BAD_INPUT
-from services.reports.evaluation_schema import load_evaluated
+from services.reports.evaluation import load_evaluated
 from tests.services.registry.made import save_model
 
 

@@ -14,7 +14,7 @@ import pytest
 from gsplat_core.io.bundle import load_bundle
 from gsplat_core.io.recordings import synthesize
 from services.cli.app import run
-from services.reports.evaluation_schema import EvaluationReport
+from services.reports.evaluation import EvaluationReport
 from services.reports.schema import RunReport
 
 
@@ -233,7 +233,7 @@ def test_an_interrupted_evaluation_leaves_what_it_reached(long, offline, tmp_pat
 
 
 def test_a_long_series_is_summed_up(intrasplat, long, offline, monkeypatch):
-    monkeypatch.setattr("services.reports.evaluation_build.MAX_SERIES", 4)
+    monkeypatch.setattr("services.reports.evaluation.MAX_SERIES", 4)
     report = evaluated(intrasplat, offline, long, "--protocol", "retention")
     assert report.series_frames_per_entry == {"baselines": 3, "retention": 3}
     assert [len(report.series[name]) for name in ("baselines", "retention")] == [4, 4]

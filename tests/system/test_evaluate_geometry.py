@@ -13,7 +13,7 @@ from gsplat_core.io.recordings import open_recording, synthesize
 from gsplat_core.io.recordings.calibration import write_poses
 from gsplat_core.io.recordings.synthetic.scene import Extras
 from services.cli.app import run
-from services.reports.evaluation_schema import EvaluationReport
+from services.reports.evaluation import EvaluationReport
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ import pytest
 
 from gsplat_core.io.bundle import load_bundle
 from gsplat_core.io.recordings import open_recording, synthesize
-from services.reports.evaluation_schema import EvaluationReport
+from services.reports.evaluation import EvaluationReport
 from services.reports.schema import RunReport
 
 pytestmark = pytest.mark.slow

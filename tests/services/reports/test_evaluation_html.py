@@ -8,8 +8,8 @@ import pytest
 from pydantic import ValidationError
 
 from services.cli.evaluate import table
+from services.reports.evaluation import EvaluationReport
 from services.reports.evaluation_html import at_age, render_evaluation, table_section, write_evaluation_html
-from services.reports.evaluation_schema import EvaluationReport
 
 
 def score(tissue, **more):
