@@ -4,12 +4,14 @@
 
 A server runs with one stream and one viewer. Every Python process of it records the code objects that are called: first for some seconds of
 live frames, where heartbeats and other periodic work are counted, too. Then the stream is stopped, and the control process is recorded while
-it is idle and while another stream is created; modules that an idle server calls are left out. A module counts with all of its lines.
+it is idle and while another stream is created; modules that an idle server calls are left out. `lines` counts all lines of a module,
+`called_lines` those of the functions that were called, with their docstrings.
 """
 
 from __future__ import annotations
 
 import argparse
+import ast
 import json
 import os
 import sys
@@ -49,7 +51,7 @@ def watch():
                 time.sleep(0.2)  # until calls in progress have been added
                 path = os.path.join(folder, f"{name[:-4]}.{os.getpid()}")
                 with open(path + ".part", "w") as file:
-                    file.write("\\n".join(sorted({code.co_filename for code in called})))
+                    file.write("\\n".join(sorted({f"{code.co_filename}:{code.co_firstlineno}" for code in called})))
                 os.replace(path + ".part", path + ".files")
 
 def begin():
@@ -63,9 +65,13 @@ begin()
 """Module that Python imports at the start of every process of the server."""
 
 
+Called = dict[str, set[int]]
+"""Path of a module, relative to the root, to the first lines of its functions that were called."""
+
+
 @contextmanager
-def recorded(folder: Path, name: str, pids: list[int], found: dict[int, set[str]]) -> Iterator[None]:
-    """Record the modules that processes call inside of the context, by process id."""
+def recorded(folder: Path, name: str, pids: list[int], found: dict[int, Called]) -> Iterator[None]:
+    """Record the functions that processes call inside of the context, by process id."""
     (folder / f"{name}.begin").touch()
     time.sleep(0.1)
     yield
@@ -75,14 +81,36 @@ def recorded(folder: Path, name: str, pids: list[int], found: dict[int, set[str]
     while not all(file.exists() for file in files) and time.monotonic() < wait_until_s:
         time.sleep(0.1)
     for file in filter(Path.exists, files):
-        modules = {os.path.relpath(line, ROOT) for line in file.read_text().split("\n") if line}
-        found[int(file.name.split(".")[1])] = {each for each in modules if each.startswith(PACKAGES)}
+        called: Called = {}
+        for line in filter(None, file.read_text().split("\n")):
+            path, _, first = line.rpartition(":")
+            module = os.path.relpath(path, ROOT)
+            if module.startswith(PACKAGES):
+                called.setdefault(module, set()).add(int(first))
+        found[int(file.name.split(".")[1])] = called
 
 
-def summary(modules: set[str]) -> dict[str, object]:
-    """Return the number of modules, their lines, and the lines of each."""
-    lines = {each: len((ROOT / each).read_text(encoding="utf-8").splitlines()) for each in sorted(modules)}
-    return {"modules": len(lines), "lines": sum(lines.values()), "lines_of": lines}
+def called_lines(source: str, first_lines: set[int]) -> int:
+    """Return the number of lines of the functions that begin at these lines, with decorators."""
+    lines: set[int] = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+            first = min([node.lineno, *(each.lineno for each in getattr(node, "decorator_list", ()))])
+            if first in first_lines:
+                lines.update(range(first, (node.end_lineno or first) + 1))
+    return len(lines)
+
+
+def summary(*traces: Called) -> dict[str, object]:
+    """Return the number of modules, their lines, those of called functions, and the lines of each module."""
+    together: Called = {}
+    for trace in traces:
+        for module, first_lines in trace.items():
+            together.setdefault(module, set()).update(first_lines)
+    sources = {module: (ROOT / module).read_text(encoding="utf-8") for module in sorted(together)}
+    lines = {module: len(source.splitlines()) for module, source in sources.items()}
+    called = sum(called_lines(source, together[module]) for module, source in sources.items())
+    return {"modules": len(lines), "lines": sum(lines.values()), "called_lines": called, "lines_of": lines}
 
 
 def main() -> int:
@@ -96,9 +124,9 @@ def main() -> int:
         (folder / "sitecustomize.py").write_text(RECORDER, encoding="utf-8")
         os.environ["INTRASPLAT_TRACE"] = str(folder)
         os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(folder), os.environ.get("PYTHONPATH")]))
-        frame: dict[int, set[str]] = {}
-        creation: dict[int, set[str]] = {}
-        idle: dict[int, set[str]] = {}
+        frame: dict[int, Called] = {}
+        creation: dict[int, Called] = {}
+        idle: dict[int, Called] = {}
         with Server(options.source) as server:
             server.until(lambda stream: (stream["processes"]["engine"]["figures"] or {}).get("pictures"), 300.0)
             pids = server.pids()
@@ -116,15 +144,21 @@ def main() -> int:
                 time.sleep(2.0)
             with recorded(folder, "creation", [pids["control"]], creation):
                 server.ask("/v1/streams", "POST", {"name": "second", "source": options.source, "start": False})
-        roles = {role: frame.get(pid, set()) for role, pid in pids.items()}
+        roles = {role: frame.get(pid, {}) for role, pid in pids.items()}
         missing = [role for role, modules in roles.items() if not modules]
         if missing:
             print(f"no modules were recorded in: {', '.join(missing)}", file=sys.stderr)
             return 1
         report = {
-            "frame": summary(set().union(*roles.values())),
+            "frame": summary(*roles.values()),
             **{f"frame, {role} process": summary(modules) for role, modules in roles.items()},
-            "creation of a stream": summary(creation[pids["control"]] - idle[pids["control"]]),
+            "creation of a stream": summary(
+                {
+                    module: called
+                    for module, called in creation[pids["control"]].items()
+                    if module not in idle[pids["control"]]
+                }
+            ),
         }
     print(json.dumps(report, indent=1))
     return 0
