@@ -61,6 +61,20 @@ def docstrings(tree: ast.Module) -> Iterator[tuple[int, str]]:
             yield node.lineno, node.value.value
 
 
+def code_lines(tree: ast.Module, lines: list[str]) -> int:
+    """Return the number of lines of code: without strings that stand alone, comments and blank lines."""
+    prose = {
+        number
+        for node in nodes(tree)
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+        for number in range(node.lineno, (node.end_lineno or node.lineno) + 1)
+    }
+    return sum(
+        number not in prose and line.strip() != "" and not line.lstrip().startswith("#")
+        for number, line in enumerate(lines, 1)
+    )
+
+
 class Uses:
     """Places (file, line) where names and attributes are used, other than by imports. Strings that only contain names count as both."""
 
@@ -315,6 +329,9 @@ def measure(root: Path) -> tuple[dict[str, int], dict[str, list[str]]]:
         figures[f"{package}: Python lines"] = sum(len(lines[file]) for file in own)
         figures[f"{package}: modules"] = len(own)
     figures["Python lines"] = sum(len(each) for each in lines.values())
+    figures["Python lines without docstrings, comments and blank lines"] = sum(
+        code_lines(product[file], lines[file]) for file in product
+    )
     figures["modules"] = len(product)
     native = [path for package in PACKAGES for path in (root / package).rglob("*") if path.suffix in NATIVE]
     figures["C++ and CUDA lines"] = sum(len(path.read_text(encoding="utf-8").splitlines()) for path in native)

@@ -69,6 +69,7 @@ def test_the_figures_of_a_small_tree(structure, tmp_path):
         (tmp_path / name).write_text(text)
     figures, places = structure.measure(tmp_path)
     assert figures["Python lines"] == sum(len(TREE[name].splitlines()) for name in TREE if "test" not in name)
+    assert figures["Python lines without docstrings, comments and blank lines"] == 16 + 9 + 2
     assert figures["modules"] == 4
     assert figures["numeric module constants"] == 1
     assert places["settings fields that nothing sets"] == ["gsplat_core/b.py:7 ThingSettings.set_nowhere"]
