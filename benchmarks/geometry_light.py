@@ -24,8 +24,7 @@ from gsplat_core.experimental.light import LightDepth
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.io.recordings.synthetic.rendered import RenderSettings, render_recording
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import BELIEVED
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import BELIEVED, Frame
 
 RECORDINGS = Path(__file__).resolve().parents[2] / "shared/recordings"
 SEEDS = 6

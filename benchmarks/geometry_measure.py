@@ -35,7 +35,7 @@ from gsplat_core.io.model_sources import load_model
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.models import Model
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import BELIEVED
+from gsplat_core.scene.frames import BELIEVED
 from operators.applications.replay import ReplaySettings, replay
 
 PAIRS = 150

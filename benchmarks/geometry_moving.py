@@ -22,7 +22,7 @@ from gsplat_core.evaluation.depth import MOST_DEPTH_PIXELS, flat_depths, pixels_
 from gsplat_core.experimental.breathing_depth import MovingTissue
 from gsplat_core.io.recordings.synthetic.rendered import RenderSettings, render_recording
 from gsplat_core.io.recordings.synthetic.scene import CLEAR, Extras
-from gsplat_core.scene.depth_origin import BELIEVED
+from gsplat_core.scene.frames import BELIEVED
 
 
 def measured(asked: RenderSettings) -> dict[str, Any]:

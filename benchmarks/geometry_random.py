@@ -39,8 +39,7 @@ from gsplat_core.io.recordings import FileRecording, open_recording, synthesize
 from gsplat_core.io.recordings.synthetic.random_scene import draw_scene
 from gsplat_core.poses.odometry import trajectory_of
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import BELIEVED
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import BELIEVED, Frame
 
 CHECK_SEEDS = list(range(1000, 1010))
 """Seeds of the published figures. Development uses other seeds."""

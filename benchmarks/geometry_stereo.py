@@ -25,8 +25,7 @@ from gsplat_core.depth.stereo import StereoDepth, grey
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.io.recordings.synthetic.rendered import RenderSettings, render_recording
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import BELIEVED
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import BELIEVED, Frame
 
 DEVICE = "cpu"
 """Device on which pictures are matched."""

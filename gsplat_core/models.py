@@ -27,7 +27,7 @@ from gsplat_core.errors import InvalidInput
 from gsplat_core.rendering.rasterization import RenderOutput, render
 from gsplat_core.rendering.surface import Surface, certainty, render_surface
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_source import DepthSource
+from gsplat_core.scene.frames import DepthSource
 from gsplat_core.scene.gaussians import Gaussians, inert_gaussians
 from gsplat_core.transfers import copy_each
 from gsplat_core.value_ranges import check_seen_at

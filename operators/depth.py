@@ -18,8 +18,7 @@ import cv2
 from gsplat_core.depth.registry import DepthFinder, check_depth, evidence, keeps_recorded
 from gsplat_core.machine import step_back, usable_cores, use_one_thread
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import BELIEVED
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import BELIEVED, Frame
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.placement import LateDepth
 from operators.graph import Operator, OperatorSpec

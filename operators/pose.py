@@ -14,8 +14,7 @@ from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.poses.camera_path import CERTAIN_SHARE, MotionTest
 from gsplat_core.poses.live_odometry import MOSTLY, LiveOdometry
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import RELATIVE_DISTANCE
-from gsplat_core.scene.frames import Frame, FrameStatus
+from gsplat_core.scene.frames import RELATIVE_DISTANCE, Frame, FrameStatus
 from operators.graph import Operator, OperatorSpec
 from operators.outcome import OutcomeBuilder
 from operators.settings import Poses

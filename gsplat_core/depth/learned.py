@@ -21,8 +21,7 @@ from gsplat_core.depth.maps import DepthMap, Estimator, doubted
 from gsplat_core.endoscope.onnx import Finite, OnnxNetwork, PictureSettings, Positive
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import BELIEVED, LEARNED, RELATIVE_DISTANCE
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import BELIEVED, LEARNED, RELATIVE_DISTANCE, Frame
 
 Plane = NDArray[np.float64]
 MOST_SPAN = 5.0

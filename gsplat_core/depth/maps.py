@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.cameras import Camera, moved, pixel_rays, pixels_of
-from gsplat_core.scene.depth_origin import BELIEVED, DepthOrigin
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import BELIEVED, DepthOrigin, Frame
 
 
 @dataclass(frozen=True)

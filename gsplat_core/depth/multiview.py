@@ -28,8 +28,7 @@ from gsplat_core.depth.maps import UNCONFIRMED, DepthMap, Estimator, Look, Recor
 from gsplat_core.geometry.tracks import followed
 from gsplat_core.machine import usable_cores
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import BELIEVED, PARALLAX
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import BELIEVED, PARALLAX, Frame
 
 WINDOW_PX = 7
 """Side of the correlation window in pixels."""

@@ -35,8 +35,7 @@ from gsplat_core.ops.stereo_matching import (
     match_disparities,
 )
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import BELIEVED, STEREO
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import BELIEVED, STEREO, Frame
 from gsplat_core.transfers import HostCopy, tensor_of
 
 EDGE_ERROR_PX = 1.5

@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.scene.cameras import Camera, pixel_rays, points_of
-from gsplat_core.scene.depth_origin import BELIEVED
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import BELIEVED, Frame
 from gsplat_core.training.metrics import ScoredMean
 
 Array = NDArray[np.float64]

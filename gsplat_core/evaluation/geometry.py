@@ -44,8 +44,7 @@ from gsplat_core.io.recordings.truth import GroundTruth
 from gsplat_core.models import Model
 from gsplat_core.rendering.renderer import picture_of
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import BELIEVED
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import BELIEVED, Frame
 from gsplat_core.scene.gaussians import Gaussians
 
 LEAST_PATH_SHARE = 1e-6

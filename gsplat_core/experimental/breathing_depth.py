@@ -33,8 +33,7 @@ from gsplat_core.experimental.periodic_motion import (
 )
 from gsplat_core.geometry.grid_tracks import GridTracks, TexturedPicture, follow_grids, seen_by, small_camera
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import PARALLAX
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import PARALLAX, Frame
 
 MOVES_PX = 2.0
 """Deviation in pixels from the periodic motion beyond which a point counts as possibly pulled by a tool."""

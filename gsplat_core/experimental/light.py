@@ -18,8 +18,7 @@ from gsplat_core.depth.maps import DepthMap, Estimator, doubted
 from gsplat_core.experimental.relief import Array, Grid, Places, find_change, find_reliefs
 from gsplat_core.experimental.shading import Change, Follower, Look, Shading, look_at
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import BELIEVED, LIGHT, RELATIVE_DISTANCE
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import BELIEVED, LIGHT, RELATIVE_DISTANCE, Frame
 
 SOLVED_AT = (1, 2, 4, 8, 12)
 """Numbers of pictures ("looks") in a window at which all reliefs are re-estimated jointly. At other numbers only the

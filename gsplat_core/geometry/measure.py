@@ -19,7 +19,7 @@ from gsplat_core.geometry.mesh import in_world, rays_of
 from gsplat_core.models import Model
 from gsplat_core.rendering.surface import COVERED, Surface
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import UNKNOWN_ERROR
+from gsplat_core.scene.frames import UNKNOWN_ERROR
 from gsplat_core.transfers import HostCopy
 
 MOST_STEPS = 4096

@@ -30,8 +30,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
-from gsplat_core.scene.frames import Frame, FrameStatus
+from gsplat_core.scene.frames import DEPTH_ORIGINS, Frame, FrameStatus
 
 MOST_NS = 2**62
 MAX_SIDE_PX = 65_536

@@ -19,9 +19,7 @@ from gsplat_core.errors import BundleCorrupt, InvalidInput, InvalidSetting, Unkn
 from gsplat_core.io.json_object import JsonObject
 from gsplat_core.models import Model, TrainedBy
 from gsplat_core.scene.cameras import CAMERA_MODELS, MAX_INTRINSICS_PX, MIN_FOCAL_PX, Camera, CameraModel
-from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
-from gsplat_core.scene.depth_source import DepthError, DepthSource
-from gsplat_core.scene.frames import LONGEST_RECORDING_S
+from gsplat_core.scene.frames import DEPTH_ORIGINS, LONGEST_RECORDING_S, DepthError, DepthSource
 from gsplat_core.scene.gaussians import MAX_SH_DEGREE, Gaussians
 from gsplat_core.value_ranges import IntegerIn, NumberIn, shortened
 

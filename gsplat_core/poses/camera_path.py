@@ -23,8 +23,7 @@ from gsplat_core.geometry.tracks import Points, followed
 from gsplat_core.poses.odometry import LEAST_POINTS, Trajectory, followed_part, trajectory_of
 from gsplat_core.poses.se3 import between
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import BELIEVED
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import BELIEVED, Frame
 
 PAIRS = 12
 """Number of pairs of frames that are compared, spread over the recording."""

@@ -34,8 +34,7 @@ from gsplat_core.poses.local_map import (
 )
 from gsplat_core.poses.se3 import inverse
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import BELIEVED, RELATIVE_DISTANCE
-from gsplat_core.scene.frames import Frame, FrameStatus
+from gsplat_core.scene.frames import BELIEVED, RELATIVE_DISTANCE, Frame, FrameStatus
 
 RETURN_PX, ROWS_PX = 0.5, 1.5
 """Largest accepted forward-backward error and row difference of a point tracked to the right eye, in pixels."""

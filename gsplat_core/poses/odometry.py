@@ -37,8 +37,7 @@ from gsplat_core.machine import one_thread, usable_cores
 from gsplat_core.poses.breathing import BreathingTrajectory, Sightings, breathing_trajectory
 from gsplat_core.poses.bundle import Bundle, adjust, errors_px
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import RELATIVE_DISTANCE
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import RELATIVE_DISTANCE, Frame
 
 LEAST_SEEN = 4
 """Fewest frames in which a point must be observed."""

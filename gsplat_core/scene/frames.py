@@ -1,19 +1,98 @@
-"""One frame of endoscopic video with its sensor data and metadata."""
+"""Frames of endoscopic video with their sensor data, and the origins of their depth."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidInput
+from gsplat_core.registry import Registry
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import MEASURED, DepthOrigin
 from gsplat_core.scene.range_sensors import RangeScan
+
+BELIEVED = 0.5
+"""Confidence from which a depth is used, in steps that either use or reject it."""
+
+
+@dataclass(frozen=True)
+class DepthOrigin:
+    """Origin of depth, with the uses that its accuracy permits. The defaults suit an estimator without a known scale."""
+
+    name: str
+    """Name in files and reports."""
+    relative_error: float
+    """Assumed relative standard error, in addition to the errors visible in a model."""
+    scale: Literal["metric", "calibrated", "relative"] = "relative"
+    """`metric`: in millimetres. `calibrated`: in millimetres if the frame's right camera is known. `relative`: known up to
+    one factor.
+    """
+    is_recorded: bool = False
+    """True for depth supplied with a frame, False for depth estimated from pictures."""
+    initialises_only: bool = False
+    """True if the depth places a new scene, but is neither trained on nor used to correct the scene. For estimators
+    whose scale changes from frame to frame.
+    """
+    is_of_still_tissue: bool = False
+    """True if the depth assumes static tissue. It then corrects the scene at all times, otherwise only at its frame's
+    time.
+    """
+    loss_weight_online: float = 1.0
+    """Factor of `ReconstructorConfig.depth_weight` in training frame by frame, for a scene that starts from this depth."""
+    loss_weight_offline: float = 1.0
+    """Factor of `ReconstructorConfig.depth_weight` in training on a complete recording that starts from this depth."""
+    right_share_offline: float | None = None
+    """`LearningRates.right_share` in training on a complete recording. None keeps the setting, which lets colour
+    differences between the eyes move Gaussians.
+    """
+    least_confidence: float = BELIEVED
+    """Smallest confidence at which the depth is a better start value of new Gaussians than an extrapolation of its
+    surroundings.
+    """
+    edge_margin_px: int = 0
+    """Margin around unknown pixels within which the depth is not trained on. Half of it applies to start values."""
+    tool_margin_px: int = 0
+    """Margin around tools within which the depth may belong to the tool."""
+    surface: str | None = None
+    """Import path of a function (frame, camera) -> frame, called before training on a complete recording. The function
+    replaces the depth by a smooth surface. None to keep the depth.
+    """
+
+    def is_metric(self, eyes_calibrated: bool) -> bool:
+        """Return True if depth of this origin is in millimetres."""
+        return self.scale == "metric" or (self.scale == "calibrated" and eyes_calibrated)
+
+
+# The loss weights of measured depth are a compromise. With lower values, colour errors move Gaussians along the line of
+# sight by more than the depth's error. Higher values leave less of a frame's few steps to its picture. Offline, colour
+# errors would also roughen the surface fitted to stereo depth.
+MEASURED = DepthOrigin(
+    "measured", 0.005, "metric", is_recorded=True, loss_weight_online=3.0, loss_weight_offline=10.0
+)  # fmt: skip
+STEREO = DepthOrigin(
+    "stereo", 0.0125, "calibrated", loss_weight_offline=10.0, right_share_offline=1.0, least_confidence=0.03,
+    edge_margin_px=2, tool_margin_px=4, surface="gsplat_core.depth.plane_fits:with_matched_surface",
+)  # fmt: skip
+PARALLAX = DepthOrigin("parallax", 0.05, is_of_still_tissue=True)
+LIGHT = DepthOrigin("light", 0.15, initialises_only=True)
+LEARNED = DepthOrigin("learned", 0.2, initialises_only=True)
+
+DEPTH_ORIGINS: Registry[DepthOrigin] = Registry(
+    "depth origin", {origin.name: origin for origin in (MEASURED, STEREO, PARALLAX, LIGHT, LEARNED)}
+)
+"""Depth origins by name. Only these entries state how depth of an origin may be used; all other code reads them.
+
+In this order: sensor or recording; matching between the eyes; matching across times, in the unit of
+the poses; shading of the scope's light; prediction of a network.
+"""
+RELATIVE_DISTANCE = 60.0
+"""Mean distance of depth whose scale is unknown, in arbitrary units."""
+UNKNOWN_ERROR = 0.3
+"""Assumed relative standard error of the depth of a model that was trained without depth."""
 
 
 class FrameStatus(Enum):
@@ -155,3 +234,51 @@ class Frame:
     def with_fields(self, **fields: Any) -> Frame:
         """Return a copy with some fields replaced."""
         return replace(self, **fields)
+
+
+class DepthError(NamedTuple):
+    """Error of a model's depth at one time."""
+
+    time_s: float
+    relative: float
+    """Standard error of z, relative to z."""
+
+
+@dataclass(frozen=True)
+class DepthSource:
+    """Depth source of the frames that a model was trained on."""
+
+    origin: DepthOrigin
+    """Origin of the first frame's depth, from which the scene was initialised."""
+    metric: bool
+    """True if the unit of all depth is known; the model's lengths are then millimetres."""
+    errors: tuple[DepthError, ...] = ()
+    """Measured errors of the model's depth, in temporal order; empty if they were not measured."""
+
+    def relative_error(self, time_s: float) -> float:
+        """Return the relative standard error of the model's depth at a time, interpolated between the measured ones.
+
+        Without measured errors it is the one assumed for the origin.
+        """
+        if not self.errors:
+            return self.origin.relative_error
+        times, values = zip(*self.errors, strict=True)
+        return float(np.interp(time_s, times, values))
+
+    @staticmethod
+    def of_first(frame: Frame) -> DepthSource | None:
+        """Return the source for a scene initialised from `frame`.
+
+        None without depth; the scene then starts on a plane at an arbitrary distance.
+        """
+        if frame.depth is None or frame.depth_origin is None:
+            return None
+        return DepthSource(frame.depth_origin, frame.depth_is_metric)
+
+    @staticmethod
+    def after(source: DepthSource | None, frame: Frame) -> DepthSource | None:
+        """Return the source after another frame: unchanged (also None), but not metric if the frame's depth is not. A
+        scene initialised on a plane never becomes metric.
+        """
+        relative = frame.depth is not None and not frame.depth_is_metric
+        return replace(source, metric=False) if source is not None and relative else source

@@ -10,8 +10,7 @@ from typing import get_args
 from gsplat_core.choices import FIELDS, MOTION_PRIORS, RENDERERS, STRATEGIES, Eyes, check_losses, check_strategy
 from gsplat_core.deformation.kinds import FieldRates, check_rates
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.scene.depth_origin import RELATIVE_DISTANCE
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import RELATIVE_DISTANCE, Frame
 from gsplat_core.training.losses import loss_weights
 from gsplat_core.training.motion.image_motion import Detail
 

@@ -36,8 +36,7 @@ from gsplat_core.rendering.frame_renderer import (
 )
 from gsplat_core.rendering.surface import COVERED
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_source import DepthError
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import DepthError, Frame
 from gsplat_core.scene.gaussians import LOG_SCALE, POSITION, Gaussians
 from gsplat_core.training.covering import UNCOVERED_ALPHA
 from gsplat_core.training.initialisation import filled, tissue_depth

@@ -18,8 +18,7 @@ from gsplat_core.deformation.kinds import NewField
 from gsplat_core.errors import InvalidInput
 from gsplat_core.models import Model, Snapshot, SnapshotSlots
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_source import DepthSource
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import DepthSource, Frame
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.covering import Covering

@@ -19,8 +19,7 @@ from gsplat_core.io.recordings.synthetic.scene import CLEAR, Extras
 from gsplat_core.poses.focal_length import FocalLength, trajectory_without_calibration, with_focal_length
 from gsplat_core.poses.odometry import Trajectory, trajectory_of
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import RELATIVE_DISTANCE
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import RELATIVE_DISTANCE, Frame
 from operators.applications.session import Progress
 from operators.errors import OutputError
 from operators.output_folder import check_file_path, check_folder_path

@@ -14,7 +14,7 @@ from gsplat_core.depth.maps import DepthMap, doubted
 from gsplat_core.depth.registry import DEPTHS
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
+from gsplat_core.scene.frames import DEPTH_ORIGINS
 from gsplat_core.training.placement import LateDepth
 from operators.depth import FEW_CORES, BackgroundDepth, DepthOp, FoundDepth, share_of
 from operators.outcome import OutcomeBuilder

@@ -12,8 +12,7 @@ from gsplat_core.depth.maps import DepthMap, doubted
 from gsplat_core.depth.registry import DEPTHS
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import BELIEVED, DEPTH_ORIGINS
-from gsplat_core.scene.frames import FrameStatus
+from gsplat_core.scene.frames import BELIEVED, DEPTH_ORIGINS, FrameStatus
 from gsplat_core.training.config import ReconstructorConfig
 from operators.depth import DepthCounts, DepthOp, FoundDepth, without_depth, without_right_eye
 from operators.outcome import OutcomeBuilder

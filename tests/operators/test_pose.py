@@ -10,7 +10,7 @@ import pytest
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.poses.live_odometry import MOSTLY, LiveOdometry
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
+from gsplat_core.scene.frames import DEPTH_ORIGINS
 from operators.outcome import OutcomeBuilder
 from operators.pose import AutoPoseOp, EstimatedPoses, PoseOp, check_poses, pose_operators
 from tests.gsplat_core.geometry.moving_scope import FIRST, HEIGHT, SIDEWAYS, WIDTH, video

@@ -13,9 +13,7 @@ from gsplat_core.geometry.measure import Measurement
 from gsplat_core.io.bundle import load_bundle
 from gsplat_core.io.recordings import synthesize
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import DEPTH_ORIGINS, DepthOrigin
-from gsplat_core.scene.depth_source import DepthSource
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import DEPTH_ORIGINS, DepthOrigin, DepthSource, Frame
 from operators.applications.reconstruct import reconstruct
 from operators.applications.replay import ReplaySettings, replay
 from operators.depth import FoundDepth

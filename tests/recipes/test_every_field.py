@@ -11,7 +11,7 @@ import pytest
 from gsplat_core.deformation import FIELDS
 from gsplat_core.io.bundle import load_bundle
 from gsplat_core.io.recordings import open_recording, synthesize
-from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
+from gsplat_core.scene.frames import DEPTH_ORIGINS
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.metrics import psnr_tissue_db
 from gsplat_core.training.reconstructor import Reconstructor

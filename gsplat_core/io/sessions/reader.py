@@ -38,8 +38,7 @@ from gsplat_core.io.sessions.records import (
     read_session_file,
 )
 from gsplat_core.io.sessions.segments import FIELDS, SegmentPictures, SegmentReader, mask_of_nothing
-from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
-from gsplat_core.scene.frames import Frame, FrameStatus
+from gsplat_core.scene.frames import DEPTH_ORIGINS, Frame, FrameStatus
 
 MOST_ARRIVED = 64
 """Maximum number of received frames that may still be prepared for training."""

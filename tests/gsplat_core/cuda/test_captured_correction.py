@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
+from gsplat_core.scene.frames import DEPTH_ORIGINS
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.placement import CapturedCorrection, _correct_at

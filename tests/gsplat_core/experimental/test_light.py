@@ -14,8 +14,7 @@ from gsplat_core.experimental.light import FLAT, UNSEEN, LightDepth
 from gsplat_core.experimental.relief import Grid, Places
 from gsplat_core.experimental.shading import SmallPicture, shading_in
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import DEPTH_ORIGINS, Frame
 from tests.gsplat_core.geometry.lit_sheet import CAMERA, HEIGHT, PINK, WIDTH, error, facing_and_distance, rays
 
 

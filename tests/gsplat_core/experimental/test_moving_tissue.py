@@ -11,8 +11,7 @@ from gsplat_core.experimental import breathing_depth
 from gsplat_core.experimental.breathing_depth import OTHERWISE, TOO_FEW, TOO_SHORT, MovingTissue
 from gsplat_core.io.recordings.synthetic.rendered import RenderedRecording, RenderSettings, render_recording
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import BELIEVED, DEPTH_ORIGINS
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import BELIEVED, DEPTH_ORIGINS, Frame
 
 FPS = 10.0
 

@@ -12,8 +12,7 @@ from gsplat_core.depth.maps import DepthMap, doubted
 from gsplat_core.experimental import breathing_depth
 from gsplat_core.experimental.breathing_depth import OTHERWISE, TOO_FEW, TOO_SHORT, MovingTissue, Pull
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import PARALLAX
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import PARALLAX, Frame
 
 FOCAL_PX = 100.0
 

@@ -12,8 +12,7 @@ from gsplat_core.depth.maps import MOST_DISAGREEMENT, UNCONFIRMED, Look, agree, 
 from gsplat_core.depth.multiview import ParallaxDepth, _confirmed
 from gsplat_core.io.recordings.synthetic.rendered import RenderSettings, render_recording
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import DEPTH_ORIGINS, Frame
 from tests.gsplat_core.geometry.test_key_frames import answers, stream
 
 WIDTH, HEIGHT, FOCAL = 120, 90, 100.0

@@ -12,8 +12,7 @@ from gsplat_core.depth.maps import DepthMap
 from gsplat_core.depth.multiview import MOST_KEY_FRAMES, ParallaxDepth
 from gsplat_core.depth.registry import DEPTHS
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import BELIEVED
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import BELIEVED, Frame
 from tests.gsplat_core.geometry.moving_scope import FIRST, HEIGHT, SIDEWAYS, WIDTH, camera_at, video
 
 FRAME_NS = 33_333_333

@@ -14,8 +14,7 @@ from gsplat_core.depth.learned import AGAINST, FLAT, GIVEN, NOT_FINITE, UNLIKE, 
 from gsplat_core.depth.registry import DepthFinder, check_depth, new_estimator
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import BELIEVED, DEPTH_ORIGINS, RELATIVE_DISTANCE
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import BELIEVED, DEPTH_ORIGINS, RELATIVE_DISTANCE, Frame
 from tests.gsplat_core.endoscope.networks import conv, external_weights, write
 
 HEIGHT, WIDTH = 96, 128

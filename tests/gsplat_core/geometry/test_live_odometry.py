@@ -16,8 +16,7 @@ from gsplat_core.io.recordings.synthetic.tissue import Tissue, Tug
 from gsplat_core.poses import live_odometry, local_map
 from gsplat_core.poses.live_odometry import LiveOdometry, seen_depth
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import RELATIVE_DISTANCE
-from gsplat_core.scene.frames import Frame, FrameStatus
+from gsplat_core.scene.frames import RELATIVE_DISTANCE, Frame, FrameStatus
 
 COUNT = 24
 

@@ -10,8 +10,7 @@ from gsplat_core.poses import live_odometry
 from gsplat_core.poses.live_odometry import LiveOdometry, seen_depth
 from gsplat_core.poses.local_map import LocalMap
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import BELIEVED, RELATIVE_DISTANCE
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import BELIEVED, RELATIVE_DISTANCE, Frame
 
 CAMERA = Camera(np.array([[200.0, 0, 160], [0, 200, 128], [0, 0, 1]]), 320, 256)
 GREY = np.full((256, 320, 3), 90, np.uint8)

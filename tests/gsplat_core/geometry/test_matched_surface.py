@@ -10,8 +10,7 @@ from gsplat_core.depth.plane_fits import ALIKE_PX2, smooth_disparity, with_match
 from gsplat_core.depth.registry import with_surface
 from gsplat_core.depth.stereo import variance_px2
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import DEPTH_ORIGINS, Frame
 
 HEIGHT, WIDTH = 128, 160
 NOISE_PX = 0.1

@@ -13,8 +13,7 @@ from gsplat_core import Camera, Frame, Gaussians, Model, Reconstructor, Reconstr
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.geometry.measure import Measurement, SurfacePoint
 from gsplat_core.io.recordings.synthetic.rendered import RenderSettings, render_recording
-from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
-from gsplat_core.scene.depth_source import DepthError, DepthSource
+from gsplat_core.scene.frames import DEPTH_ORIGINS, DepthError, DepthSource
 
 CAMERA = Camera.from_focal(60.0, 64, 48)
 MEASURED = DepthSource(DEPTH_ORIGINS["measured"], metric=True)

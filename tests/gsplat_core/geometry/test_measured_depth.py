@@ -8,8 +8,7 @@ import pytest
 from gsplat_core.depth.maps import STRIDE, _median, believed_depth, measured_confidence, possible_depth
 from gsplat_core.depth.registry import DepthFinder
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import DEPTH_ORIGINS, Frame
 
 ROWS, COLUMNS = 40, 48
 

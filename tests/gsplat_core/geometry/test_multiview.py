@@ -18,8 +18,7 @@ from gsplat_core.depth.multiview import (
     view_of,
 )
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import BELIEVED, DEPTH_ORIGINS
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import BELIEVED, DEPTH_ORIGINS, Frame
 from tests.gsplat_core.geometry.moving_scope import (
     FIRST,
     HEIGHT,

@@ -11,8 +11,7 @@ from gsplat_core.depth import multiview
 from gsplat_core.depth.maps import DepthMap
 from gsplat_core.depth.multiview import ParallaxDepth, chosen_views, view_of
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import PARALLAX
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import PARALLAX, Frame
 
 
 def view(x, turn=0.0):

@@ -9,8 +9,7 @@ from gsplat_core.depth import multiview
 from gsplat_core.depth.maps import DepthMap, doubted
 from gsplat_core.depth.multiview import ParallaxDepth, View, aggregated, best_labels, explained_by_poses, sweep
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import PARALLAX
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import PARALLAX, Frame
 
 FOCAL_PX, WIDTH, HEIGHT = 60.0, 64, 48
 TISSUE = np.ones((HEIGHT, WIDTH), np.uint8)

@@ -18,8 +18,7 @@ from gsplat_core.poses import odometry
 from gsplat_core.poses.breathing import BreathingTrajectory
 from gsplat_core.poses.odometry import LEAST_SEEN, Trajectory, followed_part, trajectory_of
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import RELATIVE_DISTANCE
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import RELATIVE_DISTANCE, Frame
 
 COUNT = 16
 

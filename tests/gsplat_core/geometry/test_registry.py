@@ -8,8 +8,7 @@ import pytest
 from gsplat_core.depth import registry
 from gsplat_core.depth.registry import DepthFinder, Sentences
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.scene.depth_origin import DEPTH_ORIGINS, DepthOrigin
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import DEPTH_ORIGINS, DepthOrigin, Frame
 from tests.gsplat_core.geometry.moving_scope import FIRST, HEIGHT, SIDEWAYS, WIDTH, video
 
 FRAME_NS = 33_333_333

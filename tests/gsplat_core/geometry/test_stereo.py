@@ -13,8 +13,7 @@ import torch
 from gsplat_core.depth import stereo
 from gsplat_core.depth.stereo import StereoDepth
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import DEPTH_ORIGINS, Frame
 from tests.gsplat_core.geometry.pairs import (
     BASELINE_MM,
     FOCAL_PX,

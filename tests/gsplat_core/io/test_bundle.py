@@ -14,8 +14,7 @@ from gsplat_core.io import bundle, files
 from gsplat_core.io.bundle import load_bundle, save_bundle
 from gsplat_core.models import Model
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
-from gsplat_core.scene.depth_source import DepthError, DepthSource
+from gsplat_core.scene.frames import DEPTH_ORIGINS, DepthError, DepthSource
 
 CAMERA = Camera([[812.5, 0, 319.25], [0, 811.0, 255.75], [0, 0, 1]], 640, 512)
 

@@ -10,8 +10,7 @@ import pytest
 from gsplat_core.errors import InvalidInput
 from gsplat_core.io.recordings import open_recording, synthesize
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import DEPTH_ORIGINS, Frame
 
 IMAGE = np.zeros((4, 6, 3), np.uint8)
 

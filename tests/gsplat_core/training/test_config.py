@@ -8,7 +8,7 @@ import pytest
 from gsplat_core.deformation.basis import BasisLearningRates
 from gsplat_core.deformation.hexplane import HexPlaneLearningRates
 from gsplat_core.errors import InvalidSetting, UserError
-from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
+from gsplat_core.scene.frames import DEPTH_ORIGINS
 from gsplat_core.training.config import (
     LearningRates,
     ReconstructorConfig,

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
+from gsplat_core.scene.frames import DEPTH_ORIGINS
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.placement import MOST_TIMES, depth_errors
 from tests.gsplat_core.training.test_late_depth import CAMERA, found, frame_at, learner

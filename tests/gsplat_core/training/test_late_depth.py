@@ -10,9 +10,7 @@ import torch
 
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import DEPTH_ORIGINS, DepthOrigin
-from gsplat_core.scene.depth_source import DepthSource
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import DEPTH_ORIGINS, DepthOrigin, DepthSource, Frame
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.placement import MOST_LATE, LateDepth
 from gsplat_core.training.reconstructor import Reconstructor

@@ -8,7 +8,7 @@ import torch
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
+from gsplat_core.scene.frames import DEPTH_ORIGINS
 from gsplat_core.training import observations
 from gsplat_core.training.observations import Observation, ObservationWindow
 

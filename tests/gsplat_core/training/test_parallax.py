@@ -8,7 +8,7 @@ import pytest
 from gsplat_core.depth import multiview
 from gsplat_core.depth.multiview import ParallaxDepth
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import BELIEVED, DEPTH_ORIGINS
+from gsplat_core.scene.frames import BELIEVED, DEPTH_ORIGINS
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.offline import to_fit
 from tests.gsplat_core.geometry.moving_scope import (

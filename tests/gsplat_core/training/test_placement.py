@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from gsplat_core.rendering.rasterization import render
-from gsplat_core.scene.depth_origin import DEPTH_ORIGINS, DepthOrigin
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import DEPTH_ORIGINS, DepthOrigin, Frame
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.schedule import LiveTraining

@@ -11,8 +11,7 @@ import torch
 from gsplat_core.deformation import FIELDS, BasisField, HexPlaneField
 from gsplat_core.io.recordings.synthetic.scene import SyntheticScene
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import DEPTH_ORIGINS, Frame
 from gsplat_core.training.config import LearningRates, ReconstructorConfig
 from gsplat_core.training.metrics import psnr_tissue_db
 from gsplat_core.training.reconstructor import Reconstructor

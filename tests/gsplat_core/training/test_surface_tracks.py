@@ -12,8 +12,7 @@ from gsplat_core.deformation import BasisField
 from gsplat_core.io.recordings.synthetic.rendered import RenderSettings, render_recording
 from gsplat_core.io.recordings.synthetic.scene import SyntheticScene
 from gsplat_core.rendering.rasterization import render
-from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import DEPTH_ORIGINS, Frame
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.initialisation import gaussians_from_frame
 from gsplat_core.training.motion.image_motion import Seen

@@ -9,8 +9,7 @@ import torch
 
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import DEPTH_ORIGINS, Frame
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.initialisation import gaussians_from_frame
 

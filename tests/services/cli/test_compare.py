@@ -14,8 +14,7 @@ import torch
 from gsplat_core import Camera, Gaussians, Model, save_bundle
 from gsplat_core.geometry.mesh import Mesh, mesh_of
 from gsplat_core.io.exports.files import mesh_ply_pieces
-from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
-from gsplat_core.scene.depth_source import DepthSource
+from gsplat_core.scene.frames import DEPTH_ORIGINS, DepthSource
 from services.cli.app import run
 from services.cli.exit_codes import BAD_INPUT, OK
 

@@ -8,8 +8,7 @@ import pytest
 import torch
 
 from gsplat_core import Camera, Gaussians, Model, save_bundle
-from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
-from gsplat_core.scene.depth_source import DepthSource
+from gsplat_core.scene.frames import DEPTH_ORIGINS, DepthSource
 from services.cli.app import run
 from services.cli.exit_codes import BAD_INPUT, OK
 

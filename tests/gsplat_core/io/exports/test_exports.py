@@ -18,8 +18,7 @@ from gsplat_core.io.ply import load_ply
 from gsplat_core.models import Model
 from gsplat_core.ops.spherical_harmonics import spherical_harmonics
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
-from gsplat_core.scene.depth_source import DepthSource
+from gsplat_core.scene.frames import DEPTH_ORIGINS, DepthSource
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
 from tests.gsplat_core.io.exports.glb_reader import NAME, read_glb, read_mesh_glb
 from tests.recipes.test_deformation_field import DriftField

@@ -9,8 +9,7 @@ from gsplat_core.io.sessions import SessionInfo, SessionWriter
 from gsplat_core.io.sessions.records import Observed, Rehearsed
 from gsplat_core.io.sessions.writer import Shown
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
-from gsplat_core.scene.frames import Frame, FrameStatus
+from gsplat_core.scene.frames import DEPTH_ORIGINS, Frame, FrameStatus
 
 HEIGHT_PX, WIDTH_PX = 16, 24
 

@@ -15,8 +15,7 @@ from gsplat_core.io.sessions import SessionReader, SessionWriter, WriterOptions
 from gsplat_core.io.sessions.reader import prepared_of
 from gsplat_core.io.sessions.records import DeletedLine, Observed, PreparedLine, ShownLine
 from gsplat_core.io.sessions.writer import Shown
-from gsplat_core.scene.depth_origin import DEPTH_ORIGINS
-from gsplat_core.scene.frames import Frame, FrameStatus
+from gsplat_core.scene.frames import DEPTH_ORIGINS, Frame, FrameStatus
 from tests.gsplat_core.io.sessions.made import Clock, new_frame, same_frame, session_info
 
 
