@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.endoscope.mask_and_depth import LEAST_TISSUE
 from gsplat_core.endoscope.onnx import OnnxToolFinder
+from gsplat_core.endoscope.sequence import LEAST_TISSUE
 from gsplat_core.endoscope.tool_network import NetworkToolFinder
 from gsplat_core.endoscope.tools import ToolFinder
 from gsplat_core.errors import InvalidSetting

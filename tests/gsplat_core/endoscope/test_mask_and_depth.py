@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gsplat_core.endoscope.mask_and_depth import SAMPLES, DepthCheck, MaskCheck, _some
+from gsplat_core.endoscope.sequence import SAMPLES, DepthCheck, MaskCheck, _some
 
 
 def mask(tool_columns, size=40):
