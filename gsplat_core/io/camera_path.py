@@ -25,9 +25,8 @@ from numpy.typing import NDArray
 
 from gsplat_core.errors import BundleCorrupt, InvalidInput, InvalidSetting
 from gsplat_core.io.files import read_regular
-from gsplat_core.io.json_object import JsonObject
 from gsplat_core.scene.cameras import MAX_INTRINSICS_PX, MIN_FOCAL_PX, Camera
-from gsplat_core.value_ranges import IntegerIn, NumberIn
+from gsplat_core.value_ranges import IntegerIn, JsonObject, NumberIn
 
 MOST_BYTES = 1 << 24
 MOST_CAMERAS = 100_000

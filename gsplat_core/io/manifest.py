@@ -16,12 +16,11 @@ import torch
 from gsplat_core.deformation.field import DeformationField
 from gsplat_core.deformation.kinds import field_from_config, kind_of
 from gsplat_core.errors import BundleCorrupt, InvalidInput, InvalidSetting, UnknownFormatVersion
-from gsplat_core.io.json_object import JsonObject
 from gsplat_core.models import Model, TrainedBy
 from gsplat_core.scene.cameras import CAMERA_MODELS, MAX_INTRINSICS_PX, MIN_FOCAL_PX, Camera, CameraModel
 from gsplat_core.scene.frames import DEPTH_ORIGINS, LONGEST_RECORDING_S, DepthError, DepthSource
 from gsplat_core.scene.gaussians import MAX_SH_DEGREE, Gaussians
-from gsplat_core.value_ranges import IntegerIn, NumberIn, shortened
+from gsplat_core.value_ranges import IntegerIn, JsonObject, NumberIn, shortened
 
 FORMAT_VERSION = 1
 MAX_MANIFEST_BYTES = 1 << 20

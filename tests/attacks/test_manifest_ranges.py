@@ -12,7 +12,6 @@ import torch
 from gsplat_core.deformation import kind_of
 from gsplat_core.errors import BundleCorrupt, BundleError
 from gsplat_core.io.bundle import load_bundle, save_bundle
-from gsplat_core.io.json_object import MAX_NESTING
 from gsplat_core.io.manifest import (
     COUNT,
     FOCAL_PX,
@@ -29,6 +28,7 @@ from gsplat_core.io.manifest import (
 from gsplat_core.models import Model
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
+from gsplat_core.value_ranges import MAX_NESTING
 
 NO_INTEGERS = (None, True, 1.5, "5", [], {}, -1, 10**400, 2**63, float(2**20))
 NO_NUMBERS = (None, False, "1", [], {}, 10**400, -(10**400), 1e300)
