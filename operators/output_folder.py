@@ -46,7 +46,7 @@ import numpy as np
 from gsplat_core.io.exports.export import TIMES_FILE
 from gsplat_core.io.exports.files import ROW
 from gsplat_core.io.files import open_regular, read_regular, replace_durably, sync_folder, unfinished
-from gsplat_core.io.ply_header import MARK_LINE
+from gsplat_core.io.ply import MARK_LINE
 from gsplat_core.io.recordings.calibration import TRAILER
 from gsplat_core.io.spz import GZIP_START
 from operators.errors import OutputError, OutputFolderInUse

@@ -24,8 +24,7 @@ from gsplat_core.choices import RENDERERS
 from gsplat_core.io.exports.export import export_model
 from gsplat_core.io.exports.formats import ExportWish, format_named
 from gsplat_core.io.model_sources import load_model
-from gsplat_core.io.ply import ply_pieces
-from gsplat_core.io.ply_header import header_lines
+from gsplat_core.io.ply import header_lines, ply_pieces
 from gsplat_core.scene.gaussians import Gaussians
 
 BLOCK = 250_000
@@ -33,7 +32,7 @@ ROOT = Path(__file__).resolve().parents[2]
 LOAD = """
 import json, sys, time
 from pathlib import Path
-from gsplat_core.io.model_files import READERS
+from gsplat_core.io.model_sources import READERS
 from gsplat_core.machine import peak_bytes
 path = Path(sys.argv[1])
 Path("/proc/self/clear_refs").write_text("5")  # the peak counts from here

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsplat_core.errors import BundleCorrupt, InvalidInput
-from gsplat_core.io.compressed_ply import morton_order
+from gsplat_core.io.ply import morton_order
 
 _log = logging.getLogger(__name__)
 

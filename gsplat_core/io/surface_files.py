@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.files import read_regular
-from gsplat_core.io.ply_header import SCALAR_TYPES
+from gsplat_core.io.ply import SCALAR_TYPES
 
 MOST_BYTES = 1 << 30
 MOST_HEADER_BYTES = 1 << 16

@@ -12,7 +12,7 @@ import pytest
 
 from gsplat_core.io.exports.export import TIMES_FILE
 from gsplat_core.io.exports.files import ROW
-from gsplat_core.io.ply_header import MARK_LINE
+from gsplat_core.io.ply import MARK_LINE
 from gsplat_core.io.recordings.calibration import TRAILER
 from operators.output_folder import is_own_file
 from operators.sinks.video import VideoFile

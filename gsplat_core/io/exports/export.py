@@ -16,7 +16,6 @@ from torch import Tensor
 from gsplat_core.errors import BundleError, ExportError, InvalidInput, InvalidSetting
 from gsplat_core.geometry.mesh import mesh_of
 from gsplat_core.io.bundle import save_bundle
-from gsplat_core.io.compressed_ply import compressed_ply_pieces
 from gsplat_core.io.exports.files import (
     glb_pieces,
     mesh_glb_pieces,
@@ -28,7 +27,7 @@ from gsplat_core.io.exports.files import (
 from gsplat_core.io.exports.formats import ExportWish, format_of
 from gsplat_core.io.files import PartialFile
 from gsplat_core.io.model_sources import static_model
-from gsplat_core.io.ply import ply_pieces
+from gsplat_core.io.ply import compressed_ply_pieces, ply_pieces
 from gsplat_core.io.spz import spz_pieces
 from gsplat_core.models import Model
 from gsplat_core.ops.arguments import require_shape

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from gsplat_core.errors import ExportError
 from gsplat_core.geometry.mesh import Mesh
-from gsplat_core.io.ply_header import MARK_LINE
+from gsplat_core.io.ply import MARK_LINE
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
 
 Array = NDArray[np.float32]

@@ -12,9 +12,8 @@ import torch
 
 from gsplat_core.errors import BundleCorrupt, BundleError, ExportError
 from gsplat_core.io import spz
-from gsplat_core.io.compressed_ply import BOUNDS, compressed_ply_pieces, morton_order
 from gsplat_core.io.exports.export import with_unit_rotations
-from gsplat_core.io.ply import load_ply
+from gsplat_core.io.ply import BOUNDS, compressed_ply_pieces, load_ply, morton_order
 from gsplat_core.io.spz import library, load_spz, spz_pieces
 from gsplat_core.reference.spherical_harmonics import spherical_harmonics_bases
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
