@@ -22,7 +22,7 @@ import yaml
 from fastapi import APIRouter
 
 from gsplat_core import Camera, Frame, Gaussians
-from gsplat_core.io.manifest import manifest_bytes, parse_manifest
+from gsplat_core.io.bundle import manifest_bytes, parse_manifest
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.io.recordings.truth import open_views
 from gsplat_core.models import Model

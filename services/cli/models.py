@@ -22,10 +22,9 @@ from gsplat_core.errors import BundleError, InvalidInput, InvalidSetting
 from gsplat_core.geometry.measure import Length, Measurement, SurfacePoint
 from gsplat_core.geometry.mesh import mesh_of
 from gsplat_core.geometry.registration import ClosestPoints, distances, from_pairs, moved_by, register
-from gsplat_core.io.bundle import load_bundle, save_bundle
+from gsplat_core.io.bundle import load_bundle, parse_manifest, save_bundle
 from gsplat_core.io.exports.export import export_model
 from gsplat_core.io.exports.formats import ExportWish, format_named, format_of
-from gsplat_core.io.manifest import parse_manifest
 from gsplat_core.io.model_sources import load_model, wrong_extent
 from gsplat_core.io.surface_files import read_surface
 from gsplat_core.machine import in_gib

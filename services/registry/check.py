@@ -24,8 +24,7 @@ from typing import Any
 import torch
 
 from gsplat_core.errors import BundleCorrupt, BundleError, UnknownFormatVersion, UserError
-from gsplat_core.io.bundle import MANIFEST, load_bundle, save_bundle
-from gsplat_core.io.manifest import MAX_MANIFEST_BYTES, parse_manifest
+from gsplat_core.io.bundle import MANIFEST, MAX_MANIFEST_BYTES, load_bundle, parse_manifest, save_bundle
 from gsplat_core.io.model_files import open_model_file
 from gsplat_core.io.model_sources import load_model
 from gsplat_core.models import Model

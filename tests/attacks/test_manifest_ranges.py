@@ -11,8 +11,7 @@ import torch
 
 from gsplat_core.deformation import kind_of
 from gsplat_core.errors import BundleCorrupt, BundleError
-from gsplat_core.io.bundle import load_bundle, save_bundle
-from gsplat_core.io.manifest import (
+from gsplat_core.io.bundle import (
     COUNT,
     FOCAL_PX,
     INTRINSICS_PX,
@@ -24,6 +23,8 @@ from gsplat_core.io.manifest import (
     SH_DEGREE,
     SIDE_PX,
     VERSION,
+    load_bundle,
+    save_bundle,
 )  # fmt: skip
 from gsplat_core.models import Model
 from gsplat_core.scene.cameras import Camera

@@ -7,7 +7,7 @@ import tarfile
 
 import pytest
 
-from gsplat_core.io import bundle, manifest
+from gsplat_core.io import bundle
 from services.errors import Rejected
 from services.registry import bundle_file
 from services.registry.bundle_file import MANIFEST, TENSORS, members_of, pack, unpack
@@ -27,7 +27,7 @@ def contents(model):
 
 def test_names_and_sizes_are_those_of_the_bundle():
     assert (MANIFEST, TENSORS) == (bundle.MANIFEST, bundle.TENSORS)
-    assert bundle_file.MOST_MANIFEST_BYTES == manifest.MAX_MANIFEST_BYTES
+    assert bundle_file.MOST_MANIFEST_BYTES == bundle.MAX_MANIFEST_BYTES
 
 
 def test_what_is_packed_comes_out_again_and_packs_to_the_same_bytes(tmp_path):
