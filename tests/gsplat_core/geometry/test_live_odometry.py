@@ -13,7 +13,7 @@ from gsplat_core.evaluation.geometry import evaluate_trajectory
 from gsplat_core.geometry.stream_tracks import SmallPictures, StreamTracks
 from gsplat_core.io.recordings.synthetic.rendered import RenderedRecording, RenderSettings, render_recording
 from gsplat_core.io.recordings.synthetic.tissue import Tissue, Tug
-from gsplat_core.poses import live_odometry, local_map
+from gsplat_core.poses import live_odometry
 from gsplat_core.poses.live_odometry import LiveOdometry, seen_depth
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import RELATIVE_DISTANCE, Frame, FrameStatus
@@ -200,8 +200,8 @@ def centres(poses: np.ndarray) -> np.ndarray:
 
 @pytest.mark.slow
 def test_memory_is_bounded(rigid, monkeypatch):
-    monkeypatch.setattr(local_map, "MOST_KEY_FRAMES", 5)
-    monkeypatch.setattr(local_map, "WINDOW", 3)
+    monkeypatch.setattr(live_odometry, "MOST_KEY_FRAMES", 5)
+    monkeypatch.setattr(live_odometry, "WINDOW", 3)
     odometry = LiveOdometry(rigid.camera)
     there = blind(rigid)
     sizes = []

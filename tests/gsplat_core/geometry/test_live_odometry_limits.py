@@ -7,8 +7,7 @@ import pytest
 
 from gsplat_core.geometry.stream_tracks import SmallPictures, StreamTracks
 from gsplat_core.poses import live_odometry
-from gsplat_core.poses.live_odometry import LiveOdometry, seen_depth
-from gsplat_core.poses.local_map import LocalMap
+from gsplat_core.poses.live_odometry import LiveOdometry, LocalMap, seen_depth
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import BELIEVED, RELATIVE_DISTANCE, Frame
 

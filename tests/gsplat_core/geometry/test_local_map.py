@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_core.poses import local_map
-from gsplat_core.poses.local_map import KeyFrame, LocalMap, position_of, scaled, unprojected
+from gsplat_core.poses import live_odometry
+from gsplat_core.poses.live_odometry import KeyFrame, LocalMap, position_of, scaled, unprojected
 from gsplat_core.scene.cameras import Camera
 
 
@@ -139,7 +139,7 @@ def test_one_key_frame_alone_is_not_adjusted():
 def test_an_adjustment_of_many_sightings_has_fewer_rounds(points, rounds, monkeypatch):
     """Each of three key frames sees all points. 1,500 sightings are adjusted once, and no adjustment has more than five rounds."""
     asked = []
-    monkeypatch.setattr(local_map, "adjusted", lambda bundle, fixed, rounds: asked.append(rounds) or bundle)
+    monkeypatch.setattr(live_odometry, "adjusted", lambda bundle, fixed, rounds: asked.append(rounds) or bundle)
     made = known([[0.1 * n, 0, 50.0] for n in range(points)])
     for x in range(3):
         seen = key(float(x), range(points))

@@ -11,8 +11,7 @@ from gsplat_core.io.recordings.synthetic.rendered import RenderedRecording, Rend
 from gsplat_core.io.recordings.synthetic.scene import SyntheticScene
 from gsplat_core.io.recordings.synthetic.tissue import Tissue, Tug
 from gsplat_core.poses import live_odometry
-from gsplat_core.poses.live_odometry import LiveOdometry
-from gsplat_core.poses.local_map import KeyFrame, LocalMap, PlaceRecognition, seen_again
+from gsplat_core.poses.live_odometry import KeyFrame, LiveOdometry, LocalMap, PlaceRecognition, seen_again
 from gsplat_core.poses.se3 import exp
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
