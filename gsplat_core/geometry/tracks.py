@@ -1,17 +1,32 @@
 """Tracking of points by sparse optical flow with forward-backward error (Kalal et al. 2010).
 
-`FeatureTracks` tracks corners through a recording and drops those that become unreliable.
+`FeatureTracks` tracks corners through a recording from picture to picture, and drops those that become unreliable.
+
+`ReferenceTracks` tracks without drift through a recording, by alignment with reference pictures. It detects corners in a new
+reference picture every `EVERY` pictures, or earlier if it finds few of the last ones, and finds them in the following pictures.
+Optical flow predicts a smooth map from the reference to the new picture. The new picture is warped by this map, and each
+corner's patch is aligned with the patch of the reference (Lucas and Kanade 1981) with a forward-backward test. Errors
+therefore do not accumulate from picture to picture, and a corner is found again after it was hidden. The lamp moves with the
+scope and exposure changes, so pictures are compared by local contrast (`local_contrast`). Highlights, tools and the outside of
+the field of view have none.
+
+`StreamTracks` tracks through a stream on reduced pictures, with bounded memory and time per frame.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from gsplat_core.endoscope.highlights import HighlightFinder
+from gsplat_core.scene.cameras import Camera
+from gsplat_core.scene.frames import Frame
 
 Points = NDArray[np.float32]
 """Pixel positions (x, y) float32 [N, 2] in OpenCV's convention: the centre of the first pixel is at 0."""
@@ -105,6 +120,18 @@ def gathered(seen: Sequence[tuple[NDArray[np.int64], NDArray[np.float64]]], coun
     return Observations(frames[kept], renumbered[points[kept]], pixels[kept])
 
 
+def _new_corners(grey: NDArray[np.uint8], usable: NDArray[np.uint8], known: Points, most: int, apart: float) -> Points:
+    """Detect at most `most` corners [N, 2] where `usable` is not 0. Distances between corners, and from the points `known`
+    [K, 2], are at least `apart`, a share of the longer side.
+    """
+    apart_px = max(4, round(apart * max(grey.shape)))
+    free = usable.copy()
+    for x, y in np.rint(known).astype(int):
+        cv2.circle(free, (int(x), int(y)), apart_px, 0, -1)
+    corners = cv2.goodFeaturesToTrack(grey, most, LEAST_QUALITY, apart_px, mask=free)
+    return np.zeros((0, 2), np.float32) if corners is None else corners.reshape(-1, 2).astype(np.float32)
+
+
 class FeatureTracks:
     """Point tracker. A point keeps its number while it is tracked. Results are deterministic."""
 
@@ -173,14 +200,385 @@ class FeatureTracks:
         missing = MOST_POINTS - len(self._points)
         if missing < MOST_POINTS // 10:
             return
-        apart = max(4, round(APART * max(grey.shape)))
-        free = usable.copy()
-        for x, y in np.rint(self._points).astype(int):
-            cv2.circle(free, (int(x), int(y)), apart, 0, -1)
-        corners = cv2.goodFeaturesToTrack(grey, missing, LEAST_QUALITY, apart, mask=free)
-        if corners is None:
-            return
-        new = corners.reshape(-1, 2).astype(np.float32)
+        new = _new_corners(grey, usable, self._points, missing, APART)
         self._points = np.concatenate([self._points, new])
         self._numbers = np.concatenate([self._numbers, np.arange(self._next, self._next + len(new))])
         self._next += len(new)
+
+
+SIDE_PX = 320
+"""Longest side of the reduced pictures, in pixels."""
+STREAM_POINTS = 220
+"""Largest number of points of a stream tracked at once."""
+STREAM_APART = 0.03
+"""Smallest distance between points when they are detected, as a share of the longer side."""
+STREAM_PATCH_PX = 17
+"""Side of the square patch that is tracked, in pixels."""
+STREAM_RETURN_PX = 0.5
+"""Largest accepted forward-backward error in pixels."""
+STREAM_BORDER_PX = 6
+SAME_PX = 3.0
+"""Distance in pixels below which two tracked points count as one point."""
+
+Numbers = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class SmallPicture:
+    """Reduced grey picture for tracking."""
+
+    grey: NDArray[np.uint8]
+    """Grey levels uint8 [h, w]."""
+    usable: NDArray[np.uint8]
+    """Validity uint8 [h, w]; 0 on tools, highlights and the border."""
+    camera: Camera
+    """Camera scaled to the size of the reduced picture."""
+
+    def rays(self, pixels: Points) -> NDArray[np.float64]:
+        """Return rays x / z and y / z [N, 2] of pixel positions in OpenCV's convention."""
+        K = self.camera.K
+        return np.asarray((pixels.astype(np.float64) + 0.5 - K[:2, 2]) / [K[0, 0], K[1, 1]])
+
+    def pixels(self, local: NDArray[np.float64]) -> Points:
+        """Project points in camera coordinates [N, 3] to OpenCV pixel positions. Points behind the
+        camera project far outside.
+        """
+        K = self.camera.K
+        depth = np.where(local[:, 2] > 1e-9, local[:, 2], 1e-9)
+        return np.asarray(
+            np.clip(local[:, :2] / depth[:, None] * [K[0, 0], K[1, 1]] + K[:2, 2] - 0.5, -1e4, 1e4), np.float32
+        )
+
+    def shows(self, pixels: Points) -> NDArray[np.bool_]:
+        """Return which positions are inside the picture and trackable [N]."""
+        height, width = self.grey.shape
+        column, row = (np.rint(np.nan_to_num(pixels[:, axis], nan=-1.0)).astype(np.int64) for axis in (0, 1))
+        inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
+        inside[inside] = self.usable[row[inside], column[inside]] > 0
+        return inside
+
+
+class SmallPictures:
+    """Reduces the frames of one stream for tracking."""
+
+    def __init__(self, camera: Camera, side_px: int = SIDE_PX) -> None:
+        self._camera, self._side_px = camera, side_px
+        self._highlights = HighlightFinder()
+
+    def of(self, frame: Frame) -> SmallPicture:
+        """Reduce a frame to grey and mark masked pixels, highlights and the border as unusable."""
+        share = min(1.0, self._side_px / max(frame.width_px, frame.height_px))
+        size = max(1, round(share * frame.width_px)), max(1, round(share * frame.height_px))
+        small = frame.image if share == 1 else np.asarray(cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA))
+        usable = np.zeros(small.shape[:2], np.uint8)
+        usable[STREAM_BORDER_PX:-STREAM_BORDER_PX, STREAM_BORDER_PX:-STREAM_BORDER_PX] = 255
+        masks = (frame.mask, frame.loss_mask, self._highlights.without(np.asarray(small, np.uint8)))
+        kept = [cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST) != 0 for mask in masks if mask is not None]
+        if kept:
+            # Exclude corners whose patch overlaps a tool, which moves differently.
+            tissue = np.logical_and.reduce(kept).astype(np.uint8) * 255
+            usable &= np.asarray(cv2.erode(tissue, np.ones((STREAM_PATCH_PX, STREAM_PATCH_PX), np.uint8)), np.uint8)
+        grey = np.asarray(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), np.uint8)
+        return SmallPicture(grey, usable, self._camera.resized(*size))
+
+
+def found_again(
+    before: SmallPicture, after: SmallPicture, points: Points, guess: Points
+) -> tuple[Points, NDArray[np.bool_]]:
+    """Track points to another picture.
+
+    Args:
+        before: picture that contains the points.
+        after: picture to search.
+        points: positions in `before` [N, 2].
+        guess: start positions in `after` [N, 2].
+
+    Returns:
+        Positions in `after` [N, 2], and which of them are reliable [N].
+    """
+    moved, misses_px = followed(before.grey, after.grey, points, guess, window_px=STREAM_PATCH_PX, levels=LEVELS)
+    return moved, (misses_px < STREAM_RETURN_PX) & after.shows(moved)
+
+
+class StreamTracks:
+    """Point tracker. A point keeps its number while it is tracked. Results are deterministic."""
+
+    def __init__(self) -> None:
+        self.picture: SmallPicture | None = None
+        """Last picture that was tracked."""
+        self.pixels: Points = np.zeros((0, 2), np.float32)
+        """Positions of the tracked points in the last picture, [N, 2]."""
+        self.numbers: Numbers = np.zeros(0, np.int64)
+        """Numbers of the points, ascending."""
+        self.first: Points = np.zeros((0, 2), np.float32)
+        """Positions where each point was first detected [N, 2]."""
+        self._next = 0
+
+    def begin(self, picture: SmallPicture) -> None:
+        """Drop all points and use this picture as the last one."""
+        self.picture = picture
+        self.keep(np.zeros(len(self.numbers), np.bool_))
+
+    def follow(self, picture: SmallPicture, guess: Points) -> tuple[Numbers, Points]:
+        """Track the points to the next picture, starting at `guess` [N, 2]. The tracker's state
+        changes only in `go_on`.
+        """
+        assert self.picture is not None
+        if picture.grey.shape != self.picture.grey.shape:
+            return self.numbers[:0], self.pixels[:0]
+        moved, trusted = found_again(self.picture, picture, self.pixels, guess)
+        return self.numbers[trusted], moved[trusted]
+
+    def go_on(self, picture: SmallPicture, numbers: Numbers, pixels: Points) -> None:
+        """Replace the tracker's state by a picture and the points found in it."""
+        self.first = self.first[np.searchsorted(self.numbers, numbers)]
+        self.picture, self.numbers, self.pixels = picture, numbers, pixels
+
+    def keep(self, kept: NDArray[np.bool_]) -> None:
+        """Keep only the marked points."""
+        self.numbers, self.pixels, self.first = self.numbers[kept], self.pixels[kept], self.first[kept]
+
+    def take_up(self) -> Numbers:
+        """Detect new corners if at least a tenth of `STREAM_POINTS` is missing. Returns their numbers, which are larger
+        than all earlier ones.
+        """
+        picture, missing = self.picture, STREAM_POINTS - len(self.numbers)
+        if picture is None or missing < STREAM_POINTS // 10:
+            return np.zeros(0, np.int64)
+        corners = _new_corners(picture.grey, picture.usable, self.pixels, missing, STREAM_APART)
+        new = np.arange(self._next, self._next + len(corners))
+        self._next += len(corners)
+        self._add(new, corners)
+        return new
+
+    def adopt(self, numbers: Numbers, pixels: Points) -> None:
+        """Track known points as well, replacing tracked points at nearly the same position."""
+        near = np.linalg.norm(self.pixels[:, None] - pixels[None], axis=2).min(1, initial=np.inf) < SAME_PX
+        self.keep(~near & ~np.isin(self.numbers, numbers))
+        self._add(numbers, pixels)
+
+    def _add(self, numbers: Numbers, pixels: Points) -> None:
+        order = np.argsort(np.concatenate([self.numbers, numbers]), kind="stable")
+        self.numbers = np.concatenate([self.numbers, numbers])[order]
+        self.pixels = np.concatenate([self.pixels, pixels])[order]
+        self.first = np.concatenate([self.first, pixels])[order]
+
+
+EVERY = 20
+"""Number of pictures from one reference to the next."""
+RENEWED = 0.4
+"""Share of found corners of the newest reference below which a new one starts earlier."""
+MOST_REFERENCES = 5
+"""Largest number of references that are tracked at once. The oldest one is dropped first."""
+MOST_CORNERS = 250
+"""Largest number of corners of a reference."""
+LONGEST_SIDE = 640
+"""Larger pictures are reduced to this longer side in pixels."""
+SMALLEST_SHARE = 0.7
+"""Smallest usable share of a tracked patch."""
+HALO_PX = 5
+"""Side of the square by which unusable areas are grown, in pixels."""
+REFERENCE_LEVELS = 2
+REFERENCE_RETURN_PX = 0.3
+"""Largest accepted error of a point tracked forward and back, in pixels."""
+OFF_PX, OFF_MEDIANS = 1.0, 3.0
+"""Distance from the smooth map from which a match is wrong: in pixels, and as a multiple of the median distance."""
+LEAST_FOUND = 24
+"""Fewest corners of a reference that must be found in a picture."""
+MOST_MISSES = 15
+"""Largest number of consecutive pictures in which a reference is not found. After that it is dropped."""
+NODES = 16
+"""Number of nodes of the smooth map along each side."""
+REACH = 0.12
+"""Standard deviation of the map's smoothing kernel, as a share of the picture's longer side."""
+HELD = 0.5
+"""Weight of a residual of 0 in the mean of the residuals at a node; a match at the node has the weight 1."""
+FLOOR = 0.02
+"""Contrast, as the standard deviation of logarithmic brightness, that is regarded as noise."""
+
+
+def local_contrast(grey: NDArray[np.uint8], usable: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """Return logarithmic brightness relative to its surroundings, divided by its local standard deviation.
+
+    Args:
+        grey: picture uint8 [H, W].
+        usable: bool [H, W]; other pixels get the mean value 128 and influence no other pixel.
+    """
+    width = max(grey.shape) / 30
+    blurred = lambda values: cv2.GaussianBlur(values, (0, 0), width)
+    inside, bright = usable.astype(np.float32), np.log(grey.astype(np.float32) + 8)
+    share = blurred(inside) + 1e-3
+    detail = (bright - blurred(bright * inside) / share) * inside
+    spread = np.sqrt(blurred(detail * detail) / share + FLOOR**2)
+    return np.clip(128 + 40 * detail / spread, 0, 255).astype(np.uint8)
+
+
+class ReferenceTracks:
+    """Point tracker with reference pictures. Results are deterministic."""
+
+    def __init__(self, pool: Executor | None = None) -> None:
+        """Create a tracker without references.
+
+        Args:
+            pool: threads that search for the references in each picture, at most `MOST_REFERENCES` at once. None to
+                search for one after the other.
+        """
+        self._map = map if pool is None else pool.map
+        self._flow: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+        self._before: NDArray[np.uint8] | None = None
+        self._references: list[_Reference] = []
+        self._next, self._count, self._newest = 0, 0, 0
+        self._seen: list[tuple[NDArray[np.int64], NDArray[np.float64]]] = []
+
+    def follow(self, image: NDArray[np.uint8], mask: NDArray[np.uint8] | None) -> None:
+        """Find the corners of the references in the next picture, and start a new reference if one is due.
+
+        Args:
+            image: RGB uint8 [H, W, 3].
+            mask: [H, W], 0 where nothing is tracked, or None.
+        """
+        grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
+        inside = np.ones(grey.shape, np.uint8) if mask is None else (mask != 0).astype(np.uint8)
+        scale = min(1.0, LONGEST_SIDE / max(grey.shape))
+        if scale < 1:
+            size = round(grey.shape[1] * scale), round(grey.shape[0] * scale)
+            grey = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
+            inside = np.asarray(cv2.resize(inside, size, interpolation=cv2.INTER_NEAREST), np.uint8)
+        picture, usable = local_contrast(grey, inside != 0), _usable(inside)
+        found: list[tuple[NDArray[np.int64], Points]] = []
+        if self._before is not None and self._references:
+            flow = self._flow.calc(self._before, picture, None)
+            search = lambda one: one.found(picture, usable, flow)
+            found = [each for each in self._map(search, self._references) if each]
+            self._references = [one for one in self._references if one.missed <= MOST_MISSES]
+        late = self._count - self._newest >= EVERY
+        if not self._references or (found and (late or self._references[-1].share < RENEWED)):
+            new = _Reference(picture, usable, self._next)
+            if len(new.corners) >= LEAST_FOUND:
+                self._references = [*self._references, new][-MOST_REFERENCES:]
+                self._next, self._newest = self._next + len(new.corners), self._count
+                found.append((new.numbers, new.corners))
+        if found:
+            self._before = picture
+            for one in self._references:
+                one.advance()
+        numbers = np.concatenate([np.zeros(0, np.int64), *(each for each, _ in found)])
+        pixels = np.concatenate([np.zeros((0, 2)), *(each.astype(np.float64) + 0.5 for _, each in found)])
+        self._seen.append((numbers, pixels / scale))
+        self._count += 1
+
+    def observations(self, least: int = 3) -> Observations:
+        """Return all observations so far of points observed at least `least` times, with the points renumbered from 0."""
+        return gathered(self._seen, self._next, least)
+
+
+class _Reference:
+    """Reference picture, its corners, and the map from it to the latest picture."""
+
+    def __init__(self, picture: NDArray[np.uint8], usable: NDArray[np.uint8], first: int) -> None:
+        height, width = picture.shape
+        self._side = max(height, width)
+        self.corners = _new_corners(picture, usable, np.zeros((0, 2), np.float32), MOST_CORNERS, APART)
+        self.numbers = first + np.arange(len(self.corners))
+        self.missed = 0
+        """Number of consecutive pictures in which too few corners were found."""
+        self.share = 1.0
+        """Share of the corners found in the latest picture in which the reference was found."""
+        self._picture = picture
+        self._grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), 2).astype(np.float32)
+        self._map = self._ahead = self._grid
+        nodes = np.stack(np.meshgrid(np.linspace(0, width - 1, NODES), np.linspace(0, height - 1, NODES)), 2)
+        self._nodes = nodes.reshape(-1, 2)
+        away = np.square(self._nodes[:, None] - self.corners).sum(2)
+        self._weights = np.exp(-0.5 * away / (REACH * self._side) ** 2)
+        across = np.linspace(0, NODES - 1, width, dtype=np.float32), np.linspace(0, NODES - 1, height, dtype=np.float32)
+        self._between = np.meshgrid(*across)
+
+    def found(
+        self, picture: NDArray[np.uint8], usable: NDArray[np.uint8], flow: NDArray[np.float32]
+    ) -> tuple[NDArray[np.int64], Points] | None:
+        """Return numbers and positions of the corners found in a picture, or None if there are too few.
+
+        The map changes with `advance`.
+
+        Args:
+            picture: local contrast of the picture uint8 [H, W].
+            usable: uint8 [H, W], 0 where no corner can be.
+            flow: optical flow from the picture of the map to this one [H, W, 2].
+        """
+        height, width = picture.shape
+        last = self._map
+        self._ahead = last + _warped(flow, last, cv2.INTER_LINEAR)
+        predicted = self._at(self._ahead)
+        kept = np.asarray(((predicted >= 0) & (predicted <= [width - 1, height - 1])).all(axis=1))
+        self.missed += 1
+        if kept.sum() < LEAST_FOUND:
+            return None
+        start = self._smooth(kept, predicted)
+        for levels in (REFERENCE_LEVELS, 0):
+            warped = _warped(picture, start, cv2.INTER_CUBIC)
+            moved, misses_px = followed(self._picture, warped, self.corners, window_px=PATCH_PX, levels=levels)
+            kept = misses_px < REFERENCE_RETURN_PX
+            moved[~kept] = self.corners[~kept]
+            at = _sampled(start, moved)
+            column, row = np.rint(at).astype(int).T
+            kept &= (column >= 0) & (row >= 0) & (column < width) & (row < height)
+            kept[kept] = usable[row[kept], column[kept]] > 0
+            if kept.sum() < LEAST_FOUND:
+                return None
+            off = np.linalg.norm(at - self._at(self._smooth(kept, at)), axis=1)
+            kept &= off < max(OFF_PX, OFF_MEDIANS * float(np.median(off[kept])))
+            start = self._smooth(kept, at)
+        if kept.sum() < LEAST_FOUND:
+            return None
+        self._ahead, self.missed, self.share = start, 0, float(kept.mean())
+        return self.numbers[kept], at[kept]
+
+    def advance(self) -> None:
+        """Replace the map by the one to the picture of the last call of `found`."""
+        self._map = self._ahead
+
+    def _at(self, values: NDArray[np.float32]) -> Points:
+        return _sampled(values, self.corners)
+
+    def _smooth(self, kept: NDArray[np.bool_], at: Points) -> NDArray[np.float32]:
+        """Interpolate the positions `at` of the `kept` corners in another picture to a position of every pixel, [H, W, 2]. The
+        displacement is a quadratic polynomial plus smoothed residuals.
+        """
+        moved = (at - self.corners)[kept].astype(np.float64)
+        basis = self._basis(self.corners[kept])
+        square = basis.T @ basis + 1e-3 * np.eye(basis.shape[1])
+        factors = np.linalg.solve(square, basis.T @ moved)
+        weights = self._weights[:, kept]
+        local = weights @ (moved - basis @ factors) / (weights.sum(1, keepdims=True) + HELD)
+        nodes = (self._basis(self._nodes) @ factors + local).reshape(NODES, NODES, 2).astype(np.float32)
+        return np.asarray(self._grid + cv2.remap(nodes, *self._between, cv2.INTER_LINEAR), np.float32)
+
+    def _basis(self, at: NDArray[np.floating]) -> NDArray[np.float64]:
+        x, y = (at.astype(np.float64) / self._side - 0.5).T
+        return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], 1)
+
+
+def _warped(values: NDArray[Any], at: NDArray[np.float32], interpolation: int) -> NDArray[Any]:
+    """Return values [H, W, ...] at the positions of a map [H, W, 2]."""
+    x, y = (np.ascontiguousarray(at[:, :, axis]) for axis in (0, 1))
+    return np.asarray(cv2.remap(values, x, y, interpolation, borderMode=cv2.BORDER_REPLICATE))
+
+
+def _sampled(values: NDArray[np.float32], at: Points) -> Points:
+    """Return values [H, W, 2] interpolated at positions [N, 2]."""
+    if not len(at):
+        return at
+    x, y = (np.ascontiguousarray(at[:, axis : axis + 1], np.float32) for axis in (0, 1))
+    return np.asarray(cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0], np.float32)
+
+
+def _usable(inside: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return uint8 [H, W], 0 near the border, near unusable pixels, and where a patch has many of them."""
+    usable = np.zeros(inside.shape, np.uint8)
+    usable[BORDER_PX:-BORDER_PX, BORDER_PX:-BORDER_PX] = 255
+    share = cv2.boxFilter(inside.astype(np.float32), -1, (PATCH_PX, PATCH_PX))
+    usable[share < SMALLEST_SHARE] = 0
+    grown = cv2.erode(inside, np.ones((HALO_PX, HALO_PX), np.uint8))
+    usable[grown == 0] = 0
+    return usable

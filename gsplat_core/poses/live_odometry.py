@@ -1,6 +1,6 @@
 """Visual odometry of a stream with bounded memory and time per frame.
 
-Tissue corners are tracked on reduced pictures (`stream_tracks`). Each frame's camera starts at the pose predicted by
+Tissue corners are tracked on reduced pictures (`StreamTracks`). Each frame's camera starts at the pose predicted by
 constant motion and is optimised until the points fit. A key frame is added once the pictures have moved far enough. Its
 new corners get the depth of the known corners around them. A few bundle adjustment steps over the newest key frames
 refine poses and points with every frame (`LocalMap`). As in `odometry`, the scene starts as a plane at
@@ -25,16 +25,17 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.geometry.stream_tracks import (
+from gsplat_core.geometry.tracks import (
     LEVELS,
-    PATCH_PX,
+    STREAM_PATCH_PX,
     Numbers,
+    Points,
     SmallPicture,
     SmallPictures,
     StreamTracks,
+    followed,
     found_again,
 )
-from gsplat_core.geometry.tracks import Points, followed
 from gsplat_core.poses.bundle import Bundle, placed
 from gsplat_core.poses.bundle import adjust as adjusted
 from gsplat_core.poses.se3 import exp, inverse, log
@@ -77,7 +78,7 @@ def _of_eyes(frame: Frame, picture: SmallPicture, pixels: Points) -> NDArray[np.
     right = np.asarray(
         cv2.cvtColor(cv2.resize(frame.right_image, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
     )
-    there, misses_px = followed(picture.grey, right.astype(np.uint8), pixels, window_px=PATCH_PX, levels=LEVELS)
+    there, misses_px = followed(picture.grey, right.astype(np.uint8), pixels, window_px=STREAM_PATCH_PX, levels=LEVELS)
     disparity, off_row = (pixels - there).T.astype(np.float64)
     baseline = -float(frame.right_camera.world_to_camera[0, 3])
     good = (misses_px < RETURN_PX) & (np.abs(off_row) < ROWS_PX) & (disparity > LEAST_DISPARITY_PX)

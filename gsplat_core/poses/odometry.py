@@ -1,6 +1,6 @@
 """Visual odometry of a complete recording with bundle adjustment over key frames.
 
-Tissue corners are tracked (`reference_tracks`), excluding tools. The scene starts as a plane in front of a static camera. Each
+Tissue corners are tracked (`ReferenceTracks`), excluding tools. The scene starts as a plane in front of a static camera. Each
 frame's camera starts at the previous pose and is optimised until the points fit. Bundle adjustment over all key
 frames so far runs at the third key frame, whenever their number has grown by 30 %, and at the last frame. Small motions
 in front of a
@@ -31,8 +31,7 @@ from torch import Tensor
 
 from gsplat_core.endoscope.highlights import without_highlights
 from gsplat_core.errors import InvalidInput
-from gsplat_core.geometry.reference_tracks import MOST_REFERENCES, ReferenceTracks
-from gsplat_core.geometry.tracks import Observations
+from gsplat_core.geometry.tracks import MOST_REFERENCES, Observations, ReferenceTracks
 from gsplat_core.machine import one_thread, usable_cores
 from gsplat_core.poses.breathing import BreathingTrajectory, Sightings, breathing_trajectory
 from gsplat_core.poses.bundle import Bundle, adjust, errors_px

@@ -10,7 +10,7 @@ import torch
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.evaluation.geometry import evaluate_trajectory
-from gsplat_core.geometry.stream_tracks import SmallPictures, StreamTracks
+from gsplat_core.geometry.tracks import SmallPictures, StreamTracks
 from gsplat_core.io.recordings.synthetic.rendered import RenderedRecording, RenderSettings, render_recording
 from gsplat_core.io.recordings.synthetic.tissue import Tissue, Tug
 from gsplat_core.poses import live_odometry

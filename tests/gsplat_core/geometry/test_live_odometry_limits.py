@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsplat_core.geometry.stream_tracks import SmallPictures, StreamTracks
+from gsplat_core.geometry.tracks import SmallPictures, StreamTracks
 from gsplat_core.poses import live_odometry
 from gsplat_core.poses.live_odometry import LiveOdometry, LocalMap, seen_depth
 from gsplat_core.scene.cameras import Camera

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_core.geometry.stream_tracks import SmallPictures
+from gsplat_core.geometry.tracks import SmallPictures
 from gsplat_core.poses.live_odometry import CORRECTED_PX, MOST_LEFT, LiveOdometry, Recognised
 from gsplat_core.poses.se3 import inverse
 from gsplat_core.scene.cameras import Camera

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_core.geometry.stream_tracks import SmallPicture, SmallPictures, StreamTracks
+from gsplat_core.geometry.tracks import SmallPicture, SmallPictures, StreamTracks
 from gsplat_core.io.recordings.synthetic.rendered import RenderedRecording, RenderSettings, render_recording
 from gsplat_core.io.recordings.synthetic.scene import SyntheticScene
 from gsplat_core.io.recordings.synthetic.tissue import Tissue, Tug

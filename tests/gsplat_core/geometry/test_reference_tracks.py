@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from gsplat_core.geometry.reference_tracks import MOST_MISSES, ReferenceTracks, _Reference, _usable, local_contrast
-from gsplat_core.geometry.tracks import Observations
+from gsplat_core.geometry.tracks import MOST_MISSES, Observations, ReferenceTracks, _Reference, _usable, local_contrast
 from tests.gsplat_core.geometry.test_tracks import wide_texture
 
 HEIGHT, WIDTH = 150, 200

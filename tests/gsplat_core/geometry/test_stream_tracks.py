@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from gsplat_core.geometry import stream_tracks
-from gsplat_core.geometry.stream_tracks import (
-    MOST_POINTS,
+from gsplat_core.geometry import tracks
+from gsplat_core.geometry.tracks import (
     SIDE_PX,
+    STREAM_POINTS,
     SmallPicture,
     SmallPictures,
     StreamTracks,
@@ -41,7 +41,7 @@ def test_points_follow_a_shifted_picture_and_keep_their_numbers():
     pictures = SmallPictures(CAMERA)
     tracks = begun(pictures)
     start, numbers = tracks.pixels.copy(), tracks.numbers.copy()
-    assert 20 < len(numbers) <= MOST_POINTS
+    assert 20 < len(numbers) <= STREAM_POINTS
     for shift in (1, 2, 3):
         picture = pictures.of(frame(shift))
         tracks.go_on(picture, *tracks.follow(picture, tracks.pixels))
@@ -193,6 +193,6 @@ def test_a_new_scene_begins_without_points():
 def test_a_way_back_that_misses_by_half_a_pixel_is_not_trusted(monkeypatch, misses_px, is_trusted):
     picture = SmallPictures(WIDE).of(wide(1))
     points = np.array([[60, 60]], np.float32)
-    monkeypatch.setattr(stream_tracks, "followed", lambda *_, **__: (points + 1, np.array([misses_px])))
+    monkeypatch.setattr(tracks, "followed", lambda *_, **__: (points + 1, np.array([misses_px])))
     there, trusted = found_again(picture, picture, points, points)
     assert trusted.tolist() == [is_trusted] and there.tolist() == [[61, 61]]
