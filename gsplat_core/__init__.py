@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from gsplat_core.ops.tiles import isect_offset_encode, isect_tiles
     from gsplat_core.ops.unscented_projection import UnscentedTransformParameters, fully_fused_projection_with_ut
     from gsplat_core.ops.world_blending import rasterize_to_pixels_eval3d
-    from gsplat_core.poses.rolling_shutter import RollingShutterType
+    from gsplat_core.poses.se3 import RollingShutterType
     from gsplat_core.rendering.frame_renderer import FrameRenderer
     from gsplat_core.rendering.rasterization import RenderOutput, rasterization, render
     from gsplat_core.rendering.rasterizer import Rasterizer, rasterization_inria_wrapper
@@ -134,7 +134,7 @@ _HOME = {
     "ReconstructorConfig": "training.config",
     "RenderOutput": "rendering.rasterization",
     "Renderer": "rendering.renderer",
-    "RollingShutterType": "poses.rolling_shutter",
+    "RollingShutterType": "poses.se3",
     "SelectiveAdam": "training.steps.optimiser",
     "Snapshot": "models",
     "SnapshotSlots": "models",

@@ -19,8 +19,7 @@ from log import options, write
 from torch import Tensor
 
 from gsplat_core import RollingShutterType, fully_fused_projection, fully_fused_projection_with_ut, rasterization
-from gsplat_core.poses.rolling_shutter import Shutter
-from gsplat_core.poses.se3 import exp
+from gsplat_core.poses.se3 import Shutter, exp
 from gsplat_core.scene.distortion import Lens
 
 WIDTH, HEIGHT = 640, 512

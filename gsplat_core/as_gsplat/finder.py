@@ -35,7 +35,7 @@ _DISTRIBUTED = "gsplat_core.rendering.distributed"
 _CUDA = {
     "FThetaCameraDistortionParameters": "gsplat_core.scene.distortion",
     "FThetaPolynomialType": "gsplat_core.scene.distortion",
-    "RollingShutterType": "gsplat_core.poses.rolling_shutter",
+    "RollingShutterType": "gsplat_core.poses.se3",
     "UnscentedTransformParameters": "gsplat_core.ops.unscented_projection",
     "fully_fused_projection": "gsplat_core.ops.projection",
     "fully_fused_projection_2dgs": "gsplat_core.ops.surfel_projection",

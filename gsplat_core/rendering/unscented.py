@@ -16,7 +16,7 @@ from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.arguments import DenseProjection, require_shape
 from gsplat_core.ops.unscented_projection import UnscentedTransformParameters, fully_fused_projection_with_ut
 from gsplat_core.ops.world_blending import rasterize_to_pixels_eval3d
-from gsplat_core.poses.rolling_shutter import RollingShutterType, Shutter
+from gsplat_core.poses.se3 import RollingShutterType, Shutter
 from gsplat_core.rendering.settings import Arguments, RenderSettings
 from gsplat_core.scene.distortion import FThetaCameraDistortionParameters
 

@@ -26,7 +26,7 @@ from gsplat_core.ops.arguments import (
     require_shape,
 )
 from gsplat_core.ops.native import register_gradient
-from gsplat_core.poses.rolling_shutter import RollingShutterType, Shutter
+from gsplat_core.poses.se3 import RollingShutterType, Shutter
 from gsplat_core.scene.cameras import CAMERA_MODELS
 from gsplat_core.scene.distortion import FThetaCameraDistortionParameters, Lens
 

@@ -17,7 +17,7 @@ from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.arguments import require_kernels, require_same_kind, require_shape
 from gsplat_core.ops.native import register_gradient
 from gsplat_core.ops.unscented_projection import UnscentedTransformParameters, checked_camera, sigma_offsets
-from gsplat_core.poses.rolling_shutter import RollingShutterType, Shutter
+from gsplat_core.poses.se3 import RollingShutterType, Shutter
 from gsplat_core.scene.distortion import FThetaCameraDistortionParameters, Lens
 
 

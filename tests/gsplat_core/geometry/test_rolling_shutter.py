@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_core.poses.rolling_shutter import RollingShutterType, Shutter, rotated, rotation_vector
-from gsplat_core.poses.se3 import exp, inverse
+from gsplat_core.poses.se3 import RollingShutterType, Shutter, exp, inverse, rotated, rotation_vector
 
 KINDS = RollingShutterType
 

@@ -13,8 +13,7 @@ from gsplat_core.ops.unscented_projection import (
     camera_rows,
     fully_fused_projection_with_ut,
 )
-from gsplat_core.poses.rolling_shutter import RollingShutterType, Shutter
-from gsplat_core.poses.se3 import exp
+from gsplat_core.poses.se3 import RollingShutterType, Shutter, exp
 from gsplat_core.scene.distortion import Lens
 from tests.gsplat_core.ops.test_unscented_projection import DISTORTED, RADIAL, H, W, scene
 

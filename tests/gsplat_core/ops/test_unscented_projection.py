@@ -9,8 +9,7 @@ import torch
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.unscented_projection import UnscentedTransformParameters, fully_fused_projection_with_ut
-from gsplat_core.poses.rolling_shutter import RollingShutterType, Shutter, rotation_vector
-from gsplat_core.poses.se3 import exp
+from gsplat_core.poses.se3 import RollingShutterType, Shutter, exp, rotation_vector
 from gsplat_core.reference.projection import fully_fused_projection
 from gsplat_core.scene.distortion import Lens
 

@@ -12,8 +12,7 @@ from gsplat_core.ops.arguments import TileGrid
 from gsplat_core.ops.tiles import bin_splats
 from gsplat_core.ops.unscented_projection import fully_fused_projection_with_ut
 from gsplat_core.ops.world_blending import rasterize_to_pixels_eval3d
-from gsplat_core.poses.rolling_shutter import RollingShutterType
-from gsplat_core.poses.se3 import exp
+from gsplat_core.poses.se3 import RollingShutterType, exp
 from gsplat_core.reference.compositing import rasterize_to_pixels
 from tests.gsplat_core.ops.test_unscented_projection import DISTORTED, RADIAL, scene
 

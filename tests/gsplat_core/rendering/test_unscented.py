@@ -14,8 +14,7 @@ from gsplat_core import (
     reference,
 )
 from gsplat_core.errors import InvalidInput
-from gsplat_core.poses.rolling_shutter import Shutter
-from gsplat_core.poses.se3 import exp
+from gsplat_core.poses.se3 import Shutter, exp
 
 W, H = 48, 32
 FTHETA = FThetaCameraDistortionParameters(
