@@ -15,7 +15,7 @@ import pytest
 
 from gsplat_core.errors import RecordingError, UserError
 from gsplat_core.io.recordings import open_recording, validate_recording
-from gsplat_core.io.recordings.packets import whole_clusters
+from gsplat_core.io.recordings.decoder import whole_clusters
 from gsplat_core.io.sessions import SessionReader, SessionWriter
 from gsplat_core.scene.frames import FrameStatus
 from operators.applications.replay import ReplaySettings, followed_session

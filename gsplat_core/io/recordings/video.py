@@ -13,9 +13,18 @@ from typing import BinaryIO
 
 import av
 
-from gsplat_core.io.recordings.decoder import NO_PICTURE, PictureConverter, PictureDecoder, captured_log, frame_rate
+from gsplat_core.io.recordings.decoder import (
+    NO_PICTURE,
+    Container,
+    PictureConverter,
+    PictureDecoder,
+    UnusableContainer,
+    captured_log,
+    frame_rate,
+    is_shown,
+    recognise,
+)
 from gsplat_core.io.recordings.findings import Findings
-from gsplat_core.io.recordings.packets import Container, UnusableContainer, is_shown, recognise
 from gsplat_core.io.recordings.plain_files import DEPENDS, MAX_PIXELS, Picture, UnreadableFile, open_plain
 
 _NOT_SHOWN = -1

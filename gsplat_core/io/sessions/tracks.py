@@ -24,8 +24,7 @@ from av.video.reformatter import ColorRange, Colorspace
 from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.io.recordings.decoder import PictureDecoder, captured_log
-from gsplat_core.io.recordings.packets import Container, whole_clusters
+from gsplat_core.io.recordings.decoder import Container, PictureDecoder, captured_log, whole_clusters
 from gsplat_core.io.recordings.plain_files import MAX_PIXELS, UnreadableFile, open_plain
 from gsplat_core.io.recordings.video import open_container
 

@@ -10,7 +10,7 @@ import pytest
 
 from gsplat_core.errors import RecordingInvalid
 from gsplat_core.io.recordings import open_recording, validate_recording
-from gsplat_core.io.recordings.packets import whole_clusters
+from gsplat_core.io.recordings.decoder import whole_clusters
 from gsplat_core.io.sessions import SessionReader
 from gsplat_core.scene.frames import Frame
 from tests.gsplat_core.io.sessions.made import FRAMES, PER_SEGMENT, same_frame
