@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from gsplat_core.io.sessions.tracks import TrackWriter
+from gsplat_core.io.sessions.segments import TrackWriter
 from gsplat_core.training.metrics import psnr_tissue_db
 from operators.display import COVERED, RememberedTissue, marked
 from tests.operators.conftest import make_frame, make_rendered
