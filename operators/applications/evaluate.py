@@ -34,7 +34,7 @@ from gsplat_core.evaluation.protocols import (
 from gsplat_core.evaluation.scores import Record, Score
 from gsplat_core.evaluation.views import SecondEye, evaluate_second_eye
 from gsplat_core.io.recordings.calibration import read_poses
-from gsplat_core.io.recordings.findings import Findings
+from gsplat_core.io.recordings.plain_files import Findings
 from gsplat_core.io.recordings.truth import GroundTruth, open_truth
 from gsplat_core.models import Model
 from gsplat_core.rendering.renderer import check_renderer

@@ -13,7 +13,7 @@ import numpy as np
 from gsplat_core.choices import Eyes
 from gsplat_core.errors import InvalidSetting, RecordingInvalid
 from gsplat_core.io.recordings.calibration import POSES_FILE, read_poses
-from gsplat_core.io.recordings.findings import Findings
+from gsplat_core.io.recordings.plain_files import Findings
 from gsplat_core.io.sessions import SessionReader, is_session
 from gsplat_core.models import Model
 from gsplat_core.scene.cameras import Camera

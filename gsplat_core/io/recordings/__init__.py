@@ -1,6 +1,6 @@
 """Recordings of endoscopic video: open, validate, synthesize."""
 
-from gsplat_core.io.recordings.findings import Finding, ValidationReport
+from gsplat_core.io.recordings.plain_files import Finding, ValidationReport
 from gsplat_core.io.recordings.recording import FileRecording, Recording, is_heldout, open_recording, validate_recording
 from gsplat_core.io.recordings.synthetic.synthesize import synthesize
 

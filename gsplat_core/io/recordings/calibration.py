@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 from gsplat_core.depth.rectification import Rectification, StereoCalibration
 from gsplat_core.errors import InvalidInput
 from gsplat_core.io.files import PartialFile
-from gsplat_core.io.recordings.findings import Findings
 from gsplat_core.io.recordings.plain_files import (
     MAX_PIXELS,
     ArrayHeader,
+    Findings,
     UnreadableFile,
     open_plain,
     read_array,

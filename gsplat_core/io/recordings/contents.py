@@ -23,9 +23,8 @@ from numpy.typing import NDArray
 from gsplat_core.depth.rectification import Rectification, Undistortion
 from gsplat_core.errors import RecordingInvalid
 from gsplat_core.io.recordings.calibration import Calibration
-from gsplat_core.io.recordings.findings import Findings, printable
 from gsplat_core.io.recordings.frame_files import DepthFiles, LabelFiles, MaskFiles, ScanFiles
-from gsplat_core.io.recordings.plain_files import Picture, UnreadableFile, open_plain
+from gsplat_core.io.recordings.plain_files import Findings, Picture, UnreadableFile, open_plain, printable
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame, FrameStatus
 from gsplat_core.scene.range_sensors import RangeScan

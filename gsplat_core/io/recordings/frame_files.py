@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from gsplat_core.choices import SENSORS
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings.calibration import number, read_json
-from gsplat_core.io.recordings.findings import Findings
 from gsplat_core.io.recordings.plain_files import (
     MAX_PIXELS,
     ArrayHeader,
+    Findings,
     Picture,
     UnreadableFile,
     UnreadableImage,

@@ -40,9 +40,9 @@ from gsplat_core.io.recordings.calibration import (
     rectified_by_file,
 )
 from gsplat_core.io.recordings.contents import Contents, FrameImages
-from gsplat_core.io.recordings.findings import Findings
 from gsplat_core.io.recordings.frame_files import ImageFiles, check_sizes
 from gsplat_core.io.recordings.plain_files import (
+    Findings,
     UnreadableFile,
     all_stay_inside,
     check_plain,

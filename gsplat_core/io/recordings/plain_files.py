@@ -1,7 +1,9 @@
-"""Bounded reading of a recording's files: regular files inside its folder, `.npy` arrays and still images.
+"""Files of a recording: bounded reading of regular files inside its folder, and the problems found in them.
 
-The header is checked first, then the size of the file, then the content. libjpeg repairs damage while decoding and only
-warns. Its warnings are therefore reported as damage.
+`.npy` arrays and still images are read. The header is checked first, then the size of the file, then the content. libjpeg
+repairs damage while decoding and only warns. Its warnings are therefore reported as damage.
+
+`open_recording` raises the first problem, and `validate_recording` lists all of them (`Findings`).
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ import warnings
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from tokenize import TokenError
 from typing import BinaryIO
@@ -26,8 +28,81 @@ import simplejpeg
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
+from gsplat_core.errors import RecordingInvalid, RecordingMissing
 from gsplat_core.io.files import open_regular
-from gsplat_core.io.recordings.findings import Findings
+
+
+def printable(name: Path | str) -> str:
+    """Return a name encodable as UTF-8; undecodable bytes become question marks."""
+    return str(name).encode("utf-8", "replace").decode("utf-8")
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Problem or warning about one file."""
+
+    file: str
+    message: str
+    """Description of the defect with the observed value."""
+    advice: str
+    """Remedy for the defect, addressed to the user."""
+    missing: bool = False
+    """True if the file does not exist (RecordingMissing), False if it is wrong (RecordingInvalid)."""
+
+    def __str__(self) -> str:
+        return f"{self.file}: {self.message}. {self.advice}."
+
+
+@dataclass
+class Findings:
+    """Collector of problems and warnings; with `strict`, the first problem is raised.
+
+    Checks are written independently of `strict`.
+    """
+
+    strict: bool = False
+    problems: list[Finding] = field(default_factory=list)
+    warnings: list[Finding] = field(default_factory=list)
+
+    def problem(self, file: Path | str, message: str, advice: str, *, missing: bool = False) -> None:
+        """Record a defect that makes the recording unusable."""
+        self._add_problem(Finding(printable(file), printable(message), advice, missing))
+
+    def warn(self, file: Path | str, message: str, advice: str) -> None:
+        """Record a fallback or an oddity that does not prevent reading."""
+        self.warnings.append(Finding(printable(file), printable(message), advice))
+
+    def add(self, others: Findings) -> None:
+        """Append the findings of another collector in order; a strict collector raises the first problem."""
+        self.warnings.extend(others.warnings)
+        for finding in others.problems:
+            self._add_problem(finding)
+
+    def taken(self) -> Findings:
+        """Move all findings into a new collector, leaving this one empty."""
+        found = Findings(problems=self.problems, warnings=self.warnings)
+        self.problems, self.warnings = [], []
+        return found
+
+    def _add_problem(self, finding: Finding) -> None:
+        self.problems.append(finding)
+        if self.strict:
+            raise (RecordingMissing if finding.missing else RecordingInvalid)(str(finding))
+
+
+@dataclass(frozen=True)
+class ValidationReport:
+    """Result of `validate_recording`."""
+
+    facts: dict[str, object]
+    """JSON-serialisable facts: frames, size, fps, available sidecars, source of the calibration, …"""
+    problems: list[Finding]
+    warnings: list[Finding]
+
+    @property
+    def ok(self) -> bool:
+        """True if the recording can be read from the first frame to the last."""
+        return not self.problems
 
 
 class UnreadableFile(Exception):

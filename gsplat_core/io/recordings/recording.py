@@ -18,10 +18,16 @@ import numpy as np
 
 from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.io.recordings.contents import Contents
-from gsplat_core.io.recordings.findings import Findings, ValidationReport, printable
 from gsplat_core.io.recordings.frame_files import resized_frame
 from gsplat_core.io.recordings.layouts import inspect
-from gsplat_core.io.recordings.plain_files import DEPENDS, MAX_PIXELS, DamagedFrames
+from gsplat_core.io.recordings.plain_files import (
+    DEPENDS,
+    MAX_PIXELS,
+    DamagedFrames,
+    Findings,
+    ValidationReport,
+    printable,
+)
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame, FrameStatus
 

@@ -26,7 +26,6 @@ from gsplat_core.io.recordings.calibration import (
     read_poses_bounds,
 )
 from gsplat_core.io.recordings.contents import FrameImages
-from gsplat_core.io.recordings.findings import Findings
 from gsplat_core.io.recordings.frame_files import (
     SENSOR_FILE,
     DepthFiles,
@@ -41,6 +40,7 @@ from gsplat_core.io.recordings.frame_files import (
 )
 from gsplat_core.io.recordings.plain_files import (
     IMAGE_SUFFIXES,
+    Findings,
     UnreadableFile,
     all_stay_inside,
     decode_plane,

@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 
 from gsplat_core.errors import RecordingInvalid
 from gsplat_core.io.recordings.calibration import number, read_json, read_pinhole
-from gsplat_core.io.recordings.findings import Findings
 from gsplat_core.io.recordings.frame_files import (
     DepthFiles,
     ImageFiles,
@@ -36,6 +35,7 @@ from gsplat_core.io.recordings.frame_files import (
 from gsplat_core.io.recordings.plain_files import (
     MAX_PIXELS,
     ArrayHeader,
+    Findings,
     UnreadableFile,
     all_stay_inside,
     decode_picture,

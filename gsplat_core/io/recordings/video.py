@@ -24,8 +24,7 @@ from gsplat_core.io.recordings.decoder import (
     is_shown,
     recognise,
 )
-from gsplat_core.io.recordings.findings import Findings
-from gsplat_core.io.recordings.plain_files import DEPENDS, MAX_PIXELS, Picture, UnreadableFile, open_plain
+from gsplat_core.io.recordings.plain_files import DEPENDS, MAX_PIXELS, Findings, Picture, UnreadableFile, open_plain
 
 _NOT_SHOWN = -1
 _MAX_LOST = 10_000

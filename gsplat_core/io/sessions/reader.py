@@ -21,7 +21,7 @@ from gsplat_core.io.frame_codec import camera_of, frame_from
 from gsplat_core.io.recordings.calibration import Calibration, default_calibration
 from gsplat_core.io.recordings.contents import digest_of
 from gsplat_core.io.recordings.decoder import NO_PICTURE
-from gsplat_core.io.recordings.findings import Findings, printable
+from gsplat_core.io.recordings.plain_files import Findings, printable
 from gsplat_core.io.sessions.records import (
     COPY_AGAIN,
     SCHEDULE_LINES,

@@ -29,8 +29,7 @@ from gsplat_core.io.frame_codec import (
     Text,
     camera_of,
 )
-from gsplat_core.io.recordings.findings import printable
-from gsplat_core.io.recordings.plain_files import UnreadableFile, open_plain
+from gsplat_core.io.recordings.plain_files import UnreadableFile, open_plain, printable
 
 Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 TrackName = Literal["image", "right_image", "mask", "loss_mask", "depth", "depth_confidence", "shown"]

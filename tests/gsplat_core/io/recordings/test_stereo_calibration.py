@@ -9,7 +9,7 @@ import pytest
 
 from gsplat_core.errors import RecordingInvalid
 from gsplat_core.io.recordings.calibration import read_stereo_calibration
-from gsplat_core.io.recordings.findings import Findings
+from gsplat_core.io.recordings.plain_files import Findings
 
 K1 = [[300.0, 0.0, 150.0], [0.0, 302.0, 130.0], [0.0, 0.0, 1.0]]
 K2 = [[305.0, 0.0, 170.0], [0.0, 304.0, 126.0], [0.0, 0.0, 1.0]]
