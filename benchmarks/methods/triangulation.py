@@ -19,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 
 from gsplat_core import Camera
-from gsplat_core.io.recordings.synthetic.light import Lamp
+from gsplat_core.io.recordings.synthetic.optics import Lamp
 from gsplat_core.io.recordings.synthetic.renderer import render_eye
 from gsplat_core.io.recordings.synthetic.scene import SyntheticScene
 from gsplat_core.io.recordings.synthetic.tissue import NO_TUG

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.io.recordings.synthetic.light import LampPlan
-from gsplat_core.io.recordings.synthetic.sensor import Exposure, Field, Sensor
+from gsplat_core.io.recordings.synthetic.optics import Exposure, Field, LampPlan, Sensor
 from gsplat_core.io.recordings.synthetic.tissue import (
     PULSE_PERIOD_S,
     TISSUE_DISTANCE_MM,

@@ -12,8 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.io.recordings.synthetic.light import Air, Lamp
-from gsplat_core.io.recordings.synthetic.sensor import RadialLens, develop
+from gsplat_core.io.recordings.synthetic.optics import Air, Lamp, RadialLens, develop
 from gsplat_core.io.recordings.synthetic.tissue import SurfacePoints, Tissue, Tug
 from gsplat_core.io.recordings.synthetic.tool import RING, SHAFT, USUAL_PLAN, Part, ToolLook, distance, trace
 from gsplat_core.scene.cameras import Camera

@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.io.recordings.synthetic.light import USUAL_LAMP, Air, Lamp, Particles
+from gsplat_core.io.recordings.synthetic.optics import USUAL_LAMP, Air, Lamp, Particles, RadialLens
 from gsplat_core.io.recordings.synthetic.random_scene import USUAL_SWAY, RandomScene, Sway, looking, rigid
 from gsplat_core.io.recordings.synthetic.renderer import Eye, render_eye
-from gsplat_core.io.recordings.synthetic.sensor import RadialLens
 from gsplat_core.io.recordings.synthetic.tissue import NO_TUG, TISSUE_DISTANCE_MM, Colon, Tissue, Tug
 from gsplat_core.io.recordings.synthetic.tool import CYCLE_S, USUAL_PLAN, Part, ToolLook, ToolMotion
 from gsplat_core.scene.cameras import Camera

@@ -39,10 +39,10 @@ from numpy.typing import NDArray
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.files import PartialFolder, read_regular
 from gsplat_core.io.recordings.sidecars import RECORDING_FORMAT, RECORDING_VERSION
+from gsplat_core.io.recordings.synthetic.optics import RadialLens
 from gsplat_core.io.recordings.synthetic.random_scene import RandomScene
 from gsplat_core.io.recordings.synthetic.renderer import Eye
 from gsplat_core.io.recordings.synthetic.scene import CLEAR, Extras, SyntheticScene
-from gsplat_core.io.recordings.synthetic.sensor import RadialLens
 from gsplat_core.io.recordings.synthetic.tissue import TISSUE_DISTANCE_MM
 from gsplat_core.io.recordings.truth import VIEWS_FILE, VIEWS_FORMAT, VIEWS_VERSION
 from gsplat_core.machine import available_bytes, in_gib

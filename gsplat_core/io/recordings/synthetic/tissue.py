@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.io.recordings.calibration import DEFAULT_FOCAL_FACTOR
-from gsplat_core.io.recordings.synthetic.light import REFERENCE_MM
+from gsplat_core.io.recordings.synthetic.optics import REFERENCE_MM
 
 PERIOD_S = 3.4
 """Mean period of a breath, in seconds."""

@@ -12,9 +12,9 @@ import pytest
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings import open_recording, synthesize, validate_recording
+from gsplat_core.io.recordings.synthetic.optics import Field, RadialLens
 from gsplat_core.io.recordings.synthetic.random_scene import draw_scene
 from gsplat_core.io.recordings.synthetic.scene import Extras, SyntheticScene
-from gsplat_core.io.recordings.synthetic.sensor import Field, RadialLens
 from gsplat_core.io.recordings.synthetic.synthesize import projected
 
 SMALL = {"frames": 2, "width_px": 48, "height_px": 40, "fps": 2}

@@ -11,7 +11,7 @@ import pytest
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings import open_recording, synthesize, validate_recording
-from gsplat_core.io.recordings.synthetic.light import EXPOSURE_STOPS, Lamp
+from gsplat_core.io.recordings.synthetic.optics import EXPOSURE_STOPS, Lamp
 from gsplat_core.io.recordings.synthetic.renderer import cast_tissue, pixel_rays
 from gsplat_core.io.recordings.synthetic.scene import Extras, SyntheticScene, View
 from gsplat_core.io.recordings.synthetic.synthesize import motion_to, projected, seen_points
