@@ -8,7 +8,7 @@ import runpy
 import sys
 from pathlib import Path
 
-from gsplat_core.as_gsplat.finder import CONSTANTS, install_for_spawned_processes
+from gsplat_core.as_gsplat import CONSTANTS, install_for_spawned_processes
 
 
 def main() -> None:

@@ -14,9 +14,10 @@ import pytest
 import torch
 
 import gsplat_core
+from gsplat_core import as_gsplat
 from gsplat_core.as_gsplat import __main__ as run
-from gsplat_core.as_gsplat import finder, install
 from gsplat_core.as_gsplat import functions as utils
+from gsplat_core.as_gsplat import install
 from gsplat_core.rendering.depth_maps import depth_to_normal, depth_to_points
 
 PROGRAM = """
@@ -44,8 +45,8 @@ def installed(request):
     before = dict(sys.modules)
     install(getattr(request, "param", "1.6"))
     yield
-    sys.meta_path[:] = [each for each in sys.meta_path if not isinstance(each, finder.Finder)]
-    for name in finder.MODULES:
+    sys.meta_path[:] = [each for each in sys.meta_path if not isinstance(each, as_gsplat.Finder)]
+    for name in as_gsplat.MODULES:
         sys.modules.pop(name, None)
         if name in before:
             sys.modules[name] = before[name]
@@ -107,17 +108,17 @@ def test_processes_that_a_program_spawns_have_the_modules_too(tmp_path, constant
 
 @pytest.mark.parametrize("constants", ["1.6", "1.5.3"])
 def test_a_module_on_the_path_gives_way_to_that_of_the_hook(monkeypatch, constants):
-    monkeypatch.setattr(sys, "meta_path", [each for each in sys.meta_path if not isinstance(each, finder.Finder)])
+    monkeypatch.setattr(sys, "meta_path", [each for each in sys.meta_path if not isinstance(each, as_gsplat.Finder)])
     monkeypatch.setenv("INTRASPLAT_GSPLAT_CONSTANTS", constants)
-    monkeypatch.syspath_prepend(finder.PATH_ENTRY)
-    for name in finder.MODULES:
+    monkeypatch.syspath_prepend(as_gsplat.PATH_ENTRY)
+    for name in as_gsplat.MODULES:
         monkeypatch.delitem(sys.modules, name, raising=False)
     try:
         module = importlib.import_module("gsplat")
-        assert isinstance(module, finder.AliasModule) and module.__spec__.loader.constants == constants
+        assert isinstance(module, as_gsplat.AliasModule) and module.__spec__.loader.constants == constants
         assert importlib.import_module("fused_ssim").fused_ssim is gsplat_core.fused_ssim
     finally:
-        for name in finder.MODULES:
+        for name in as_gsplat.MODULES:
             sys.modules.pop(name, None)
 
 
@@ -142,7 +143,7 @@ def test_a_program_that_is_not_there_is_a_wrong_argument(tmp_path, monkeypatch, 
 
 
 def test_every_name_exists(installed):
-    for module_name, homes in finder.MODULES.items():
+    for module_name, homes in as_gsplat.MODULES.items():
         module = importlib.import_module(module_name)
         for name in homes:
             assert getattr(module, name) is not None, (module_name, name)
@@ -151,7 +152,7 @@ def test_every_name_exists(installed):
 
 def test_names_are_those_of_the_package_itself(installed):
     module = importlib.import_module("gsplat")
-    for name in finder.MODULES["gsplat"]:
+    for name in as_gsplat.MODULES["gsplat"]:
         if name in gsplat_core.__all__:
             assert getattr(module, name) is getattr(gsplat_core, name)
 

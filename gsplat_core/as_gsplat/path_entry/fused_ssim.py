@@ -1,5 +1,5 @@
 """Module `fused_ssim` of a spawned process, which gives way to that of the import hook."""
 
-from gsplat_core.as_gsplat.finder import take_over
+from gsplat_core.as_gsplat import take_over
 
 take_over("fused_ssim")
