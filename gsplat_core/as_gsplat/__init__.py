@@ -29,13 +29,13 @@ VERSION = "1.5.3"
 """Version of gsplat whose names and signatures the modules have."""
 
 _FUNCTIONS = "gsplat_core.as_gsplat.functions"
-_PLAIN = "gsplat_core.reference.gsplat_names"
+_PLAIN = "gsplat_core.reference.rendering"
+_OPERATIONS = "gsplat_core.training.strategies.strategy"
 _STRATEGIES = {
     "DefaultStrategy": "gsplat_core.training.strategies.adc",
     "MCMCStrategy": "gsplat_core.training.strategies.mcmc",
-    "Strategy": "gsplat_core.training.strategies.strategy",
+    "Strategy": _OPERATIONS,
 }
-_OPERATIONS = "gsplat_core.training.strategies.operations"
 _DYNAMIC = "gsplat_core.contrib.dynamic"
 _SURGICAL = "gsplat_core.contrib.surgical"
 _TRAINER = "gsplat_core.contrib.trainer"
@@ -171,7 +171,7 @@ MODULES: Mapping[str, Mapping[str, str]] = {
     "gsplat.optimizers": {"SelectiveAdam": "gsplat_core.training.steps.optimiser"},
     "gsplat.optimizers.selective_adam": {"SelectiveAdam": "gsplat_core.training.steps.optimiser"},
     "gsplat.regularizers": {"compute_tv_loss_targeted": _SURGICAL},
-    "gsplat.relocation": {"compute_relocation": "gsplat_core.training.strategies.operations"},
+    "gsplat.relocation": {"compute_relocation": _OPERATIONS},
     "gsplat.rendering": {
         **_RENDERING,
         **_CUDA,

@@ -15,7 +15,7 @@ from gsplat_core.io.exports.export import export_splats
 from gsplat_core.io.ply import load_ply
 from gsplat_core.ops.arguments import require_trailing
 from gsplat_core.scene.gaussians import SH_C0
-from gsplat_core.training.strategies.operations import draw
+from gsplat_core.training.strategies.strategy import draw
 
 
 def normalized_quat_to_rotmat(quat: Tensor) -> Tensor:

@@ -21,10 +21,10 @@ from gsplat_core.reference.projection import (
     isect_offset_encode,
     isect_tiles,
     quat_scale_to_covar_preci,
+    spherical_harmonics,
 )
 from gsplat_core.reference.ray_blending import blend_rays, range_histogram, ray_depth_loss, ray_normal_loss, splat_rays
 from gsplat_core.reference.rendering import rasterization, render_frame
-from gsplat_core.reference.spherical_harmonics import spherical_harmonics
 from gsplat_core.reference.splat_regression import splat_regression, splat_regression_gradients
 from gsplat_core.reference.stereo import fit_disparities, match_disparities, smooth_within_edges
 from gsplat_core.reference.stochastic import point_moments, sample_moments

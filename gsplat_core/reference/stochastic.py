@@ -15,8 +15,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.ops.arguments import ALPHA_CUTOFF
-from gsplat_core.reference.projection import fully_fused_projection
-from gsplat_core.reference.spherical_harmonics import spherical_harmonics
+from gsplat_core.reference.projection import fully_fused_projection, spherical_harmonics
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from gsplat_core.ops.densification import accumulate_gradient_norms_
-from gsplat_core.training.strategies.operations import duplicate, remove, reset_opa, split
 from gsplat_core.training.strategies.strategy import (
     GEOMETRY,
     InvalidParameters,
@@ -19,7 +18,11 @@ from gsplat_core.training.strategies.strategy import (
     Strategy,
     StrategyKind,
     change_rows,
+    duplicate,
     every_of,
+    remove,
+    reset_opa,
+    split,
     views_of,
 )
 

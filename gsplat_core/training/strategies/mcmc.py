@@ -18,7 +18,6 @@ from torch import Tensor
 from gsplat_core.regression import probabilities
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.steps.step import TrainingStep
-from gsplat_core.training.strategies.operations import binomials, inject_noise_to_position, relocate, sample_add
 from gsplat_core.training.strategies.strategy import (
     GEOMETRY,
     Optimizers,
@@ -26,8 +25,12 @@ from gsplat_core.training.strategies.strategy import (
     Plan,
     Strategy,
     StrategyKind,
+    binomials,
     change_rows,
     every_of,
+    inject_noise_to_position,
+    relocate,
+    sample_add,
     views_of,
 )
 from gsplat_core.training.strategies.streaming import UNSEEN_PX, Rounds, Shares, halves

@@ -1,4 +1,5 @@
-"""Base of the strategies that change the number of Gaussians during training, in gsplat's calling convention.
+"""Base of the strategies that change the number of Gaussians during training, and their row operations, in gsplat's calling
+convention.
 
 A strategy works on a user's own training loop. The Gaussians are tensors of one row each in a dict `params`: `means` [N, 3],
 `quats` [N, 4] wxyz, `scales` [N, 3] as logarithms, `opacities` [N] or [N, 1] as logits, and any further ones. `optimizers`
@@ -17,12 +18,18 @@ holds one optimiser with one parameter group for each trainable tensor, under th
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
 
+Row operations add, remove or change Gaussians together with the state of their optimisers. They change `params`, the optimisers
+and `state` in place. Tensors in `state` have a row for each Gaussian; numbers and tensors without dimensions are left alone. Random
+numbers come from torch's default generator of the device, or from `generator`, so a seed gives the same Gaussians.
+
 `StrategyKind` and its adapter run such a strategy on a scene that deforms, in offline reconstructions.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, MutableMapping, Sequence
+import functools
+import math
+from collections.abc import Callable, Iterable, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
@@ -32,11 +39,13 @@ from torch import Tensor
 from torch.nn import Parameter, ParameterDict
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.scene.gaussians import Gaussians
+from gsplat_core.ops.densification import diffuse_positions_
+from gsplat_core.scene.gaussians import Gaussians, rotations
 
 if TYPE_CHECKING:
     from gsplat_core.training.observations import Observation
     from gsplat_core.training.steps.step import TrainingStep
+
 
 Params = MutableMapping[str, Parameter] | ParameterDict
 """Tensors of the Gaussians by name; strategies replace entries."""
@@ -90,6 +99,369 @@ class Strategy:
 
 GEOMETRY = ("means", "scales", "quats", "opacities")
 """Names of the tensors that strategies require: position, size, rotation and opacity."""
+
+
+MOST_COPIES = 51
+"""Largest number of copies in the table of `binomials`."""
+ROWS_AT_ONCE = 1 << 16
+"""Gaussians whose sums are computed together, with three temporary values of 8 bytes per Gaussian and coefficient."""
+
+
+def binomials() -> Tensor:
+    """Return binomial coefficients C(n, k) for n, k < `MOST_COPIES` as a float32 matrix; 0 for k > n."""
+    return torch.tensor([[float(math.comb(n, k)) for k in range(MOST_COPIES)] for n in range(MOST_COPIES)])
+
+
+@functools.cache
+def _factors(count: int, device: torch.device) -> Tensor:
+    """Return C(n + 1, k + 1) (-1)^k / √(k + 1) for n, k < `count`, float64 [count, count]."""
+    rows = [[(-1) ** k * math.comb(n + 1, k + 1) / math.sqrt(k + 1) for k in range(count)] for n in range(count)]
+    return torch.tensor(rows, dtype=torch.float64, device=device)
+
+
+@torch.no_grad()
+def compute_relocation(opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor) -> tuple[Tensor, Tensor]:
+    """Compute the opacity and the scales of each of n copies at the place of a Gaussian.
+
+    The copies have o' = 1 - (1 - o)^(1/n), so that n of them absorb as much light as the Gaussian. The scales
+    s' = s o / Σ_{i=1..n} Σ_{k<i} C(i-1, k) (-1)^k o'^(k+1) / √(k+1) keep the integral of the blended opacity. The terms alternate
+    and cancel, so they are summed in float64. The sum over i of C(i-1, k) is C(n, k+1).
+
+    Args:
+        opacities: [N] or [N, 1], 0..1.
+        scales: standard deviations [N, 3].
+        ratios: number n of copies, integers [N]; values outside 1 to n_max are clamped.
+        binoms: C(n, k) for n, k < n_max, [n_max, n_max], see `binomials`. Only n_max counts: exact coefficients are used.
+
+    Returns:
+        Opacities in the shape of `opacities`, and scales [N, 3].
+
+    Raises:
+        InvalidInput: for tensors of other shapes.
+    """
+    n = opacities.shape[0]
+    square = binoms.dim() == 2 and binoms.shape[0] == binoms.shape[1] > 0
+    if opacities.numel() != n or scales.shape != (n, 3) or ratios.shape != (n,) or not square:
+        raise InvalidInput(
+            "compute_relocation takes opacities [N], scales [N, 3], ratios [N] and binoms [M, M], got"
+            f" {list(opacities.shape)}, {list(scales.shape)}, {list(ratios.shape)} and {list(binoms.shape)}"
+        )
+    before = opacities.reshape(-1).double()
+    copies = ratios.long().clamp(1, len(binoms))
+    after = -torch.expm1(torch.log1p(-before) / copies)
+    factors = _factors(len(binoms), before.device)
+    # In parts, because a part has a value per row and coefficient.
+    parts = zip(after.split(ROWS_AT_ONCE), copies.split(ROWS_AT_ONCE), strict=True)
+    sums = [(factors[n - 1] * a[:, None].expand(-1, len(binoms)).cumprod(1)).sum(1) for a, n in parts]
+    total = torch.cat(sums)
+    # An invisible Gaussian keeps its size: the quotient's limit for o = 0 is 1.
+    ratio = torch.where(before > 0, before / torch.where(before > 0, total, 1.0), 1.0)
+    return after.to(opacities.dtype).reshape(opacities.shape), (ratio[:, None] * scales.double()).to(scales.dtype)
+
+
+State = MutableMapping[str, Any]
+"""Statistics of a strategy by name."""
+SHRINK = 1.6
+"""Factor by which the samples of a split Gaussian shrink (Kerbl et al. 2023, section 5.2)."""
+LARGEST_MULTINOMIAL = 1 << 24
+"""Largest number of categories of `torch.multinomial`."""
+
+
+@torch.no_grad()
+def update_rows(
+    param_fn: Callable[[str, Tensor], Tensor],
+    optimizer_fn: Callable[[str, Tensor], Tensor],
+    params: Params,
+    optimizers: Optimizers,
+    names: Iterable[str] | None = None,
+) -> None:
+    """Replace parameters, and move the state of their optimisers to the new ones.
+
+    Args:
+        param_fn: returns the new parameter for a name and the old parameter.
+        optimizer_fn: returns the new value for the name and the value of an entry of the optimiser's state. `step` and tensors
+            without dimensions stay.
+        params: tensors of the Gaussians.
+        optimizers: optimisers by the same names.
+        names: parameters to replace; None for all.
+
+    Raises:
+        InvalidParameters: if a trainable parameter has no optimiser.
+    """
+    for name in list(params.keys() if names is None else names):
+        old = params[name]
+        new = params[name] = param_fn(name, old)  # type: ignore[assignment]
+        if name not in optimizers:
+            if old.requires_grad:
+                raise InvalidParameters(f"{name} is trainable but has no optimizer; give it one, or freeze it")
+            continue
+        optimizer = optimizers[name]
+        moments = optimizer.state.pop(old, {})
+        for group in optimizer.param_groups:
+            group["params"] = [new]
+        if moments:
+            kept = {
+                key: optimizer_fn(key, value) if key != "step" and _has_rows(value) else value
+                for key, value in moments.items()
+            }
+            optimizer.state[new] = kept
+
+
+@torch.no_grad()
+def duplicate(params: Params, optimizers: Optimizers, state: State, mask: Tensor) -> None:
+    """Append a copy of each Gaussian in `mask`, bool [N]. Copies start with zero moments."""
+    chosen, _ = _divided(params, mask)
+    _append(params, optimizers, chosen, lambda name, tensor: tensor[chosen])
+    for name, rows in _rows_of(state):
+        state[name] = torch.cat([rows, rows[chosen]])
+
+
+@torch.no_grad()
+def split(
+    params: Params,
+    optimizers: Optimizers,
+    state: State,
+    mask: Tensor,
+    revised_opacity: bool = False,
+    *,
+    generator: torch.Generator | None = None,
+) -> None:
+    """Replace each Gaussian in `mask`, bool [N], by two smaller ones drawn from it (Kerbl et al. 2023, section 5.2).
+
+    The others come first, then the first samples, then the second ones. Samples start with zero moments.
+
+    Args:
+        params: tensors of the Gaussians.
+        optimizers: optimisers by the same names.
+        state: statistics; samples inherit those of their Gaussian.
+        mask: Gaussians to split.
+        revised_opacity: give the samples the opacity 1 - √(1 - o), which keeps the picture (Rota Bulò et al. 2024).
+        generator: source of the random numbers, on the device of `mask`.
+    """
+    chosen, rest = _divided(params, mask)
+    scales = params["scales"][chosen].exp()
+    noise = torch.randn(2, len(chosen), 3, device=mask.device, dtype=scales.dtype, generator=generator)
+    axes = rotations(params["quats"][chosen])
+    offsets = torch.einsum("nij,nj,bnj->bni", axes, scales, noise)
+
+    def samples(name: str, tensor: Tensor) -> Tensor:
+        parents = tensor[chosen]
+        if name == "means":
+            return (parents + offsets).reshape(-1, 3)
+        if name == "scales":
+            parents = (scales / SHRINK).log()
+        elif name == "opacities" and revised_opacity:
+            parents = torch.logit(1 - (1 - parents.sigmoid()).sqrt())
+        return torch.cat([parents, parents])
+
+    def moments(_: str, values: Tensor) -> Tensor:
+        return torch.cat([values[rest], values.new_zeros(2 * len(chosen), *values.shape[1:])])
+
+    update_rows(
+        lambda name, tensor: Parameter(torch.cat([tensor[rest], samples(name, tensor)]), tensor.requires_grad),
+        moments, params, optimizers,
+    )  # fmt: skip
+    for name, rows in _rows_of(state):
+        state[name] = torch.cat([rows[rest], rows[chosen], rows[chosen]])
+
+
+@torch.no_grad()
+def remove(params: Params, optimizers: Optimizers, state: State, mask: Tensor) -> None:
+    """Remove the Gaussians in `mask`, bool [N]; the others keep their order and moments."""
+    _, rest = _divided(params, mask)
+    update_rows(
+        lambda _, tensor: Parameter(tensor[rest], tensor.requires_grad),
+        lambda _, values: values[rest],
+        params,
+        optimizers,
+    )
+    for name, rows in _rows_of(state):
+        state[name] = rows[rest]
+
+
+@torch.no_grad()
+def reset_opa(params: Params, optimizers: Optimizers, state: State, value: float) -> None:
+    """Reduce opacities above `value` (0 to 1) to it, and reset the moments of all opacities."""
+    most = torch.logit(torch.tensor(value)).item()
+    update_rows(
+        lambda _, tensor: Parameter(tensor.clamp(max=most), tensor.requires_grad),
+        lambda _, values: torch.zeros_like(values),
+        params,
+        optimizers,
+        ["opacities"],
+    )
+
+
+@torch.no_grad()
+def relocate(
+    params: Params,
+    optimizers: Optimizers,
+    state: State,
+    mask: Tensor,
+    binoms: Tensor,
+    min_opacity: float = 0.005,
+    *,
+    generator: torch.Generator | None = None,
+) -> None:
+    """Move the Gaussians in `mask`, bool [N], to places of others, drawn in proportion to their opacity.
+
+    The copies at one place share its opacity by `compute_relocation`. Moments and statistics of the chosen places are reset.
+
+    Args:
+        params: tensors of the Gaussians.
+        optimizers: optimisers by the same names.
+        state: statistics.
+        mask: Gaussians to move, the dead ones.
+        binoms: see `compute_relocation`.
+        min_opacity: smallest opacity after the move.
+        generator: source of the random numbers, on the device of `mask`.
+    """
+    dead, alive = _divided(params, mask)
+    weights = params["opacities"][alive].sigmoid().flatten()
+    places = alive[draw(weights, len(dead), generator)]
+    shared = _shared(params, places, binoms, min_opacity)
+
+    def moved(name: str, tensor: Tensor) -> Tensor:
+        if name in shared:
+            tensor[places] = shared[name].to(tensor.dtype)
+        tensor[dead] = tensor[places]
+        return Parameter(tensor, tensor.requires_grad)
+
+    update_rows(moved, lambda _, values: values.index_fill_(0, places, 0), params, optimizers)
+    for _, rows in _rows_of(state):
+        rows[places] = 0
+
+
+@torch.no_grad()
+def sample_add(
+    params: Params,
+    optimizers: Optimizers,
+    state: State,
+    n: int,
+    binoms: Tensor,
+    min_opacity: float = 0.005,
+    *,
+    generator: torch.Generator | None = None,
+) -> None:
+    """Append `n` copies of Gaussians that are drawn in proportion to their opacity.
+
+    The copies at one place share its opacity by `compute_relocation`. Copies start with zero moments and statistics; those of
+    the chosen places stay.
+
+    Args:
+        params: tensors of the Gaussians.
+        optimizers: optimisers by the same names.
+        state: statistics.
+        n: number of copies.
+        binoms: see `compute_relocation`.
+        min_opacity: smallest opacity of the copies.
+        generator: source of the random numbers, on the device of the Gaussians.
+    """
+    places = draw(params["opacities"].sigmoid().flatten(), n, generator)
+    shared = _shared(params, places, binoms, min_opacity)
+
+    def copies(name: str, tensor: Tensor) -> Tensor:
+        if name in shared:
+            tensor[places] = shared[name].to(tensor.dtype)
+        return tensor[places]
+
+    _append(params, optimizers, places, copies)
+    for name, rows in _rows_of(state):
+        state[name] = torch.cat([rows, rows.new_zeros(len(places), *rows.shape[1:])])
+
+
+@torch.no_grad()
+def inject_noise_to_position(
+    params: Params,
+    optimizers: Optimizers,
+    state: State,
+    scaler: float,
+    *,
+    opacity_at_half: float = 0.005,
+    steepness: float = 100.0,
+    generator: torch.Generator | None = None,
+) -> None:
+    """Move each Gaussian by Σ ε times `scaler`, fading out with opacity (Kheradmand et al. 2024, equation 10).
+
+    Σ is its covariance and ε standard normal noise. The factor sigmoid(-k (o - t)) spares visible Gaussians.
+
+    Args:
+        params: tensors of the Gaussians.
+        optimizers: not used.
+        state: not used.
+        scaler: learning rate of the positions times the noise's rate.
+        opacity_at_half: the opacity t at which the factor is a half.
+        steepness: the slope k of the factor.
+        generator: source of the random numbers, on the device of the Gaussians.
+    """
+    means = params["means"]
+    noise = torch.randn(means.shape, dtype=means.dtype, device=means.device, generator=generator)
+    moved = means.detach().contiguous()
+    diffuse_positions_(
+        moved, params["quats"].detach(), params["scales"].detach(), params["opacities"].detach().flatten(), noise, scaler,
+        opacity_at_half, steepness,
+    )  # fmt: skip
+    if not means.is_contiguous():
+        means.copy_(moved)
+
+
+def draw(weights: Tensor, count: int, generator: torch.Generator | None = None) -> Tensor:
+    """Draw `count` indices with replacement in proportion to `weights` [N], int64 [count]; a NaN is never drawn."""
+    weights = weights.nan_to_num(0.0)
+    if len(weights) <= LARGEST_MULTINOMIAL:
+        return torch.multinomial(weights, count, replacement=True, generator=generator)
+    total = weights.double().cumsum(0)
+    draws = torch.rand(count, dtype=total.dtype, device=total.device, generator=generator) * total[-1]
+    return torch.searchsorted(total, draws, right=True).clamp(max=len(weights) - 1)
+
+
+def _append(params: Params, optimizers: Optimizers, parents: Tensor, copies: Callable[[str, Tensor], Tensor]) -> None:
+    """Append a row for each of `parents`, made by `copies` of a name and its tensor, with zero moments."""
+
+    def moments(_: str, values: Tensor) -> Tensor:
+        return torch.cat([values, values.new_zeros(len(parents), *values.shape[1:])])
+
+    def appended(name: str, tensor: Tensor) -> Tensor:
+        # `copies` may change rows of the tensor, which the result contains.
+        added = copies(name, tensor)
+        return Parameter(torch.cat([tensor, added]), tensor.requires_grad)
+
+    update_rows(appended, moments, params, optimizers)
+
+
+def _shared(params: Params, places: Tensor, binoms: Tensor, min_opacity: float) -> dict[str, Tensor]:
+    """Return logits and log-scales at `places` after each has been copied as often as it was drawn, by parameter name."""
+    opacities, scales = compute_relocation(
+        params["opacities"][places].sigmoid(),
+        params["scales"][places].exp(),
+        torch.bincount(places, minlength=len(params["opacities"]))[places] + 1,
+        binoms,
+    )
+    most = 1 - torch.finfo(torch.float32).eps
+    return {"opacities": torch.logit(opacities.clamp(min_opacity, most)), "scales": scales.log()}
+
+
+def _divided(params: Params, mask: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the rows in `mask` and the others.
+
+    Raises:
+        InvalidParameters: if `mask` is not a bool with one value per Gaussian.
+    """
+    count = len(next(iter(params.values())))
+    if mask.dtype != torch.bool or mask.numel() != count:
+        raise InvalidParameters(
+            f"mask must be bool [N] with N = {count} Gaussians, got {mask.dtype} {list(mask.shape)}"
+        )
+    mask = mask.flatten()
+    return mask.nonzero()[:, 0], (~mask).nonzero()[:, 0]
+
+
+def _has_rows(value: Any) -> bool:
+    return isinstance(value, Tensor) and value.dim() > 0
+
+
+def _rows_of(state: State) -> list[tuple[str, Tensor]]:
+    return [(name, value) for name, value in state.items() if _has_rows(value)]
 
 
 @dataclass(frozen=True)

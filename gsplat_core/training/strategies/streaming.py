@@ -18,15 +18,11 @@ from gsplat_core.scene.gaussians import SH_C0, Gaussians
 from gsplat_core.training.motion.image_motion import Seen
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.steps.step import TrainingStep
-from gsplat_core.training.strategies.strategy import Plan, StrategyKind
+from gsplat_core.training.strategies.strategy import SHRINK, Plan, StrategyKind
 
 UNSEEN_PX = 0.5
 """Largest sum of blending weights over the pixels of any picture, in pixels, below which a Gaussian counts as
 invisible.
-"""
-SHRINK = 1.6
-"""Factor by which the halves of a split Gaussian are shorter along its longest axis (Kerbl et al. 2023, section
-5.2).
 """
 APART = 0.5
 """Distance of the halves from their parent's centre, in its standard deviations along its longest axis."""

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gsplat_core import DefaultStrategy, MCMCStrategy, SelectiveAdam, fused_ssim, rasterization
-from gsplat_core.training.strategies.operations import binomials, compute_relocation
+from gsplat_core.training.strategies.strategy import binomials, compute_relocation
 
 COUNT = 200
 

@@ -15,7 +15,7 @@ from gsplat_core.io import spz
 from gsplat_core.io.exports.export import with_unit_rotations
 from gsplat_core.io.ply import BOUNDS, compressed_ply_pieces, load_ply, morton_order
 from gsplat_core.io.spz import library, load_spz, spz_pieces
-from gsplat_core.reference.spherical_harmonics import spherical_harmonics_bases
+from gsplat_core.reference.projection import spherical_harmonics_bases
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
 
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from gsplat_core import InvalidInput, reference, spherical_harmonics
-from gsplat_core.reference.spherical_harmonics import spherical_harmonics_bases
+from gsplat_core.reference.projection import spherical_harmonics_bases
 
 
 def inputs(shape, bases, seed=0, coefficients=None):

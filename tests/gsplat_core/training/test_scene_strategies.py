@@ -17,8 +17,7 @@ from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.steps.step import TrainingStep
 from gsplat_core.training.strategies.adc import CappedAdc
 from gsplat_core.training.strategies.mcmc import SceneMcmc
-from gsplat_core.training.strategies.operations import draw, remove, split
-from gsplat_core.training.strategies.strategy import Plan, change_rows
+from gsplat_core.training.strategies.strategy import Plan, change_rows, draw, remove, split
 
 COUNT = 90
 

@@ -10,8 +10,8 @@ import torch
 import gsplat_core
 from gsplat_core import DefaultStrategy, MCMCStrategy, Strategy, rasterization
 from gsplat_core.errors import InvalidInput
-from gsplat_core.training.strategies import operations as ops
-from gsplat_core.training.strategies.operations import MOST_COPIES, binomials, compute_relocation
+from gsplat_core.training.strategies import strategy as ops
+from gsplat_core.training.strategies.strategy import MOST_COPIES, binomials, compute_relocation
 
 COUNT = 40
 
