@@ -26,10 +26,19 @@ from gsplat_core.deformation.basis_bumps import (
     BasisRates,
     BumpTensors,
     bump_capacity,
+    least_squares_weights,
 )
-from gsplat_core.deformation.field import Capabilities, Continuation, DeformationField, FieldSlot, displaced, ops_for
+from gsplat_core.deformation.field import (
+    Capabilities,
+    Continuation,
+    DeformationField,
+    FieldSlot,
+    displaced,
+    ops_for,
+    towards_neighbours_,
+    towards_others_,
+)
 from gsplat_core.deformation.kinds import PARAMETER_BYTES, FieldKind, FieldRates, NewField
-from gsplat_core.deformation.regularisers import least_squares_weights, towards_neighbours_, towards_others_
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import basis_field as compiled
 from gsplat_core.ops import plain_torch

@@ -1,4 +1,4 @@
-"""Tensors of a `BasisField`: Gaussians as rows, bumps as columns of a ring, and Adam's state."""
+"""Tensors of a `BasisField`: Gaussians as rows, bumps as columns of a ring, Adam's state, and the weights that fit given values."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from torch import Tensor
 
 from gsplat_core.deformation.field import ContinuedField, checked_window
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.plain_torch import BASIS_CHANNELS, BUMP_REACH
+from gsplat_core.machine import one_thread
+from gsplat_core.ops.plain_torch import BASIS_CHANNELS, BUMP_REACH, basis_field
 from gsplat_core.scene.gaussians import Gaussians, RowMoves
 
 
@@ -157,6 +158,26 @@ def columns_to_change(window_s: tuple[float, float], columns: Columns) -> tuple[
 
 BUMPS_PER_SPACING = math.sqrt(math.pi)
 """Sum at any time of equal bumps of width 1 at unit spacing (within 0.02 %)."""
+
+
+BEND = 0.05
+"""Weight of the penalty on bending between bumps, relative to the squared error at one time.
+
+Suppresses the noise of per-frame measurements.
+"""
+
+
+@one_thread()
+def least_squares_weights(taus: Sequence[float], bumps: int) -> Tensor:
+    """Return the matrix [B, T], float64, that maps values at `taus` to bump weights.
+
+    The bumps have width 1 and centres 0, 1, .... The fit is least squares with a penalty on bending.
+    """
+    row = torch.arange(bumps, dtype=torch.float64)[None], torch.zeros(1, bumps, dtype=torch.float64)
+    each = torch.eye(bumps, dtype=torch.float64)[None]
+    heights = torch.stack([basis_field(*row, each, tau)[0] for tau in taus]) if taus else each.new_zeros(0, bumps)
+    bends = torch.eye(bumps, dtype=torch.float64).diff(n=2, dim=0)
+    return torch.linalg.solve(heights.T @ heights + BEND * bends.T @ bends + 1e-6 * torch.eye(bumps), heights.T)
 
 
 class BumpTensors(ContinuedField):

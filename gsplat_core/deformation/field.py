@@ -3,7 +3,8 @@
 `DeformationField` is the module that deforms canonical Gaussians to one time. Every field implements it. `Capabilities`
 lists what only some fields support; callers skip the work that needs a missing capability.
 
-`ContinuedField` extrapolates a field with a velocity shortly after the newest frame.
+`ContinuedField` extrapolates a field with a velocity shortly after the newest frame. `towards_neighbours_` and
+`towards_others_` smooth a field's values along time and between Gaussians.
 """
 
 from __future__ import annotations
@@ -340,6 +341,36 @@ def ops_for(tensor: Tensor, compiled: ModuleType, plain: ModuleType) -> ModuleTy
     device = tensor.device.type
     has_kernels = device == "cpu" or (device == "cuda" and CUDA_MISSING is None)
     return compiled if has_kernels and tensor.dtype == torch.float32 else plain
+
+
+ROWS_AT_ONCE = 1 << 14
+"""Number of rows processed at once, to bound memory."""
+
+
+def towards_neighbours_(values: Tensor, amount: float) -> None:
+    """Diffuse `values` [N, T, ...] along T in place: move each towards its neighbours' mean.
+
+    Both ends are fixed. For amounts up to 1 this is one explicit diffusion step, a descent step on
+    the squared differences of neighbours.
+    """
+    if values.shape[1] < 3:
+        return
+    for rows in values.split(ROWS_AT_ONCE):
+        rows[:, 1:-1].add_(rows.diff(n=2, dim=1), alpha=amount / 2)
+
+
+def towards_others_(values: Tensor, others: Tensor, amount: float) -> None:
+    """Move each of `values` [N, ...] towards the mean of its `others` [N, K], in place.
+
+    All rows are updated simultaneously.
+    """
+    if others.shape[1] == 0:
+        return
+    before = values.contiguous()
+    mean = torch.zeros_like(before)
+    for each in others.unbind(1):
+        mean += before[each]
+    values.lerp_(mean / others.shape[1], amount)
 
 
 class WholeFieldSlot:

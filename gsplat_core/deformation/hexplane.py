@@ -16,9 +16,15 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from gsplat_core.deformation.field import Capabilities, DeformationField, WholeFieldSlot, checked_window, ops_for
+from gsplat_core.deformation.field import (
+    Capabilities,
+    DeformationField,
+    WholeFieldSlot,
+    checked_window,
+    ops_for,
+    towards_neighbours_,
+)
 from gsplat_core.deformation.kinds import FieldKind, NewField, OneRate
-from gsplat_core.deformation.regularisers import towards_neighbours_
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import hexplane as compiled
 from gsplat_core.ops import plain_torch

@@ -6,12 +6,8 @@ import pytest
 import torch
 
 from gsplat_core.deformation import BasisField, HexPlaneField
-from gsplat_core.deformation.regularisers import (
-    ROWS_AT_ONCE,
-    least_squares_weights,
-    towards_neighbours_,
-    towards_others_,
-)
+from gsplat_core.deformation.basis_bumps import least_squares_weights
+from gsplat_core.deformation.field import ROWS_AT_ONCE, towards_neighbours_, towards_others_
 from gsplat_core.ops.plain_torch import basis_field
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gsplat_core.deformation.regularisers import least_squares_weights
+from gsplat_core.deformation.basis_bumps import least_squares_weights
 
 
 @pytest.mark.parametrize("bumps", [5, 11, 40, 130])
