@@ -105,7 +105,7 @@ def test_experimental_methods_are_named_by_registries_only():
 
 FIELD_MODULES = (
     "gsplat_core/choices.py", "gsplat_core/deformation/", "gsplat_core/ops/", "gsplat_core/reference/",
-    "gsplat_core/contrib/", "gsplat_core/as_gsplat/",
+    "gsplat_core/contrib.py", "gsplat_core/as_gsplat/",
 )  # fmt: skip
 """Registry entries of the deformation fields, their modules and their kernels, and gsplat's class of the same name."""
 FIELD_NAMES, FIELD_CLASSES = {"basis", "hexplane"}, {"BasisField", "HexPlaneField"}

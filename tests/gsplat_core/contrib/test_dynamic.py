@@ -9,7 +9,7 @@ import torch
 from torch.nn.functional import grid_sample
 
 from gsplat_core import rasterization
-from gsplat_core.contrib.dynamic import (
+from gsplat_core.contrib import (
     DeformNetwork,
     DynamicStrategy,
     HexPlaneField,

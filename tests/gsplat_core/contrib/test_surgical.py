@@ -7,9 +7,8 @@ import math
 import pytest
 import torch
 
-from gsplat_core import rasterization
-from gsplat_core.contrib import surgical
-from gsplat_core.contrib.dynamic import DeformNetwork, DynamicStrategy, HexPlaneField, hexplane_regularization
+from gsplat_core import contrib, rasterization
+from gsplat_core.contrib import DeformNetwork, DynamicStrategy, HexPlaneField, hexplane_regularization
 from gsplat_core.reference.training import ssim_map
 
 K = torch.tensor([[20.0, 0, 8], [0, 20, 6], [0, 0, 1]])
@@ -23,65 +22,65 @@ def test_pixels_with_depth_become_points_of_the_world():
     poses = torch.eye(4).repeat(2, 1, 1)
     poses[1, :3, :3] = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     poses[1, :3, 3] = torch.tensor([10.0, 20, 30])
-    points, colours = surgical.multi_frame_depth_unprojection(images, depths, masks, poses, K.repeat(2, 1, 1))
+    points, colours = contrib.multi_frame_depth_unprojection(images, depths, masks, poses, K.repeat(2, 1, 1))
     in_camera = torch.tensor([(5 - 8) * 4 / 20, (3 - 6) * 4 / 20, 4])
     assert torch.allclose(points, (poses[1, :3, :3] @ in_camera + poses[1, :3, 3])[None])
     assert torch.allclose(colours, torch.tensor([[1.0, 0.2, 0]]))
     arguments = images, torch.ones(2, 12, 16), masks, poses, K.repeat(2, 1, 1)
-    assert len(surgical.multi_frame_depth_unprojection(*arguments, max_points=7)[0]) == 7
+    assert len(contrib.multi_frame_depth_unprojection(*arguments, max_points=7)[0]) == 7
     with pytest.raises(ValueError, match="leading dim mismatch"):
-        surgical.multi_frame_depth_unprojection(images, depths, masks[:1], poses, K.repeat(2, 1, 1))
+        contrib.multi_frame_depth_unprojection(images, depths, masks[:1], poses, K.repeat(2, 1, 1))
 
 
 def test_scales_are_distances_of_neighbours():
     points = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 2], [50, 0, 0]])
-    assert surgical.knn_scale_init(points)[0].item() == pytest.approx(math.log(math.sqrt((1 + 4 + 4) / 3)))
-    assert surgical.knn_scale_init(torch.zeros(4, 3)).tolist() == pytest.approx([math.log(1e-7)] * 4)
+    assert contrib.knn_scale_init(points)[0].item() == pytest.approx(math.log(math.sqrt((1 + 4 + 4) / 3)))
+    assert contrib.knn_scale_init(torch.zeros(4, 3)).tolist() == pytest.approx([math.log(1e-7)] * 4)
     with pytest.raises(ValueError, match="at least k\\+1=4"):
-        surgical.knn_scale_init(points[:3])
+        contrib.knn_scale_init(points[:3])
 
 
 def test_losses_leave_out_masked_pixels():
     own, other = torch.rand(1, 3, 16, 16), torch.rand(1, 3, 16, 16)
     mask = (torch.rand(1, 1, 16, 16) > 0.5).float()
     difference = ((own - other).abs() * mask).sum() / (3 * mask.sum())
-    assert surgical.masked_l1(own, other, mask).item() == pytest.approx(difference.item(), rel=1e-5)
-    assert surgical.masked_l1(own, other, 0 * mask).item() == 0
+    assert contrib.masked_l1(own, other, mask).item() == pytest.approx(difference.item(), rel=1e-5)
+    assert contrib.masked_l1(own, other, 0 * mask).item() == 0
     channels_last = [(each * mask)[0].permute(1, 2, 0).double() for each in (own, other)]
     wanted = 1 - ssim_map(*channels_last).mean()
-    assert surgical.masked_ssim(own, other, mask).item() == pytest.approx(wanted.item(), abs=1e-5)
+    assert contrib.masked_ssim(own, other, mask).item() == pytest.approx(wanted.item(), abs=1e-5)
     with pytest.raises(ValueError, match="shapes must match"):
-        surgical.masked_ssim(own, other[:, :1], mask)
+        contrib.masked_ssim(own, other[:, :1], mask)
 
 
 def test_depth_losses_count_known_pairs():
     own, other = torch.tensor([[2.0, 0, 4, 5]], requires_grad=True), torch.tensor([[4.0, 3, 0, 2]])
-    assert surgical.binocular_disparity_l1(own, other).item() == pytest.approx((0.25 + 0.3) / 2)
+    assert contrib.binocular_disparity_l1(own, other).item() == pytest.approx((0.25 + 0.3) / 2)
     kept = torch.tensor([[1, 1, 1, 0]])
-    assert surgical.binocular_disparity_l1(own, other, kept).item() == pytest.approx(0.25)
-    (gradient,) = torch.autograd.grad(surgical.binocular_disparity_l1(own, other), own)
+    assert contrib.binocular_disparity_l1(own, other, kept).item() == pytest.approx(0.25)
+    (gradient,) = torch.autograd.grad(contrib.binocular_disparity_l1(own, other), own)
     assert gradient.isfinite().all() and gradient[0, 1] == 0
     line = torch.linspace(1, 2, 12).view(1, 3, 4)
-    assert surgical.pearson_depth_loss(line, 3 * line + 1).item() == pytest.approx(0, abs=1e-5)
-    assert surgical.pearson_depth_loss(line, -line).item() == pytest.approx(2, abs=1e-5)
-    assert surgical.pearson_depth_loss(line, line, torch.zeros_like(line)).item() == 0
-    assert surgical.pearson_depth_loss(0 * line, line).isfinite()
+    assert contrib.pearson_depth_loss(line, 3 * line + 1).item() == pytest.approx(0, abs=1e-5)
+    assert contrib.pearson_depth_loss(line, -line).item() == pytest.approx(2, abs=1e-5)
+    assert contrib.pearson_depth_loss(line, line, torch.zeros_like(line)).item() == 0
+    assert contrib.pearson_depth_loss(0 * line, line).isfinite()
 
 
 def test_total_variation_is_the_sum_of_steps():
     image = torch.zeros(1, 2, 4, 5)
     image[..., 3:] = 0.5  # one step in each of 4 rows of both channels
-    assert surgical.compute_tv_loss_targeted(image).item() == pytest.approx(4 * 2 * 0.5 / 40)
+    assert contrib.compute_tv_loss_targeted(image).item() == pytest.approx(4 * 2 * 0.5 / 40)
     mask = torch.zeros(1, 1, 4, 5)
     mask[:, :, :2] = 1
     # Of the 8 differences across in the two rows of the mask, 2 are 0.5.
-    assert surgical.compute_tv_loss_targeted(image, mask).item() == pytest.approx(2 * 2 * 0.5 / (8 * 2))
+    assert contrib.compute_tv_loss_targeted(image, mask).item() == pytest.approx(2 * 2 * 0.5 / (8 * 2))
     with pytest.raises(ValueError, match="4D"):
-        surgical.compute_tv_loss_targeted(image[0])
+        contrib.compute_tv_loss_targeted(image[0])
 
 
 def test_the_schedule_stays_on_one_frame_first():
-    schedule = surgical.TwoStageScheduler(coarse_steps=2, fine_steps=10, coarse_frame_index=1)
+    schedule = contrib.TwoStageScheduler(coarse_steps=2, fine_steps=10, coarse_frame_index=1)
     steps = [schedule.step(k, 3) for k in range(6)]
     assert [each.frame_index for each in steps] == [1, 1, 0, 1, 2, 0]
     assert [each.stage for each in steps] == ["coarse"] * 2 + ["fine"] * 4
@@ -90,18 +89,18 @@ def test_the_schedule_stays_on_one_frame_first():
         with pytest.raises(ValueError):
             schedule.step(*wrong)
     with pytest.raises(ValueError, match="fine_steps"):
-        surgical.TwoStageScheduler(1, -1)
+        contrib.TwoStageScheduler(1, -1)
 
 
 def test_a_training_with_all_parts_lowers_its_loss():
     """The steps of gsplat's surgical trainer on one frame."""
     torch.manual_seed(0)
     image, depth, mask = torch.rand(1, 12, 16, 3) * 0.2 + 0.4, torch.full((1, 12, 16), 3.0), torch.ones(1, 12, 16)
-    points, colours = surgical.multi_frame_depth_unprojection(image, depth, mask, torch.eye(4)[None], K[None], 60)
+    points, colours = contrib.multi_frame_depth_unprojection(image, depth, mask, torch.eye(4)[None], K[None], 60)
     values = {
         "means": points,
         "quats": torch.nn.functional.normalize(torch.randn(60, 4), dim=-1),
-        "scales": surgical.knn_scale_init(points)[:, None].repeat(1, 3),
+        "scales": contrib.knn_scale_init(points)[:, None].repeat(1, 3),
         "opacities": torch.zeros(60, 1),
         "colors": torch.zeros_like(colours),
     }
@@ -126,8 +125,8 @@ def test_a_training_with_all_parts_lowers_its_loss():
         )  # fmt: skip
         own, true = rendered[..., :3].permute(0, 3, 1, 2), image.permute(0, 3, 1, 2)
         loss = (
-            0.8 * surgical.masked_l1(own, true, mask[:, None]) + 0.2 * surgical.masked_ssim(own, true, mask[:, None])
-            + surgical.binocular_disparity_l1(rendered[..., 3], depth, mask) + 1e-3 * surgical.compute_tv_loss_targeted(own)
+            0.8 * contrib.masked_l1(own, true, mask[:, None]) + 0.2 * contrib.masked_ssim(own, true, mask[:, None])
+            + contrib.binocular_disparity_l1(rendered[..., 3], depth, mask) + 1e-3 * contrib.compute_tv_loss_targeted(own)
             + 1e-4 * hexplane_regularization(field)
         )  # fmt: skip
         strategy.step_pre_backward(params, optimizers, state, step, info)

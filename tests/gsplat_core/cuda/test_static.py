@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_core.contrib.dynamic import HexPlaneField
+from gsplat_core.contrib import HexPlaneField
 from gsplat_core.training.static import StaticConfig, StaticTrainer
 from tests.gsplat_core.training.posed_pictures import posed_pictures
 

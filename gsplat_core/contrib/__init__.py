@@ -1,1 +1,0 @@
-"""Experimental parts of gsplat under its names, for training loops of library users."""
