@@ -22,7 +22,7 @@ from torch import Tensor
 
 from gsplat_core import Camera, Gaussians, render
 from gsplat_core.deformation import BasisField, DeformationField, HexPlaneField
-from gsplat_core.rendering.frame_renderer import FrameRenderer, Precision
+from gsplat_core.rendering.alpha import FrameRenderer, Precision
 
 WINDOW_S = (0.0, 6.0)
 HEXPLANES = {

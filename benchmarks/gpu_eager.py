@@ -24,7 +24,7 @@ from gpu_timing import Times, compare, extra_mib, gsplat, measure, report, repor
 from torch import Tensor
 
 import gsplat_core
-from gsplat_core.rendering.single_call import next_capacity
+from gsplat_core.rendering.rasterization import next_capacity
 
 ASKED_MS = {"surgical50k_640x512": (0.12, 0.6), "volume1m_1080p": (0.9, 2.8)}
 """Required times in ms: forward, and forward with backward."""

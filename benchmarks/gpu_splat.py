@@ -26,7 +26,7 @@ from gsplat_core.ops.frame_gradients import (
     render_frame_backward,
     render_frame_backward_adam_,
 )
-from gsplat_core.rendering.frame_renderer import FrameRenderer, TileListCapacity, capacity_for
+from gsplat_core.rendering.alpha import FrameRenderer, TileListCapacity, capacity_for
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from gsplat_core.ops.unscented_projection import UnscentedTransformParameters, fully_fused_projection_with_ut
     from gsplat_core.ops.world_blending import rasterize_to_pixels_eval3d
     from gsplat_core.poses.se3 import RollingShutterType
-    from gsplat_core.rendering.frame_renderer import FrameRenderer
+    from gsplat_core.rendering.alpha import FrameRenderer
     from gsplat_core.rendering.rasterization import RenderOutput, rasterization, render
     from gsplat_core.rendering.rasterizer import Rasterizer, rasterization_inria_wrapper
     from gsplat_core.rendering.renderer import Renderer, new_renderer
@@ -121,7 +121,7 @@ _HOME = {
     "FThetaCameraDistortionParameters": "scene.distortion",
     "FThetaPolynomialType": "scene.distortion",
     "Frame": "scene.frames",
-    "FrameRenderer": "rendering.frame_renderer",
+    "FrameRenderer": "rendering.alpha",
     "FrameStatus": "scene.frames",
     "GaussianCollection": "scene.collection",
     "Gaussians": "scene.gaussians",

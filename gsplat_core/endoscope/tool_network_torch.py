@@ -22,7 +22,7 @@ from torch.nn import functional
 
 from gsplat_core.endoscope.onnx import read_model, values
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.rendering.frame_renderer import CapturedSequence, GraphMemory
+from gsplat_core.rendering.alpha import CapturedSequence, GraphMemory
 
 PRIORITY = -1
 """Priority of the CUDA stream, above that of training (0), which uses the GPU at the same time."""

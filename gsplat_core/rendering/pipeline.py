@@ -1,7 +1,7 @@
 """`rasterization` with gsplat's arguments and results, for any implementation of the operations.
 
 The pipeline has four steps: project, colour, bin into tiles, blend. `rasterization()` and training run it with the
-compiled operations, tests with those in plain torch. On CUDA, `single_call.py` does the same in one native call.
+compiled operations, tests with those in plain torch. On CUDA, `SingleCall` does the same in one native call.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from gsplat_core.rendering.settings import (
 
 if TYPE_CHECKING:
     from gsplat_core.ops.rasterization import Rasterized
-    from gsplat_core.rendering.single_call import SingleCall
+    from gsplat_core.rendering.rasterization import SingleCall
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from torch import Tensor
 from gsplat_core.ops.arguments import require_shape
 from gsplat_core.ops.frame import TILE_SIZE as FRAME_TILE_SIZE
 from gsplat_core.ops.native import CUDA_MISSING
-from gsplat_core.rendering.frame_renderer import FrameRenderer, TileListCapacity
+from gsplat_core.rendering.alpha import FrameRenderer, TileListCapacity
 from gsplat_core.rendering.rasterization import rasterization
 from gsplat_core.rendering.settings import (
     EPS2D,

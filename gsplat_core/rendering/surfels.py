@@ -26,7 +26,7 @@ from gsplat_core.ops.surfel_projection import fully_fused_projection_2dgs, spars
 from gsplat_core.ops.tiles import bin_splats
 from gsplat_core.rendering.depth_maps import depth_to_normal
 from gsplat_core.rendering.pipeline import Meta, Signal, check_shapes, isect_ids_of, view_colors
-from gsplat_core.rendering.rasterization import step_by_step
+from gsplat_core.rendering.rasterization import in_plain_mode, step_by_step
 from gsplat_core.rendering.settings import (
     CONSTANTS,
     EPS2D,
@@ -38,7 +38,6 @@ from gsplat_core.rendering.settings import (
     RenderSettings,
     check_tensors,
 )
-from gsplat_core.rendering.torch_modes import in_plain_mode
 
 SurfelMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 DepthMode = Literal["expected", "median"]

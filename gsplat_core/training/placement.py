@@ -27,7 +27,7 @@ from gsplat_core.deformation.field import CapturedMotion, EditableMotion
 from gsplat_core.depth.maps import possible_depth
 from gsplat_core.models import Model
 from gsplat_core.ops.frame import STATUS_OVERFLOW, FrameMode, View, render_frame
-from gsplat_core.rendering.frame_renderer import (
+from gsplat_core.rendering.alpha import (
     CapturedSequence,
     FrameControls,
     FrameStatusCopy,

@@ -25,7 +25,7 @@ from gsplat_core.ops.frame import (
 )
 from gsplat_core.ops.frame_gradients import GaussianAdam, render_frame_backward_adam_
 from gsplat_core.ops.image_loss import frame_loss
-from gsplat_core.rendering.frame_renderer import (
+from gsplat_core.rendering.alpha import (
     CapturedSequence,
     FrameControls,
     FrameStatusCopy,

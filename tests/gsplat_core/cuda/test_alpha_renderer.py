@@ -9,7 +9,7 @@ import torch
 
 from gsplat_core import Camera, Model, SnapshotSlots, new_renderer, render
 from gsplat_core.deformation import BasisField, new_field
-from gsplat_core.rendering import frame_renderer
+from gsplat_core.rendering import alpha
 
 WIDTH_PX, HEIGHT_PX = 150, 101
 WINDOW_S = (0.0, 1.0)
@@ -29,8 +29,8 @@ def scene(make_gaussians):
 def captures(monkeypatch):
     """Counts the graphs that are captured."""
     made = []
-    original = frame_renderer._capture
-    monkeypatch.setattr(frame_renderer, "_capture", lambda *arguments: made.append(1) or original(*arguments))
+    original = alpha._capture
+    monkeypatch.setattr(alpha, "_capture", lambda *arguments: made.append(1) or original(*arguments))
     return made
 
 

@@ -10,7 +10,7 @@ import torch
 
 from gsplat_core import Camera, Gaussians, InvalidInput, render
 from gsplat_core.deformation import BasisField
-from gsplat_core.rendering.frame_renderer import FrameRenderer
+from gsplat_core.rendering.alpha import FrameRenderer
 
 WIDTH_PX, HEIGHT_PX = 150, 101
 

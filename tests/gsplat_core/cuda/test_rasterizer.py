@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from gsplat_core import Camera, Rasterizer
-from gsplat_core.rendering.frame_renderer import TileListCapacity
+from gsplat_core.rendering.alpha import TileListCapacity
 
 CAMERA = Camera.from_focal(120.0, 150, 101)
 

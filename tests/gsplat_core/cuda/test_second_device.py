@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gsplat_core import Camera, render
 from gsplat_core.deformation import BasisField, DeformationField, HexPlaneField
-from gsplat_core.rendering.frame_renderer import FrameRenderer
+from gsplat_core.rendering.alpha import FrameRenderer
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.steps.step import TrainingStep

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core import quat_scale_to_covar_preci, rasterization, reference
-from gsplat_core.rendering import single_call
+from gsplat_core.rendering import rasterization as module
 from gsplat_core.rendering.rasterization import step_by_step
 from tests.gsplat_core.cuda.single_call_checks import assert_same, check_lists, inputs, run
 
@@ -19,13 +19,13 @@ from tests.gsplat_core.cuda.single_call_checks import assert_same, check_lists, 
 def calls(monkeypatch) -> list[bool]:
     """Record the native calls of `rasterization`: for each, if it is differentiable."""
     found: list[bool] = []
-    render = single_call.rasterize
+    render = module.rasterize
 
     def rendered(inputs, view, differentiable):
         found.append(differentiable)
         return render(inputs, view, differentiable)
 
-    monkeypatch.setattr(single_call, "rasterize", rendered)
+    monkeypatch.setattr(module, "rasterize", rendered)
     return found
 
 

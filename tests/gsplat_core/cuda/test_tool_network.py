@@ -20,7 +20,7 @@ from gsplat_core.endoscope.tool_network import (
 )
 from gsplat_core.endoscope.tool_network_torch import PRIORITY, TorchToolNetwork
 from gsplat_core.io.recordings import open_recording
-from gsplat_core.rendering.frame_renderer import CapturedSequence, GraphMemory
+from gsplat_core.rendering.alpha import CapturedSequence, GraphMemory
 from tests.gsplat_core.endoscope.tool_pictures import in_round_view, tissue, with_rod
 
 INPUTS = {NETWORK: (INPUT_PX, 5), ROUND_NETWORK: (ROUND_INPUT_PX, ROUND_INPUTS)}

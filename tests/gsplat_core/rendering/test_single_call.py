@@ -6,9 +6,14 @@ import pytest
 import torch
 
 from gsplat_core.ops.rasterization import Rasterized
-from gsplat_core.rendering import single_call
+from gsplat_core.rendering import rasterization as module
+from gsplat_core.rendering.rasterization import (
+    FEWEST_RESERVED_ENTRIES,
+    MOST_RESERVED_ENTRIES,
+    SingleCall,
+    next_capacity,
+)
 from gsplat_core.rendering.settings import Arguments, RenderSettings
-from gsplat_core.rendering.single_call import FEWEST_RESERVED_ENTRIES, MOST_RESERVED_ENTRIES, SingleCall, next_capacity
 
 SETTINGS = RenderSettings(16, 16, sh_degree=0, render_mode="RGB+ED")
 
@@ -33,7 +38,7 @@ def capacities_for(monkeypatch):
             empty, ids = torch.empty(0), torch.empty(1, dtype=torch.int32).expand(length)
             return Rasterized(*[empty] * 9, flatten_ids=ids, isect_ids=empty)
 
-        monkeypatch.setattr(single_call, "rasterize", rasterize)
+        monkeypatch.setattr(module, "rasterize", rasterize)
         call = SingleCall(arguments(), SETTINGS)
         for _ in lengths:
             call(arguments())

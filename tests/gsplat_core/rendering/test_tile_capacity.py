@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from gsplat_core.ops.frame import MAX_SEGMENT
-from gsplat_core.rendering.frame_renderer import HEADROOM, TILE_STEP, TileListCapacity, capacity_for
+from gsplat_core.rendering.alpha import HEADROOM, TILE_STEP, TileListCapacity, capacity_for
 
 
 def test_each_tile_has_its_own_buffer_with_headroom():
