@@ -84,8 +84,8 @@ DEPTHS_WITH_ADDRESS = {"onnx": "onnx:FILE"}
 MOTION_PRIORS: Registry[Callable[[Any], Any]] = Registry(
     "motion prior",
     {
-        "bumps": "gsplat_core.training.motion.prior:no_prior",
-        "flow": "gsplat_core.training.motion.prior:FlowPrior",
+        "bumps": "gsplat_core.training.motion_prior:no_prior",
+        "flow": "gsplat_core.training.motion_prior:FlowPrior",
         "learned": "gsplat_core.experimental.learned_prior:LearnedPrior",
     },
 )

@@ -24,8 +24,8 @@ from torch import Tensor
 from gsplat_core.deformation.field import displaced
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import COLOUR, POSITION, RAW_COLUMNS
-from gsplat_core.training.motion.image_motion import CELL_PX, Flow, SurfaceMotion
-from gsplat_core.training.motion.prior import AT_FIRST, HORIZON_S, FlowPrior
+from gsplat_core.training.image_motion import CELL_PX, Flow, SurfaceMotion
+from gsplat_core.training.motion_prior import AT_FIRST, HORIZON_S, FlowPrior
 from gsplat_core.training.steps.photometric import colour_change
 from gsplat_core.training.steps.step import TrainingStep
 from gsplat_core.transfers import tensor_of

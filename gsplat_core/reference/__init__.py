@@ -15,7 +15,17 @@ from gsplat_core.ops.plain_torch import (
     hexplane_modulate,
     hexplane_space,
 )
-from gsplat_core.reference.compositing import blend_flow, correct_colours, rasterize_to_pixels, weighted_sums
+from gsplat_core.reference.compositing import (
+    blend_flow,
+    blend_rays,
+    correct_colours,
+    range_histogram,
+    rasterize_to_pixels,
+    ray_depth_loss,
+    ray_normal_loss,
+    splat_rays,
+    weighted_sums,
+)
 from gsplat_core.reference.projection import (
     fully_fused_projection,
     isect_offset_encode,
@@ -23,7 +33,6 @@ from gsplat_core.reference.projection import (
     quat_scale_to_covar_preci,
     spherical_harmonics,
 )
-from gsplat_core.reference.ray_blending import blend_rays, range_histogram, ray_depth_loss, ray_normal_loss, splat_rays
 from gsplat_core.reference.rendering import rasterization, render_frame
 from gsplat_core.reference.splat_regression import splat_regression, splat_regression_gradients
 from gsplat_core.reference.stereo import fit_disparities, match_disparities, smooth_within_edges

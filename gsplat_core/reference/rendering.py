@@ -24,8 +24,7 @@ from gsplat_core.ops.arguments import (
     require_shape,
 )
 from gsplat_core.ops.plain_torch import proj, world_to_cam
-from gsplat_core.reference import ray_blending
-from gsplat_core.reference.compositing import rasterize_to_pixels
+from gsplat_core.reference.compositing import blend_rays, rasterize_to_pixels, splat_rays
 from gsplat_core.reference.projection import (
     fully_fused_projection,
     isect_offset_encode,
@@ -83,12 +82,12 @@ def bin_splats_within(
     return tiles_per_gauss, torch.cat([unused, flatten_ids[listed]]), offsets, needed
 
 
-def splat_rays(*arguments: Any) -> tuple[Tensor, Tensor]:
+def _pinhole_rays(*arguments: Any) -> tuple[Tensor, Tensor]:
     """Return ray coefficients and normals of Gaussians seen by a pinhole camera."""
     *tensors, camera_model = arguments
     if camera_model != "pinhole":
         raise InvalidInput(f"the reference has rays of pinhole cameras only, got {camera_model!r}")
-    return ray_blending.splat_rays(*tensors)
+    return splat_rays(*tensors)
 
 
 def visible_harmonics(
@@ -109,8 +108,8 @@ rasterization = Operations(
     spherical_harmonics=spherical_harmonics,
     bin_splats=bin_splats,
     rasterize_to_pixels=rasterize_to_pixels,
-    splat_rays=splat_rays,
-    blend_rays=ray_blending.blend_rays,
+    splat_rays=_pinhole_rays,
+    blend_rays=blend_rays,
     values_of_rows=values_of_rows,
     visible_harmonics=visible_harmonics,
 ).rasterization

@@ -11,8 +11,8 @@ from gsplat_core.choices import FIELDS, MOTION_PRIORS, RENDERERS, STRATEGIES, Ey
 from gsplat_core.deformation.kinds import FieldRates, check_rates
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.frames import RELATIVE_DISTANCE, Frame
+from gsplat_core.training.image_motion import Detail
 from gsplat_core.training.losses import loss_weights
-from gsplat_core.training.motion.image_motion import Detail
 
 
 def check_eyes(eyes: str) -> None:

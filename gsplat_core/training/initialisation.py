@@ -22,7 +22,7 @@ from gsplat_core.depth.plane_fits import filled_depth
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
-from gsplat_core.training.motion.image_motion import beside
+from gsplat_core.training.image_motion import beside
 from gsplat_core.training.observations import Observation, unprojected
 from gsplat_core.transfers import tensor_of
 

@@ -26,8 +26,8 @@ from gsplat_core.rendering.flow import nearest_splats, projected, render_depth, 
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.range_sensors import RangeScan, RangeSensor
+from gsplat_core.training.image_motion import SMALL_PIXELS, consistent_flow
 from gsplat_core.training.losses import LossContext
-from gsplat_core.training.motion.image_motion import SMALL_PIXELS, consistent_flow
 from gsplat_core.training.observations import Observation
 from gsplat_core.transfers import HostCopy, tensor_of
 

@@ -35,7 +35,7 @@ from gsplat_core.machine import usable_cores
 from gsplat_core.ops.surface_motion import surface_path
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
-from gsplat_core.training.motion.image_motion import SMALLEST_PX, Flow, ImageMotion, Seen, SurfaceMotion, beside
+from gsplat_core.training.image_motion import SMALLEST_PX, Flow, ImageMotion, Seen, SurfaceMotion, beside
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.steps.step import TrainingStep
 from gsplat_core.training.strategies.strategy import Plan

@@ -39,8 +39,8 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DepthError, Frame
 from gsplat_core.scene.gaussians import LOG_SCALE, POSITION, Gaussians
 from gsplat_core.training.covering import UNCOVERED_ALPHA
+from gsplat_core.training.image_motion import NEAREST, Seen, beside
 from gsplat_core.training.initialisation import filled, tissue_depth
-from gsplat_core.training.motion.image_motion import NEAREST, Seen, beside
 from gsplat_core.training.observations import Observation, error_of_depth, known_depth, learned_depth
 from gsplat_core.training.steps.step import TrainingStep
 from gsplat_core.transfers import tensor_of

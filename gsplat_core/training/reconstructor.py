@@ -23,7 +23,7 @@ from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.covering import Covering
 from gsplat_core.training.initialisation import StartOnDevice, gaussians_from_frame
-from gsplat_core.training.motion.prior import Following, continued, newest_state
+from gsplat_core.training.motion_prior import Following, continued, newest_state
 from gsplat_core.training.observations import BothEyes, Observation, ObservationWindow, for_eyes
 from gsplat_core.training.offline import OfflineTraining, ToFit, least_spacing_s, to_fit
 from gsplat_core.training.placement import MOST_LATE, LateDepth, Placement, depth_errors

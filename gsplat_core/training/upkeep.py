@@ -35,7 +35,7 @@ from gsplat_core.training.covering import (
     has_moved,
 )
 from gsplat_core.training.initialisation import SIGMA_IN_SPACINGS
-from gsplat_core.training.motion.prior import Following
+from gsplat_core.training.motion_prior import Following
 from gsplat_core.training.observations import Observation, depth_of, pixels_of, value_at
 from gsplat_core.training.steps.step import TrainingStep
 from gsplat_core.training.strategies.streaming import halves

@@ -9,7 +9,7 @@ from pathlib import Path
 from gsplat_core.depth.registry import check_depth, depth_inputs
 from gsplat_core.io.sessions import WriterOptions
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.motion.image_motion import Detail
+from gsplat_core.training.image_motion import Detail
 from gsplat_core.training.schedule import LiveTraining
 from operators.applications.replay import PIXELS_PER_GAUSSIAN
 from operators.applications.session import RunSettings

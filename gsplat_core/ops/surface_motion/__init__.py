@@ -1,7 +1,7 @@
 """3D motion of surface points from optical flow, compiled: between two pictures for the CPU, through several pictures for
 both devices.
 
-`gsplat_core.training.motion.image_motion` implements it in plain torch for any floating dtype and device.
+`gsplat_core.training.image_motion` implements it in plain torch for any floating dtype and device.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
-from gsplat_core.training.motion.image_motion import Seen
+from gsplat_core.training.image_motion import Seen
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.steps.step import TrainingStep
 from gsplat_core.training.strategies.strategy import SHRINK, Plan, StrategyKind

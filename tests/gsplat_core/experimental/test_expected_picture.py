@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.experimental.learned_prior import ExpectedPicture, moved, origin
-from gsplat_core.training.motion.image_motion import CELL_PX
+from gsplat_core.training.image_motion import CELL_PX
 
 SIZE = 48, 64
 CELLS = SIZE[0] // CELL_PX, SIZE[1] // CELL_PX

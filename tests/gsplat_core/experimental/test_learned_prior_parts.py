@@ -12,7 +12,7 @@ import torch
 from gsplat_core.experimental import learned_prior
 from gsplat_core.experimental.learned_prior import ExpectedPicture, LearnedPrior, SimilarMoments, weighted_mean
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.motion.image_motion import CELL_PX
+from gsplat_core.training.image_motion import CELL_PX
 from tests.gsplat_core.training.test_motion_prior import stream
 
 SHAPE = (12, 16, 2)

@@ -10,7 +10,7 @@ import torch
 from gsplat_core import reference
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.splat_rays import SplatRays, splat_rays
-from gsplat_core.reference.ray_blending import depths_of_rays, ray_depths
+from gsplat_core.reference.compositing import depths_of_rays, ray_depths
 from tests.gsplat_core.ops.ray_scenes import gaussians, intrinsics, splat_results, view
 
 

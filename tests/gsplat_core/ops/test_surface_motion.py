@@ -13,7 +13,7 @@ from torch import Tensor
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.surface_motion import surface_motion, surface_path
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.training.motion.image_motion import SurfaceMotion
+from gsplat_core.training.image_motion import SurfaceMotion
 
 
 def pose(angle: float, shift: tuple[float, float, float]) -> NDArray[np.float64]:
@@ -78,7 +78,7 @@ def test_float32_on_the_cpu_takes_the_op_and_the_rest_does_not(monkeypatch: pyte
         calls.append(arrived)
         return torch.zeros(9, 3)
 
-    monkeypatch.setattr("gsplat_core.training.motion.image_motion.surface_motion", counted)
+    monkeypatch.setattr("gsplat_core.training.image_motion.surface_motion", counted)
     motion = SurfaceMotion(flow, BEFORE, AFTER)
     motion.ahead(points), motion.arrived(points)
     assert calls == [False, True]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gsplat_core.training.motion.prior import AT_FIRST, Damping
+from gsplat_core.training.motion_prior import AT_FIRST, Damping
 
 
 def share_of(damping: Damping) -> float:

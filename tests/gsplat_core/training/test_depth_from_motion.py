@@ -13,8 +13,8 @@ from gsplat_core.deformation import BasisField
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.motion.image_motion import Seen, SurfaceMotion
-from gsplat_core.training.motion.prior import DepthFromMotion, inverse_depths
+from gsplat_core.training.image_motion import Seen, SurfaceMotion
+from gsplat_core.training.motion_prior import DepthFromMotion, inverse_depths
 from gsplat_core.training.steps.step import TrainingStep
 
 WIDTH, HEIGHT = 160, 128

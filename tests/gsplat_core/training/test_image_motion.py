@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from gsplat_core.training.motion.image_motion import ImageMotion, revealed_px, typical_px
+from gsplat_core.training.image_motion import ImageMotion, revealed_px, typical_px
 
 
 def texture(shift_x: float, shift_y: float, size: tuple[int, int] = (96, 128)) -> NDArray[np.uint8]:

@@ -11,9 +11,9 @@ import torch
 from gsplat_core import Camera, Gaussians, render
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.image_motion import consistent_flow
 from gsplat_core.training.losses import LossContext
 from gsplat_core.training.measured_losses import FlowLoss, TriangulationLoss, triangulate, triangulated
-from gsplat_core.training.motion.image_motion import consistent_flow
 from gsplat_core.training.observations import Observation
 
 CAMERA = Camera.from_focal(110.0, 96, 80)

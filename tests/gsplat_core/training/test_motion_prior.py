@@ -17,7 +17,7 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.metrics import psnr_tissue_db
-from gsplat_core.training.motion.prior import HORIZON_S, FlowPrior, new_motion_prior, widened
+from gsplat_core.training.motion_prior import HORIZON_S, FlowPrior, new_motion_prior, widened
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.schedule import LiveTraining
 from tests.gsplat_core.training.continuation_checks import check_published_continuations

@@ -11,9 +11,9 @@ import torch
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import RAW_COLUMNS
+from gsplat_core.training import motion_prior as prior_module
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.motion import prior as prior_module
-from gsplat_core.training.motion.prior import (
+from gsplat_core.training.motion_prior import (
     Damping,
     DepthFromMotion,
     Following,

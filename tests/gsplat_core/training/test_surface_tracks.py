@@ -14,8 +14,8 @@ from gsplat_core.io.recordings.synthetic.scene import SyntheticScene
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.frames import DEPTH_ORIGINS, Frame
 from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.image_motion import Seen
 from gsplat_core.training.initialisation import gaussians_from_frame
-from gsplat_core.training.motion.image_motion import Seen
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.offline import SurfaceDepth, SurfaceTracks, between_known, steady_course
 from gsplat_core.training.reconstructor import Reconstructor

@@ -29,7 +29,7 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import LOG_SCALE, POSITION, RAW_COLUMNS, Gaussians
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.motion.image_motion import Flow, ImageMotion, SurfaceMotion, beside, revealed_px, typical_px
+from gsplat_core.training.image_motion import Flow, ImageMotion, SurfaceMotion, beside, revealed_px, typical_px
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.steps.step import TrainingStep
 from gsplat_core.transfers import tensor_of
