@@ -26,7 +26,7 @@ from service_server import STREAM, Server
 from service_viewers import FastViewer, watch
 from service_watchers import Watch, quantiles
 
-from services.audit.verify import verify
+from services.audit.reading import verify
 
 SOURCE = "synthetic:?width=640&height=512&frames=24&fps=30"
 BACK_WITHIN_S = 60.0

@@ -31,7 +31,7 @@ from gsplat_core.io.files import PartialFolder, open_regular, read_regular, sync
 from services import product_version
 from services.api.app import AUDIT_FILE, KEYS_FILE
 from services.audit import verify
-from services.audit.files import MOST_LINE_BYTES, parse_line, read_head
+from services.audit.log import MOST_LINE_BYTES, parse_line, read_head
 from services.jobs.results import RUNNING
 from services.missing_files import StoredFiles, missing_files
 from services.registry.models import DATABASE_FILE

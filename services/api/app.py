@@ -29,8 +29,7 @@ from services.api.pages import ABOUT, describe
 from services.api.problems import Conflicting, Missing, Problem, Unavailable, Unprocessable, answer_with_problems
 from services.api.state import ControlState, Parts, Storage, TokenBuckets, ViewerCount, folders_of
 from services.audit import AuditLog, AuditUnwritable, Keeping
-from services.audit.files import Outcome
-from services.audit.log import SystemEvents
+from services.audit.log import Outcome, SystemEvents
 from services.auth.keys import KeyStore, Tickets, changed_outside, first_admin_key, keys_read_again
 from services.bus.runtime import RuntimeFolder
 from services.clock_guard import ClockGuard

@@ -13,8 +13,8 @@ from starlette.responses import Response, StreamingResponse
 
 from services.api.guard import CallerOf, new_router, recorded, requires
 from services.api.state import control_of
-from services.audit import ExportFormat, Wanted
-from services.audit.files import Outcome
+from services.audit import ExportFormat, Wanted, exported, search
+from services.audit.log import Outcome
 from services.schemas import AuditPage, EntryView, Moment
 
 router = new_router("audit")
@@ -59,7 +59,7 @@ async def audit_entries(
     async with AsyncExitStack() as entry:
         if control.audit_reads.wait_s(f"{caller.key_id} {_said(wanted)}") == 0:
             await entry.enter_async_context(recorded(request, caller, "audit.read", "audit", _said(wanted)))
-        page = await asyncio.to_thread(log.search, wanted, count, before)
+        page = await asyncio.to_thread(search, log.path, wanted, count, before)
     head = log.head
     return AuditPage(
         entries=[EntryView.model_validate(entry) for entry in page.entries],
@@ -86,7 +86,7 @@ async def export_audit(
     """Download the log or the filtered entries, oldest first. The download is recorded in the log."""
     log = control_of(request).audit
     async with recorded(request, caller, "audit.export", "audit", {"format": format, **_said(wanted)}):
-        made = log.exported(wanted, format)
+        made = exported(log.path, wanted, format)
     name = f"audit-{datetime.now(UTC):%Y%m%dT%H%M%SZ}.{format}"
     headers = {"Content-Disposition": f'attachment; filename="{name}"'}
     return StreamingResponse(made, media_type=MEDIA_TYPES[format], headers=headers)

@@ -42,7 +42,7 @@ from services.api.problems import (
 )
 from services.api.state import KEYS_UNREADABLE, ControlState, TokenBuckets, control_of, known_problem
 from services.audit import AuditUnwritable
-from services.audit.files import Detail, Outcome
+from services.audit.log import Detail, Outcome
 from services.auth.keys import ANYBODY, Caller, KeysUnreadable, Role
 from services.settings.sections import LimitSettings, ServerSettings
 

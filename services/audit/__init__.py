@@ -5,9 +5,8 @@ AuditError
 └── AuditUnwritable (UserError)   an entry could not be written to the disk
 """
 
-from services.audit.files import Entry, Keeping
-from services.audit.log import AuditLog, ExportFormat, Wanted
-from services.audit.verify import Finding, Verdict, verify
+from services.audit.log import AuditLog, Entry, Keeping
+from services.audit.reading import ExportFormat, Finding, Verdict, Wanted, exported, search, verify
 from services.errors import AuditError, AuditInUse, AuditUnwritable
 
 __all__ = [
@@ -21,5 +20,7 @@ __all__ = [
     "Keeping",
     "Verdict",
     "Wanted",
+    "exported",
+    "search",
     "verify",
 ]

@@ -1,4 +1,7 @@
-"""Writer of the audit log. Each line is on the disk before `append` returns.
+"""Audit log: its entries, its files and its writer. Each line is on the disk before `append` returns.
+
+Each line contains the digest of the previous line. The head file next to the log holds the newest digest. A closed segment is named after the number of
+its first entry and never written again. The anchor file names the last entry that retention removed.
 
 An entry is valid once its line and the head that names it are on the disk. If either write fails, the line is removed
 again and `append` raises AuditUnwritable. A kill between both writes leaves the log ahead of its head; the next start
@@ -10,205 +13,289 @@ follows the chain from the head to the end and moves the head forward.
 from __future__ import annotations
 
 import asyncio
-import csv
 import errno
 import fcntl
-import io
+import hashlib
 import json
 import logging
 import os
+import re
 import threading
 import time
 from collections import deque
-from collections.abc import AsyncIterator, Iterator, Mapping
-from contextlib import ExitStack, asynccontextmanager, contextmanager
-from dataclasses import dataclass
-from datetime import UTC, datetime
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager, contextmanager
+from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
-from gsplat_core.io.files import open_regular
-from services.audit.files import (
-    MOST_LINE_BYTES,
-    Detail,
-    Entry,
-    Head,
-    Keeping,
-    Outcome,
-    all_segments,
-    anchor_path,
-    closed_segments,
-    digest_of_entry,
-    head_path,
-    lines_backwards,
-    parse_line,
-    read_anchor,
-    read_head,
-    segment_path,
-    sync_folder,
-    too_old,
-    whole_lines_bytes,
-    write_anchor,
-    write_head,
-)
+from gsplat_core.io.files import open_regular, read_regular, sync_folder
 from services.errors import AuditInUse, AuditUnwritable, disk_advice
 
-MOST_LOOKED_AT = 50_000
-"""Largest number of entries read per search, which bounds its time to about a second. The next page continues at that
-position.
-"""
-PIECE_BYTES = 1 << 16
-CSV_FIELDS = ("seq", "at", "event", "actor", "role", "subject", "outcome", "request_id", "detail", "digest")
-FORMULA = ("=", "+", "-", "@", "\t", "\r")
-"""First characters that spreadsheets interpret as a formula."""
-ExportFormat = Literal["csv", "jsonl"]
-
-
-@dataclass(frozen=True)
-class Wanted:
-    """Filter for entries; None matches any value."""
-
-    event: str | None = None
-    """Event name such as `model.activate`, or `model` for all its events."""
-    actor: str | None = None
-    """Part of the entry's actor in any letter case, for example the name or the id of an API key."""
-    subject: str | None = None
-    """Part of the entry's subject in any letter case."""
-    outcome: Outcome | None = None
-    since: datetime | None = None
-    until: datetime | None = None
-    """End of the time range, exclusive. `since` and `until` have a time zone."""
-
-    def fits(self, values: Mapping[str, Any]) -> bool:
-        """Return True if the values of an entry match."""
-        at = values["at"]  # all in UTC with milliseconds, so text order is time order
-        return (
-            (self.outcome is None or values["outcome"] == self.outcome)
-            and (self.event is None or f"{values['event']}.".startswith(f"{self.event.rstrip('.')}."))
-            and (self.actor is None or self.actor.lower() in values["actor"].lower())
-            and (self.subject is None or self.subject.lower() in values["subject"].lower())
-            and (self.since is None or at >= _stamp(self.since))
-            and (self.until is None or at < _stamp(self.until))
-        )
-
-
-@dataclass(frozen=True)
-class Page:
-    """Entries, newest first. `before` is the argument for the next page; None if the beginning of the log is
-    reached."""
-
-    entries: list[Entry]
-    before: int | None
-
-
-def newest(log: Path, count: int, before: int | None = None) -> list[Entry]:
-    """Return up to `count` entries below number `before`, newest first.
-
-    Raises:
-        ValueError: if a line is no entry.
-    """
-    return search(log, Wanted(), count, before).entries
-
-
-def search(log: Path, wanted: Wanted, count: int, before: int | None = None) -> Page:
-    """Return up to `count` matching entries, newest first.
-
-    Args:
-        log: path of the log.
-        wanted: filter.
-        count: maximum number of entries.
-        before: return only entries below this number.
-
-    Raises:
-        ValueError: if a line is no entry.
-    """
-    while True:
-        closed = closed_segments(log)
-        older = [each.path for each in reversed(closed) if before is None or each.first_seq < before]
-        try:
-            found = _search([*([log] if log.exists() else []), *older], wanted, count, before)
-        except FileNotFoundError:  # closed or removed a moment ago
-            continue
-        # Another list means that a segment was closed or removed during the search, so entries may be missing.
-        if closed == closed_segments(log):
-            return found
-
-
-def _search(files: list[Path], wanted: Wanted, count: int, before: int | None) -> Page:
-    found: list[Entry] = []
-    looked_at = 0
-    for line in (line for file in files for line in lines_backwards(file)):
-        if wanted == Wanted():
-            entry, _ = parse_line(line)
-            number, fits = entry.seq, True
-        else:  # full validation of a line takes five times as long as parsing
-            values = json.loads(line)
-            number, fits = int(values["seq"]), wanted.fits(values)
-        if before is not None and number >= before:
-            continue
-        looked_at += 1
-        if fits:
-            found.append(entry if wanted == Wanted() else parse_line(line)[0])
-        if len(found) >= count or (looked_at >= MOST_LOOKED_AT and wanted != Wanted()):
-            return Page(found, number if number > 0 else None)
-    return Page(found, None)
-
-
-def exported(log: Path, wanted: Wanted, form: ExportFormat) -> Iterator[bytes]:
-    """Yield the matching entries as a file, oldest first.
-
-    `jsonl` has the original lines with their digests. `csv` has a heading, and cells that a
-    spreadsheet would interpret as a formula are prefixed with an apostrophe.
-    """
-    if form == "csv":
-        yield (",".join(CSV_FIELDS) + "\r\n").encode()
-    piece = bytearray()
-    with ExitStack() as opened:
-        for file in _opened(log, opened):
-            for line in file:
-                if not line.endswith(b"\n"):
-                    break  # this line is still being written
-                values = json.loads(line)
-                if wanted.fits(values):
-                    piece += line if form == "jsonl" else _csv_line(values)
-                if len(piece) >= PIECE_BYTES:
-                    yield bytes(piece)
-                    piece.clear()
-    if piece:
-        yield bytes(piece)
-
-
-def _opened(log: Path, opened: ExitStack) -> list[BinaryIO]:
-    """Open all files of the log, oldest first. Files deleted afterwards remain readable."""
-    while True:
-        closed = closed_segments(log)
-        with ExitStack() as trying:
-            try:
-                files: list[BinaryIO] = [
-                    trying.enter_context(path.open("rb")) for path in (*(each.path for each in closed), log)
-                ]
-            except FileNotFoundError:
-                continue
-            if closed == closed_segments(log):
-                opened.push(trying.pop_all())
-                return files
-
-
-def _csv_line(values: Mapping[str, Any]) -> bytes:
-    cells = [
-        json.dumps(values[name], sort_keys=True) if name == "detail" else str(values.get(name, ""))
-        for name in CSV_FIELDS
-    ]
-    line = io.StringIO()
-    csv.writer(line).writerow([f"'{cell}" if cell.startswith(FORMULA) else cell for cell in cells])
-    return line.getvalue().encode()
-
-
-def _stamp(time: datetime) -> str:
-    return time.astimezone(UTC).isoformat(timespec="milliseconds")
-
-
 log = logging.getLogger(__name__)
+FIRST = 64 * "0"
+"""Digest that the first entry of a log states for its missing predecessor."""
+MOST_LINE_BYTES = 8192
+_DIGEST = re.compile(r"[0-9a-f]{64}")
+_PLAIN = re.compile(r"[\w .:@/+*=,;()'?&#%|-]{0,400}", re.ASCII)
+Outcome = Literal["done", "refused", "failed"]
+Detail = dict[str, str | int | float | bool | None]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """Audit entry. It names callers and objects of the service, never file names or patients."""
+
+    seq: int
+    at: str
+    """Wall-clock time, UTC, ISO 8601."""
+    event: str
+    """Event as `resource.verb`, such as `model.activate`."""
+    actor: str
+    """Name and id of an API key or OpenID Connect user, `shell` for a change of keys by the command line, or `system`
+    for the service itself.
+    """
+    role: str
+    subject: str
+    """Affected object, such as `liver/3`."""
+    outcome: Outcome
+    request_id: str = ""
+    detail: Detail = field(default_factory=dict)
+    previous: str = FIRST
+
+    def __post_init__(self) -> None:
+        for name in ("event", "actor", "role", "subject", "request_id", "at"):
+            if not _PLAIN.fullmatch(getattr(self, name)):
+                raise ValueError(f"audit: {name} is not a short plain text")
+        for key, value in self.detail.items():
+            if not _PLAIN.fullmatch(key) or not _PLAIN.fullmatch(str(value)):
+                raise ValueError(f"audit: the detail {key:.40} is not a short plain value")
+
+    def line(self) -> bytes:
+        """Return the entry with its digest as a JSON line."""
+        values = asdict(self)
+        return _canonical(values | {"digest": digest_of(values)}) + b"\n"
+
+
+def parse_line(line: bytes) -> tuple[Entry, str]:
+    """Return the entry and digest of a line of the audit log.
+
+    Returns:
+        The entry and the stated digest.
+
+    Raises:
+        ValueError: if the line has another format.
+    """
+    try:
+        values = json.loads(line)
+    except RecursionError as error:
+        raise ValueError("it nests values too deep") from error
+    if not isinstance(values, dict) or not _DIGEST.fullmatch(str(values.get("digest"))):
+        raise ValueError("it has no digest")
+    digest = values.pop("digest")
+    seq, detail = values.get("seq"), values.get("detail")
+    if not isinstance(seq, int) or isinstance(seq, bool) or not 0 <= seq < 1 << 63 or not isinstance(detail, dict):
+        raise ValueError("its number or its detail is not that of an entry")
+    try:
+        entry = Entry(**values)
+    except TypeError as error:
+        raise ValueError("its keys are not those of an entry") from error
+    if entry.line() != line.rstrip(b"\n") + b"\n" and digest == digest_of(values):
+        raise ValueError("it is not written as an entry is")
+    return entry, digest
+
+
+def digest_of(values: dict[str, Any]) -> str:
+    """Return the SHA-256 of an entry's values, including the predecessor's digest."""
+    return hashlib.sha256(_canonical(values)).hexdigest()
+
+
+def digest_of_entry(entry: Entry) -> str:
+    """Compute the digest that the line of an entry must state."""
+    return digest_of(asdict(entry))
+
+
+def _canonical(values: dict[str, Any]) -> bytes:
+    return json.dumps(values, sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False).encode()
+
+
+BLOCK_BYTES = 1 << 16
+
+
+def whole_lines_bytes(file: BinaryIO, size: int) -> int:
+    """Return the number of bytes of an open file up to the end of the last complete line below `size`."""
+    end = size
+    while end:
+        start = max(0, end - BLOCK_BYTES)
+        file.seek(start)
+        found = file.read(end - start).rfind(b"\n")
+        if found >= 0:
+            return start + found + 1
+        end = start
+    return 0
+
+
+def lines_backwards(path: Path, size: int | None = None) -> Iterator[bytes]:
+    """Yield the complete lines of a file, last one first."""
+    with open_regular(path) as file:
+        end = whole_lines_bytes(file, os.fstat(file.fileno()).st_size) if size is None else size
+        rest = b""
+        while end:
+            start = max(0, end - BLOCK_BYTES)
+            file.seek(start)
+            block = file.read(end - start) + rest
+            first, *lines = block.split(b"\n")
+            yield from (line for line in reversed(lines) if line)
+            rest, end = first, start
+        if rest:
+            yield rest
+
+
+MOST_BYTES = 4096
+
+
+@dataclass(frozen=True)
+class Head:
+    """Number and digest of an entry, as stored in head and anchor files. `seq` is -1 for a log without entries."""
+
+    seq: int = -1
+    digest: str = FIRST
+
+
+def head_path(log: Path) -> Path:
+    """Return the path of a log's head file."""
+    return log.with_suffix(".head")
+
+
+def anchor_path(log: Path) -> Path:
+    """Return the path of a log's anchor file."""
+    return log.with_suffix(".anchor")
+
+
+def read_head(log: Path) -> Head | None:
+    """Read the head of a log, which names its newest entry; None if the file is missing.
+
+    Raises:
+        ValueError: if the file is malformed.
+    """
+    return _read(head_path(log))
+
+
+def read_anchor(log: Path) -> Head | None:
+    """Read the anchor of a log, which names the last entry removed by retention; None if no entry was removed.
+
+    Raises:
+        ValueError: if the file is malformed.
+    """
+    return _read(anchor_path(log))
+
+
+def write_head(log: Path, head: Head) -> None:
+    """Replace a log's head file atomically."""
+    _write(head_path(log), head)
+
+
+def write_anchor(log: Path, anchor: Head) -> None:
+    """Replace a log's anchor file, which names the last entry removed by retention, atomically."""
+    _write(anchor_path(log), anchor)
+
+
+def _read(path: Path) -> Head | None:
+    try:
+        values = json.loads(read_regular(path, MOST_BYTES))
+    except FileNotFoundError:
+        return None
+    except RecursionError as error:
+        raise ValueError("it nests values too deep") from error
+    except OSError as error:
+        if error.errno != errno.EFBIG:
+            raise
+        raise ValueError(error.strerror) from error
+    if not isinstance(values, dict) or set(values) != {"seq", "digest"}:
+        raise ValueError("it does not hold a number and a digest")
+    seq, digest = values["seq"], values["digest"]
+    if not isinstance(seq, int) or isinstance(seq, bool) or not -1 <= seq < 1 << 63 or not isinstance(digest, str):
+        raise ValueError("it does not hold a number and a digest")
+    return Head(seq, digest)
+
+
+def _write(path: Path, head: Head) -> None:
+    """Replace a file atomically. No step after the rename can fail, so an error means that the
+    earlier content is unchanged."""
+    unfinished = path.with_suffix(f"{path.suffix}.new")
+    data = json.dumps(asdict(head)).encode()
+    descriptor = os.open(unfinished, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+    try:
+        if os.write(descriptor, data) != len(data):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), os.fspath(unfinished))
+        os.fdatasync(descriptor)
+    finally:
+        os.close(descriptor)
+    os.replace(unfinished, path)
+
+
+@dataclass(frozen=True)
+class Keeping:
+    """Size limit of a file, and retention of closed files. By default all are kept."""
+
+    segment_bytes: int = 16 * 2**20
+    segments: int | None = None
+    days: float | None = None
+    trusts_ages: Callable[[], bool] = lambda: True
+    """Returns True while the clock is trusted. Otherwise no file is removed by age."""
+
+
+@dataclass(frozen=True)
+class Segment:
+    """Closed file of the log, named after the number of its first entry."""
+
+    first_seq: int
+    path: Path
+
+    def last(self) -> tuple[Entry, str]:
+        """Return the segment's last entry and the digest stated in its line.
+
+        Raises:
+            ValueError: if the file has no valid entry.
+        """
+        line = next(lines_backwards(self.path), None)
+        if line is None:
+            raise ValueError(f"{self.path.name} is empty")
+        return parse_line(line)
+
+
+def closed_segments(log: Path) -> list[Segment]:
+    """Return the closed segments that retention has not removed, oldest first.
+
+    Raises:
+        ValueError: if the anchor is malformed.
+    """
+    anchor = read_anchor(log)
+    removed = -1 if anchor is None else anchor.seq
+    return [each for each in all_segments(log) if each.first_seq > removed]
+
+
+def all_segments(log: Path) -> list[Segment]:
+    """Return all segments on the disk, including those whose removal was interrupted."""
+    name = re.compile(rf"{re.escape(log.stem)}\.(\d{{12}}){re.escape(log.suffix)}")
+    found = ((name.fullmatch(each), log.parent / each) for each in os.listdir(log.parent))
+    return sorted((Segment(int(match[1]), path) for match, path in found if match), key=lambda each: each.first_seq)
+
+
+def segment_path(log: Path, first_seq: int) -> Path:
+    """Return the path of a closed segment."""
+    return log.with_name(f"{log.stem}.{first_seq:012d}{log.suffix}")
+
+
+def too_old(segments: list[Segment], keeping: Keeping) -> list[Segment]:
+    """Return the segments that exceed the retention limits, oldest first."""
+    surplus = 0 if keeping.segments is None else max(0, len(segments) - keeping.segments)
+    if keeping.days is not None and keeping.trusts_ages():
+        until = datetime.now(UTC) - timedelta(days=keeping.days)
+        while surplus < len(segments) and datetime.fromisoformat(segments[surplus].last()[0].at) < until:
+            surplus += 1
+    return segments[:surplus]
 
 
 class AuditLog:
@@ -264,18 +351,6 @@ class AuditLog:
                     self._close_segment()
                     self._remove_old()
             return self._add(self._next(event, actor, role, subject, outcome, request_id, detail or {}))
-
-    def newest(self, count: int, before: int | None = None) -> list[Entry]:
-        """Return up to `count` entries below number `before`, newest first."""
-        return newest(self.path, count, before)
-
-    def search(self, wanted: Wanted, count: int, before: int | None = None) -> Page:
-        """Return up to `count` matching entries below number `before`, newest first."""
-        return search(self.path, wanted, count, before)
-
-    def exported(self, wanted: Wanted, form: ExportFormat) -> Iterator[bytes]:
-        """Yield the matching entries as a file, oldest first; see `services.audit.log.exported`."""
-        return exported(self.path, wanted, form)
 
     @property
     def head(self) -> Head:

@@ -28,7 +28,7 @@ from typing import Any
 from gsplat_core.errors import UserError
 from gsplat_core.io.files import read_regular
 from services.audit import AuditLog, AuditUnwritable
-from services.audit.files import Detail
+from services.audit.log import Detail
 
 log = logging.getLogger(__name__)
 

@@ -9,6 +9,7 @@ from starlette.testclient import TestClient
 
 from services.api import Parts, new_app
 from services.api.guard import CallerOf, new_router, recorded, requires
+from services.audit import Wanted, search
 from services.auth.keys import Role
 from services.console import FILES, PAGE
 from services.settings import ServiceSettings
@@ -41,7 +42,9 @@ def test_a_route_is_guarded_audited_and_documented(tmp_path):
         assert delete(Authorization=f"Bearer {keys['operator']}") == 204
         assert notes == {}
         assert client.get("/openapi.json").json()["paths"]["/v1/notes/{number}"]["delete"]["summary"]
-    entries = [(entry.event, entry.subject, entry.outcome) for entry in control.audit.newest(100)]
+    entries = [
+        (entry.event, entry.subject, entry.outcome) for entry in search(control.audit.path, Wanted(), 100).entries
+    ]
     assert ("note.delete", "1", "done") in entries
 
 

@@ -9,8 +9,7 @@ from datetime import UTC, datetime, timedelta
 import pytest
 
 from services.audit import AuditLog, Keeping
-from services.audit.files import closed_segments
-from services.audit.log import SystemEvents
+from services.audit.log import SystemEvents, closed_segments
 from services.clock_guard import CONFIRM_S, FILE, ClockGuard
 from services.jobs.replays import RecordingRetention, ReplayRetention
 
@@ -130,7 +129,7 @@ def test_the_audit_log_stays_while_the_clock_is_not_believed(tmp_path, monkeypat
         def now(cls, tz=None):
             return datetime.now(UTC) + timedelta(days=400)
 
-    monkeypatch.setattr("services.audit.files.datetime", Later)
+    monkeypatch.setattr("services.audit.log.datetime", Later)
     AuditLog(path, keeping).close()
     assert len(closed_segments(path)) == many > 3
     trusted[0] = True

@@ -15,6 +15,7 @@ from starlette.testclient import TestClient
 
 from services.api import Parts, new_app
 from services.api.state import ControlState
+from services.audit import Wanted, search
 from services.auth.keys import Role
 from services.settings import ServiceSettings
 
@@ -50,7 +51,10 @@ class Plane:
 
     def events(self) -> list[tuple[str, str, str]]:
         """Return the audit log's entries, oldest first."""
-        return [(entry.event, entry.subject, entry.outcome) for entry in reversed(self.control.audit.newest(1000))]
+        return [
+            (entry.event, entry.subject, entry.outcome)
+            for entry in reversed(search(self.control.audit.path, Wanted(), 1000).entries)
+        ]
 
 
 @pytest.fixture

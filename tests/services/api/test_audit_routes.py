@@ -9,8 +9,7 @@ from datetime import UTC, datetime, timedelta
 
 import pytest
 
-from services.audit import Wanted, log, verify
-from services.audit import log as audit_log
+from services.audit import AuditLog, Keeping, Wanted, exported, reading, search, verify
 
 
 @pytest.fixture
@@ -65,7 +64,7 @@ def test_times_have_a_zone_and_bound_a_search(kept):
 
 
 def test_pages_of_a_search_have_every_entry_once(kept, monkeypatch):
-    monkeypatch.setattr(log, "MOST_LOOKED_AT", 7)
+    monkeypatch.setattr(reading, "MOST_LOOKED_AT", 7)
     seen, before, asked = [], None, 0
     while asked == 0 or before is not None:
         page = found(kept, count=5, actor="1f1", **({} if before is None else {"before": before}))
@@ -124,13 +123,12 @@ def test_a_table_for_spreadsheets_has_no_formulas(kept):
 
 
 def test_a_download_reads_closed_files_and_those_that_are_removed_meanwhile(tmp_path):
-    from services.audit import AuditLog, Keeping
 
     log = AuditLog(tmp_path / "audit.jsonl", Keeping(segment_bytes=2000))
     for number in range(30):
         log.append("model.activate", actor="console", subject=str(number))
     assert len(list(tmp_path.glob("audit.0*.jsonl"))) > 3
-    pieces = log.exported(Wanted(subject="2"), "csv")
+    pieces = exported(log.path, Wanted(subject="2"), "csv")
     first = next(pieces)
     assert first.startswith(b"seq,at,event")
     lines = b"".join(pieces).splitlines()
@@ -144,7 +142,9 @@ def test_reading_is_an_entry_once_a_minute_and_each_download_is_one(plane):
     found(plane, outcome="refused")
     for _ in range(2):
         plane.ask("GET", "/v1/audit/export", params={"format": "csv"})
-    entries = [entry for entry in plane.control.audit.newest(50) if entry.event.startswith("audit.")]
+    entries = [
+        entry for entry in search(plane.control.audit.path, Wanted(), 50).entries if entry.event.startswith("audit.")
+    ]
     assert [(entry.event, entry.detail) for entry in reversed(entries)] == [
         ("audit.read", {}),
         ("audit.read", {"outcome": "refused"}),
@@ -155,14 +155,14 @@ def test_reading_is_an_entry_once_a_minute_and_each_download_is_one(plane):
 
 @pytest.mark.parametrize("form", ["jsonl", "csv"])
 def test_a_download_is_sent_in_pieces_of_bounded_size(tmp_path, monkeypatch, form):
-    log = audit_log.AuditLog(tmp_path / "audit.jsonl")
+    log = AuditLog(tmp_path / "audit.jsonl")
     for number in range(40):
         log.append("model.activate", actor="console", subject=str(number))
-    whole = b"".join(log.exported(Wanted(), form))
+    whole = b"".join(exported(log.path, Wanted(), form))
     assert whole.count(b"\n") == 40 + (form == "csv")
     longest = max(map(len, whole.splitlines(keepends=True)))
-    monkeypatch.setattr(audit_log, "PIECE_BYTES", 3 * longest)
-    pieces = list(log.exported(Wanted(), form))
+    monkeypatch.setattr(reading, "PIECE_BYTES", 3 * longest)
+    pieces = list(exported(log.path, Wanted(), form))
     log.close()
     assert b"".join(pieces) == whole
     body = pieces[1:] if form == "csv" else pieces

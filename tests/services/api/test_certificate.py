@@ -226,7 +226,7 @@ def test_what_prometheus_gets(tmp_path):
 
 def test_a_change_is_seen_by_itself_and_is_in_the_audit_log(tmp_path, monkeypatch):
     from services.api import server as module
-    from services.audit import AuditLog
+    from services.audit import AuditLog, Wanted, search
 
     monkeypatch.setattr(module, "LOOK_S", 0.01)
     audit, events = AuditLog(tmp_path / "audit.jsonl"), SystemEvents()
@@ -252,7 +252,7 @@ def test_a_change_is_seen_by_itself_and_is_in_the_audit_log(tmp_path, monkeypatc
             await until(2)
 
     asyncio.run(renew())
-    entries = list(reversed(audit.newest(10)))
+    entries = list(reversed(search(audit.path, Wanted(), 10).entries))
     audit.close()
     assert {entry.event for entry in entries} == {"certificate.reload"}
     assert (entries[0].outcome, entries[-1].outcome) == ("failed", "done")

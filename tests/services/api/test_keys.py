@@ -13,6 +13,7 @@ from fastapi.routing import iter_route_contexts
 from starlette.testclient import WebSocketDenialResponse
 
 from services.api.guard import rule_of, still_valid
+from services.audit import Wanted, search
 from services.auth import keys as keys_module
 from services.auth.keys import Caller, KeyConflict, KeyStore, Role, Tickets, first_admin_key
 
@@ -341,7 +342,7 @@ def test_expiry_and_last_use_over_the_api(plane, clock):
     answer = plane.client.get("/v1/me", headers=headers)
     assert answer.status_code == 401 and "has expired at" in answer.json()["detail"]
     assert listed()["expired"] is True
-    (entry,) = [each for each in plane.control.audit.newest(20) if each.subject == "wall"]
+    (entry,) = [each for each in search(plane.control.audit.path, Wanted(), 20).entries if each.subject == "wall"]
     assert entry.detail["expires_at"] == made.json()["expires_at"]
 
 

@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from services.audit import AuditLog, AuditUnwritable, log
+from services.audit import AuditLog, AuditUnwritable, Wanted, log, search
 from services.audit.log import SystemEvents
 
 
@@ -19,7 +19,9 @@ def audit(tmp_path):
 
 
 def said(audit: AuditLog) -> list[tuple[str, str, str]]:
-    return [(entry.event, entry.subject, entry.outcome) for entry in reversed(audit.newest(2000))]
+    return [
+        (entry.event, entry.subject, entry.outcome) for entry in reversed(search(audit.path, Wanted(), 2000).entries)
+    ]
 
 
 def test_events_are_written_while_the_server_runs_and_what_is_left_when_it_ends(audit):
@@ -33,7 +35,7 @@ def test_events_are_written_while_the_server_runs_and_what_is_left_when_it_ends(
 
     asyncio.run(run())
     assert said(audit) == [("process.started", "theatre/engine", "done"), ("process.ended", "theatre/engine", "failed")]
-    newest = audit.newest(1)[0]
+    newest = search(audit.path, Wanted(), 1).entries[0]
     assert (newest.actor, newest.detail) == ("system", {"reason": "killed by SIGKILL"})
 
 
@@ -49,7 +51,9 @@ def test_more_than_may_wait_are_counted(audit, monkeypatch):
 
     asyncio.run(run())
     assert len(said(audit)) == 21
-    assert audit.newest(1)[0].event == "audit.missed" and audit.newest(1)[0].detail == {"events": 3}
+    assert search(audit.path, Wanted(), 1).entries[0].event == "audit.missed" and search(
+        audit.path, Wanted(), 1
+    ).entries[0].detail == {"events": 3}
 
 
 def test_what_cannot_be_written_is_in_the_log_and_the_next_one_is_tried(audit, caplog, monkeypatch):

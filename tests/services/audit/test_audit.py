@@ -14,8 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from services.audit import AuditError, AuditLog, AuditUnwritable, verify
-from services.audit.files import Entry, digest_of_entry, head_path, parse_line, read_anchor
+from services.audit import AuditError, AuditLog, AuditUnwritable, Wanted, search, verify
+from services.audit.log import Entry, digest_of_entry, head_path, parse_line, read_anchor
 
 ENTRIES = 12
 
@@ -116,7 +116,7 @@ def test_a_line_that_a_crash_cut_is_told_apart_and_taken_off(path):
     verdict = verify(path)
     assert verdict.intact and verdict.cut_by_a_crash and verdict.entries == ENTRIES
     log = AuditLog(path)
-    assert log.newest(1)[0].event == "audit.recovered"
+    assert search(log.path, Wanted(), 1).entries[0].event == "audit.recovered"
     log.close()
     assert verify(path).intact and path.read_bytes().startswith(whole)
 
@@ -165,7 +165,7 @@ def test_entries_that_are_written_during_the_verification_are_no_finding(path, m
             log.append("model.rollback", actor="console")
         return anchor
 
-    monkeypatch.setattr(sys.modules["services.audit.verify"], "read_anchor", read_anchor_late)
+    monkeypatch.setattr(sys.modules["services.audit.reading"], "read_anchor", read_anchor_late)
     verdict = verify(path)
     log.close()
     assert verdict.intact and verdict.entries == ENTRIES + 3
@@ -215,7 +215,7 @@ def test_a_lost_head_is_found(path):
 def test_a_broken_log_is_put_aside_and_the_service_goes_on(path):
     path.write_bytes(b"".join(lines(path)[:-2]))
     log = AuditLog(path)
-    entry = log.newest(1)[0]
+    entry = search(log.path, Wanted(), 1).entries[0]
     log.close()
     aside = path.with_name(str(entry.detail["put_aside"]))
     assert (entry.event, entry.seq) == ("audit.broken", 0)
@@ -273,8 +273,8 @@ def test_pages_are_read_from_the_end(tmp_path):
     log = AuditLog(tmp_path / "audit.jsonl")
     for number in range(400):
         log.append("x", actor="a", detail={"padding": 300 * "p", "number": number})
-    assert [entry.seq for entry in log.newest(3)] == [399, 398, 397]
-    assert [entry.seq for entry in log.newest(500, before=200)] == list(range(199, -1, -1))
+    assert [entry.seq for entry in search(log.path, Wanted(), 3).entries] == [399, 398, 397]
+    assert [entry.seq for entry in search(log.path, Wanted(), 500, before=200).entries] == list(range(199, -1, -1))
     log.close()
 
 

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from services.audit import AuditLog, AuditUnwritable, Keeping, verify
-from services.audit.files import Head, digest_of_entry, head_path, parse_line, read_head, write_head
+from services.audit import AuditLog, AuditUnwritable, Keeping, Wanted, search, verify
+from services.audit.log import Head, digest_of_entry, head_path, parse_line, read_head, write_head
 
 CALLS = ("open", "write", "fsync", "fdatasync", "ftruncate", "rename", "replace")
 ONE_FILE = Keeping()
@@ -65,12 +65,14 @@ def wire(monkeypatch) -> Tripwire:
 
 def subjects(log: AuditLog) -> list[str]:
     """Subjects of the entries that callers have asked for, the oldest first."""
-    return [entry.subject for entry in reversed(log.newest(1000)) if entry.event == "model.activate"]
+    return [
+        entry.subject for entry in reversed(search(log.path, Wanted(), 1000).entries) if entry.event == "model.activate"
+    ]
 
 
 def reopened(path: Path, keeping: Keeping) -> AuditLog:
     log = AuditLog(path, keeping)
-    assert not list(path.parent.glob("*broken*")), log.newest(1)
+    assert not list(path.parent.glob("*broken*")), search(log.path, Wanted(), 1).entries
     return log
 
 
@@ -183,7 +185,7 @@ def test_a_valid_chain_that_is_ahead_of_its_head_is_taken_over(tmp_path):
         write_head(path, head)
         assert "follow the newest one that the service confirmed" in verify(path).findings[0].what
         again = reopened(path, keeping)
-        said = again.newest(1)[0]
+        said = search(again.path, Wanted(), 1).entries[0]
         assert (said.event, said.detail) == ("audit.recovered", {"entries_ahead_of_the_head": 7})
         assert said.previous == digest_of_entry(newest) and subjects(again) == list("abcdefgh")
         again.close()
@@ -214,5 +216,5 @@ def test_a_chain_that_is_ahead_and_does_not_fit_is_put_aside(tmp_path, which, ch
         which == "the last" and change != "changed"
     )  # without the head, nothing tells such a last entry from a true one
     log = AuditLog(path)
-    assert log.newest(1)[0].event == ("audit.recovered" if consistent else "audit.broken")
+    assert search(log.path, Wanted(), 1).entries[0].event == ("audit.recovered" if consistent else "audit.broken")
     log.close()

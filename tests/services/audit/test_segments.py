@@ -14,8 +14,9 @@ from pathlib import Path
 
 import pytest
 
-from services.audit import AuditLog, Keeping, files, verify
-from services.audit.files import anchor_path, closed_segments, parse_line, read_anchor, segment_path, write_anchor
+from services.audit import AuditLog, Keeping, Wanted, search, verify
+from services.audit import log as audit_log
+from services.audit.log import anchor_path, closed_segments, parse_line, read_anchor, segment_path, write_anchor
 
 SMALL = Keeping(segment_bytes=1000)
 ENTRIES = 20
@@ -42,8 +43,8 @@ def test_the_chain_goes_on_over_files(path):
     assert (verdict.intact, verdict.entries, verdict.head.seq, verdict.removed) == (True, ENTRIES, ENTRIES - 1, 0)
     assert verify(path, closed[0].last()[1]).intact, "a digest that was noted long ago"
     log = AuditLog(path, SMALL)
-    assert [entry.seq for entry in log.newest(100)] == list(reversed(range(ENTRIES)))
-    assert [entry.seq for entry in log.newest(3, before=closed[1].first_seq + 1)] == [
+    assert [entry.seq for entry in search(log.path, Wanted(), 100).entries] == list(reversed(range(ENTRIES)))
+    assert [entry.seq for entry in search(log.path, Wanted(), 3, before=closed[1].first_seq + 1).entries] == [
         closed[1].first_seq - n for n in range(3)
     ]
     log.close()
@@ -95,7 +96,7 @@ def test_segments_go_by_their_age(tmp_path, monkeypatch):
         def now(cls, tz=None):
             return datetime.now(UTC) + timedelta(days=1.5)
 
-    monkeypatch.setattr("services.audit.files.datetime", Tomorrow)
+    monkeypatch.setattr("services.audit.log.datetime", Tomorrow)
     AuditLog(log.path, keeping).close()
     assert closed_segments(log.path) == [] and verify(log.path).intact
 
@@ -155,7 +156,7 @@ def test_a_crash_while_segments_are_removed(path, step, monkeypatch):
 def test_a_broken_log_is_put_aside_with_its_segments(path):
     path.write_bytes(b"")
     log = AuditLog(path, SMALL)
-    entry = log.newest(1)[0]
+    entry = search(log.path, Wanted(), 1).entries[0]
     log.close()
     aside = path.with_name(str(entry.detail["put_aside"]))
     assert closed_segments(path) == [] and verify(path).intact
@@ -193,7 +194,7 @@ def test_kill_at_any_moment_leaves_a_log_that_fits(tmp_path):
 def test_a_file_that_is_replaced_after_it_was_opened_is_read_to_its_end(tmp_path, monkeypatch):
     log = tmp_path / "audit.jsonl"
     log.write_bytes(b"first line\nsecond line\nunfinished")
-    opened = files.open_regular
+    opened = audit_log.open_regular
 
     def open_and_replace(path):
         file = opened(path)
@@ -201,8 +202,8 @@ def test_a_file_that_is_replaced_after_it_was_opened_is_read_to_its_end(tmp_path
         log.write_bytes(b"new\n")
         return file
 
-    monkeypatch.setattr(files, "open_regular", open_and_replace)
-    assert list(files.lines_backwards(log)) == [b"second line", b"first line"]
+    monkeypatch.setattr(audit_log, "open_regular", open_and_replace)
+    assert list(audit_log.lines_backwards(log)) == [b"second line", b"first line"]
 
 
 def test_a_log_is_read_and_verified_while_it_is_written(tmp_path):
@@ -217,7 +218,7 @@ def test_a_log_is_read_and_verified_while_it_is_written(tmp_path):
     writer = threading.Thread(target=write)
     writer.start()
     while not ended.is_set():
-        seen = [entry.seq for entry in log.newest(10)]
+        seen = [entry.seq for entry in search(log.path, Wanted(), 10).entries]
         assert seen == sorted(seen, reverse=True) and len(set(seen)) == len(seen)
         assert seen == [] or seen[0] - seen[-1] == len(seen) - 1
     writer.join()

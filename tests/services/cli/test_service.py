@@ -9,7 +9,7 @@ from functools import partial
 
 import pytest
 
-from services.audit import AuditLog
+from services.audit import AuditLog, Wanted, search
 from services.auth.keys import KeyStore
 from services.cli.app import run
 from services.cli.exit_codes import BAD_INPUT, OK
@@ -45,7 +45,10 @@ def test_a_key_is_made_listed_and_revoked(tmp_path, capsys):
     assert run(["keys", "revoke", listed["console"]["id"], *data]) == BAD_INPUT
     assert "only administrator" in capsys.readouterr().err
     log = AuditLog(tmp_path / "audit.jsonl")
-    said = [(entry.event, entry.actor, entry.subject, entry.detail["role"]) for entry in reversed(log.newest(9))]
+    said = [
+        (entry.event, entry.actor, entry.subject, entry.detail["role"])
+        for entry in reversed(search(log.path, Wanted(), 9).entries)
+    ]
     log.close()
     assert said == [
         ("key.create", "shell", "console", "admin"),
@@ -61,9 +64,9 @@ def test_a_server_that_runs_writes_what_a_shell_changes(tmp_path, capsys):
     keys = KeyStore(tmp_path / "keys.json")
     keys.watch(partial(changed_outside, server))
     assert run(["keys", "add", "console", "--data", str(tmp_path)]) == OK
-    assert server.newest(9) == []
+    assert search(server.path, Wanted(), 9).entries == []
     keys.all()
-    (entry,) = server.newest(9)
+    (entry,) = search(server.path, Wanted(), 9).entries
     server.close()
     assert (entry.event, entry.actor, entry.subject) == ("key.create", "shell", "console")
     assert entry.detail["key_id"] in capsys.readouterr().out
