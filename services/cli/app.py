@@ -202,7 +202,7 @@ def evaluate(
     json: JsonOption = False,
 ) -> int:
     """Evaluate a model or a run on a recording, next to trivial baselines, or a model on a scene in COLMAP's format."""
-    from services.cli.evaluate import evaluate_command, evaluate_scene_command, evaluation_settings, scene_settings
+    from services.cli.runs import evaluate_command, evaluate_scene_command, evaluation_settings, scene_settings
 
     if recording is None:
         return evaluate_scene_command(model, scene_settings(options), out, as_json=json)

@@ -133,9 +133,8 @@ def test_numbers_inside_texts_are_plain_too(number):
     from gsplat_core.errors import InvalidSetting
     from operators.sources.address import Address
     from services.cli.ctl import moment
-    from services.cli.evaluate import _place
     from services.cli.models import pixel_of
-    from services.cli.runs import recording_kept
+    from services.cli.runs import _place, recording_kept
 
     assert isinstance(moment("10m"), datetime)
     assert pixel_of("10,10") == (10, 10) and _place("0:2,10:12").again == (10, 12)

@@ -8,12 +8,12 @@ from typing import Any
 import pytest
 
 from gsplat_core.errors import InvalidSetting
-from services.cli import evaluate
+from services.cli import runs
 
 
 def test_two_stays_at_a_place() -> None:
-    visits = evaluate._place("0:2,60:62.5")
-    assert visits == evaluate.Visits((0.0, 2.0), (60.0, 62.5))
+    visits = runs._place("0:2,60:62.5")
+    assert visits == runs.Visits((0.0, 2.0), (60.0, 62.5))
 
 
 @pytest.mark.parametrize(
@@ -21,7 +21,7 @@ def test_two_stays_at_a_place() -> None:
 )
 def test_other_texts_are_no_stays(text: str) -> None:
     with pytest.raises(InvalidSetting, match="give two stays in seconds"):
-        evaluate._place(text)
+        runs._place(text)
 
 
 def score(psnr_db: float, ssim: float | None = 0.9) -> Any:
@@ -41,7 +41,7 @@ def report(**facts: Any) -> Any:
 
 
 def test_a_table_has_each_protocol_with_its_baselines_below_it() -> None:
-    lines = evaluate.table(report(causal=Facts(score=score(30.0)), baselines=[baseline("previous_frame", 1)]))
+    lines = runs.evaluation_table(report(causal=Facts(score=score(30.0)), baselines=[baseline("previous_frame", 1)]))
     assert [line.split() for line in lines[:1]] == [["frames", "tissue", "dB", "frame", "dB", "SSIM", "worst", "dB"]]
     assert lines[1].startswith("Causal: ") and lines[1].split()[-5:] == ["12", "30.00", "29.00", "0.9000", "25.00"]
     assert lines[2].startswith("  previous_frame ") and lines[2].split()[1:] == ["11", "20.00", "–"]
@@ -52,15 +52,15 @@ def test_a_table_has_each_protocol_with_its_baselines_below_it() -> None:
 
 
 def test_without_a_protocol_the_baselines_stand_alone() -> None:
-    lines = evaluate.table(report(baselines=[baseline("future")]))
+    lines = runs.evaluation_table(report(baselines=[baseline("future")]))
     assert len(lines) == 2 and lines[1].startswith("  future (sees the future)")
 
 
 def test_ages_of_a_live_run_are_a_line() -> None:
     ages = Facts(p50_ms=50.04, p95_ms=95.0, p99_ms=99.0, max_ms=120.0)
     live = Facts(score=score(30.0, None), settled=score(31.0), age_when_shown=ages)
-    lines = evaluate.table(report(live=live))
+    lines = runs.evaluation_table(report(live=live))
     assert lines[-1] == "age when shown: p50 50.0, p95 95.0, p99 99.0, max 120.0 ms"
     assert lines[1].split()[-2] == "–"
     live.age_when_shown = None
-    assert len(evaluate.table(report(live=live))) == 3
+    assert len(runs.evaluation_table(report(live=live))) == 3

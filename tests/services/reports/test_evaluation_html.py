@@ -7,7 +7,7 @@ import re
 import pytest
 from pydantic import ValidationError
 
-from services.cli.evaluate import table
+from services.cli.runs import evaluation_table
 from services.reports.evaluation import EvaluationReport
 from services.reports.evaluation_html import at_age, render_evaluation, table_section, write_evaluation_html
 
@@ -121,7 +121,7 @@ def test_each_protocol_stands_beside_its_baselines(report):
 
 
 def test_the_table_for_the_terminal_has_equal_columns(report):
-    lines = table(report)
+    lines = evaluation_table(report)
     assert lines[0].split() == ["frames", "tissue", "dB", "frame", "dB", "SSIM", "worst", "dB"]
     (causal,) = [line for line in lines if line.startswith("Causal")]
     assert causal.split()[-5:] == ["7", "39.25", "40.25", "0.9500", "36.25"]
@@ -133,10 +133,10 @@ def test_without_any_protocol_there_are_the_baselines(content):
     bare = content | {"heldout": None, "causal": None, "live": None, "retention": None, "returns": {}, "series": {}}
     report = EvaluationReport.model_validate(bare)
     assert "label of half_way_flow" in render_evaluation(report) and any(
-        "half_way_flow" in line for line in table(report)
+        "half_way_flow" in line for line in evaluation_table(report)
     )
     nothing = report.model_copy(update={"baselines": [], "left_out": {}, "notes": []})
-    assert "<table" in render_evaluation(nothing) and len(table(nothing)) == 1
+    assert "<table" in render_evaluation(nothing) and len(evaluation_table(nothing)) == 1
 
 
 def test_an_interrupted_evaluation_says_so(report):
