@@ -32,7 +32,6 @@ from services.audit import AuditLog, AuditUnwritable, Keeping
 from services.audit.log import Outcome, SystemEvents
 from services.auth.keys import KeyStore, Tickets, changed_outside, first_admin_key, keys_read_again
 from services.bus.runtime import RuntimeFolder
-from services.clock_guard import ClockGuard
 from services.errors import (
     BusError,
     Conflict,
@@ -47,13 +46,13 @@ from services.errors import (
 from services.exports.files import ExportCache
 from services.exports.snapshots import ModelExports, SnapshotStore, StreamSnapshots
 from services.jobs.pool import PoolKeeper, PoolProcess, PoolSettings
-from services.jobs.replays import RecordingRetention, ReplayRetention, Replays
-from services.jobs.results import Results
+from services.jobs.results import Replays, Results
 from services.jobs.store import JobStore, uses_recording
 from services.missing_files import StoredFiles, StoredFilesWatch
 from services.recordings.store import RecordingStore, State
 from services.registry.models import DATABASE_FILE, ModelRegistry
 from services.registry.records import NICENESS
+from services.retention import ClockGuard, RecordingRetention, ReplayRetention
 from services.schemas import CheckResult
 from services.settings import ServiceSettings, SettingsInvalid
 from services.supervisor.process import StreamEvent

@@ -24,7 +24,7 @@ from services.jobs.store import JobState
 from services.schemas import BatchView, ModelTarget, ReplayRequest, ReplayView, Submitted, VersionView
 
 if TYPE_CHECKING:
-    from services.jobs.replays import Replays
+    from services.jobs.results import Replays
 
 router = new_router("replays")
 JobId = Annotated[str, Path(pattern=r"^[0-9a-f]{16}$", examples=["1f0c9a3b5d7e8f20"])]

@@ -36,7 +36,7 @@ from services.settings import ServiceSettings
 if TYPE_CHECKING:
     from services.auth.oidc import OpenIdPersons
     from services.exports.snapshots import ModelExports, StreamSnapshots
-    from services.jobs.replays import Replays
+    from services.jobs.results import Replays
     from services.recordings.store import RecordingStore
     from services.registry.models import ModelRegistry
     from services.supervisor.stream import SupervisedStreams

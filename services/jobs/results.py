@@ -1,4 +1,4 @@
-"""Files of jobs: result folders, and the attempt that fills one.
+"""Replay jobs of a server with their files: result folders, and the attempt that fills one.
 
 An attempt reports by files alone, so it may run on any machine with the folder. Its working folder is published by one rename.
 """
@@ -10,15 +10,17 @@ import fcntl
 import json
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from gsplat_core.choices import OUTPUTS, STANDARD
 from gsplat_core.io.files import sync_folder
-from services.errors import StoreUnavailable
-from services.jobs.store import JobProgress, JobState
+from services.errors import NotFound, StoreUnavailable
+from services.jobs.store import JobProgress, JobRecord, JobState, JobStore, NewJob, Submission
+from services.recordings.store import Expired
 
 RUNNING, LOCK = ".running", "lock"
 OUT, REPORT = "out", "report.json"
@@ -81,6 +83,80 @@ class Results:
         except FileNotFoundError:
             return
         shutil.rmtree(gone, ignore_errors=True)
+
+
+class Replays:
+    """Replay jobs with their result files. Synchronous and thread-safe."""
+
+    def __init__(self, store: JobStore, results: Results) -> None:
+        self._store, self._results = store, results
+
+    def submit(
+        self, recordings: Sequence[str], options: Mapping[str, Any], by: str, idempotency_key: str | None
+    ) -> Submission:
+        """Queue one job per recording."""
+        return self._store.submit([NewJob(name) for name in recordings], options, by, idempotency_key)
+
+    def newest(self, count: int, *, before: int | None, batch: str | None, state: str | None) -> list[JobRecord]:
+        """Return replays, newest first."""
+        return self._store.newest(count, before=before, batch=batch, state=state)
+
+    def get(self, job_id: str) -> JobRecord:
+        """Return one replay."""
+        return self._store.get(job_id)
+
+    def counts(self, batch: str | None = None) -> dict[str, int]:
+        """Return the number of replays in each state; if `batch` is given, of that batch."""
+        return self._store.counts(batch)
+
+    def cancel(self, job_id: str, by: str) -> JobRecord:
+        """Cancel a queued or running replay."""
+        return self._store.cancel(job_id, by)
+
+    def delete(self, job_id: str) -> JobRecord:
+        """Delete a finished replay and its results."""
+        record = self._store.forget(job_id)
+        self._results.remove(record.folder)
+        return record
+
+    def expire(self, max_age_s: float | None, most: int | None) -> list[Expired]:
+        """Delete ended replays beyond the limits on age and number.
+
+        Args:
+            max_age_s: age limit in seconds, or None.
+            most: number limit, or None.
+
+        Returns:
+            The deleted replays, each with the reason.
+        """
+        gone = []
+        for job_id, why in self._store.surplus(max_age_s, most):
+            with suppress(NotFound):  # a concurrent request has deleted the replay
+                self.delete(job_id)
+                gone.append(Expired(job_id, why))
+        return gone
+
+    def files(self, job: JobRecord) -> list[str]:
+        """Return the names of the result files; none unless the replay is done."""
+        return self._results.files(job.folder) if job.state == JobState.DONE else []
+
+    def file(self, job_id: str, name: str) -> Path:
+        """Return the path of a result file.
+
+        Raises:
+            NotFound: if there is no such result file.
+            StoreUnavailable: if the replay is done and its result is missing on the disk.
+        """
+        job = self.get(job_id)
+        if job.state == JobState.DONE and not self.files(job):
+            raise StoreUnavailable(
+                f"the result of the replay {job_id} is not on the disk; restore it from a backup, or delete the replay and make it again"
+            )
+        if name not in FILES or name not in self.files(job):
+            raise NotFound(
+                f"the replay {job_id} is {job.state} and has no {name[:40]}; GET /v1/replays/{job_id} lists its results"
+            )
+        return self._results.folder / job.folder / name
 
 
 class Workspace:

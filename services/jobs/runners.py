@@ -1,23 +1,91 @@
-"""Runners of attempts: forked processes of this machine, or a Ray cluster (extra `ray`)."""
+"""Attempts of jobs: replay, reports and packed model, run in forked processes of this machine or on a Ray cluster (extra `ray`).
+
+Only an attempt loads torch, so functions import it.
+"""
 
 from __future__ import annotations
 
 import gc
 import os
 import resource
+import shutil
 import signal
 import sys
 import threading
+import time
 import traceback
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
-from typing import Any, NoReturn, Protocol
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn, Protocol
 
+from services.cli.exit_codes import user_sentence
 from services.errors import StoreUnavailable
 from services.jobs.results import Task
+from services.jobs.store import JobProgress, JobState
 from services.private_files import keep_files_private
+from services.registry.bundle_file import SUFFIX, pack
 from services.supervisor.launcher import ended_how
+
+if TYPE_CHECKING:
+    from operators.applications.session import Progress, RunOutcome
+
+SAY_S = 0.2
+MODEL = "model"
+
+
+def work(task: Task) -> None:
+    """Run one attempt and report its outcome. A bug is reported as failure too, because a retry would fail again."""
+    import torch
+
+    from operators.applications.replay import ReplaySettings, replay
+    from services.reports.build import require_shown, write_reports
+
+    def report(outcome: RunOutcome, folder: Path) -> None:
+        write_reports(outcome, folder)
+
+    torch.set_num_threads(task.threads)
+    try:
+        settings = ReplaySettings(recording=Path(task.source), out=task.out, **task.options)
+        require_shown(replay(settings, _Teller(task), report=report))
+        if task.pack_model:
+            _pack(task.out)
+    except Exception as error:  # noqa: BLE001 - the error message becomes the failed job's reason
+        traceback.print_exc(file=sys.stderr)
+        sentence = user_sentence(error, [task.source])
+        reason = (
+            f"a bug in this program ({type(error).__name__}); the log has the rest" if sentence is None else sentence
+        )
+        task.say_outcome(JobState.FAILED, reason.replace(f"{Path(task.source).parent}/", ""))
+    else:
+        task.say_outcome(JobState.DONE)
+
+
+class _Teller:
+    """Progress callback of a run that writes `JobProgress` to the attempt's folder a few times per second."""
+
+    def __init__(self, task: Task) -> None:
+        self._task, self._said_s = task, 0.0
+        self._next_db: float | None = None
+
+    def __call__(self, progress: Progress) -> None:
+        now_s = time.monotonic()
+        if now_s - self._said_s >= SAY_S or progress.done == progress.total:
+            self._said_s = now_s
+            next_db = progress.next_frame_db
+            self._next_db = self._next_db if next_db is None else next_db  # the last frame has no prediction score
+            self._task.say_progress(
+                JobProgress(
+                    progress.done, progress.total, progress.psnr_tissue_db, progress.previous_frame_db, self._next_db
+                )
+            )
+
+
+def _pack(out: Path) -> None:
+    if (out / MODEL).is_dir():
+        pack(out / MODEL, out / f"{MODEL}{SUFFIX}")
+        shutil.rmtree(out / MODEL)
 
 
 class Runner(Protocol):
@@ -46,7 +114,7 @@ def load() -> None:
     """Import everything that attempts need. Call before the first fork, in a single-threaded process."""
     # The NVML check detects GPUs without initialising CUDA; after initialisation no forked process could use CUDA.
     os.environ["PYTORCH_NVML_BASED_CUDA_CHECK"] = "1"
-    import services.jobs.work  # noqa: F401
+    import services.reports.build  # noqa: F401
 
     gc.collect()
     gc.freeze()  # excludes the imported objects from garbage collection, so their pages stay shared
@@ -105,8 +173,6 @@ def _become(task: Task, life: int) -> NoReturn:
         threading.Thread(target=_end_with_the_pool, args=(life,), name="life", daemon=True).start()
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # a core file would contain patient images
         os.nice(task.niceness)
-        from services.jobs.work import work
-
         # A new thread has no OpenMP team. This one may have the team of the thread that forked it, whose members do not
         # exist in the fork, so that a parallel loop would wait for them for ever.
         with ThreadPoolExecutor(1, thread_name_prefix="attempt") as attempt:
@@ -140,8 +206,6 @@ ATTEMPTS_OF_A_PROCESS = 20
 
 def _attempt(values: dict[str, Any]) -> None:
     """Run an attempt in a Ray worker process."""
-    from services.jobs.work import work
-
     keep_files_private()
     work(Task(**values))
 

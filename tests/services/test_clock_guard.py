@@ -10,8 +10,7 @@ import pytest
 
 from services.audit import AuditLog, Keeping
 from services.audit.log import SystemEvents, closed_segments
-from services.clock_guard import CONFIRM_S, FILE, ClockGuard
-from services.jobs.replays import RecordingRetention, ReplayRetention
+from services.retention import CONFIRM_S, FILE, ClockGuard, RecordingRetention, ReplayRetention
 
 DAY_S = 86_400.0
 

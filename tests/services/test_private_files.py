@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 import services
-from services.jobs import runners, work
+from services.jobs import runners
 from services.jobs.results import Task
 from services.private_files import KEPT, FolderNotPrivate, make_state_private
 
@@ -72,13 +72,13 @@ def test_every_process_begins_with_a_umask_of_its_own(monkeypatch, module, funct
 
 def test_an_attempt_on_ray_begins_with_a_umask_of_its_own(monkeypatch, tmp_path, open_umask):
     masks = []
-    monkeypatch.setattr(work, "work", lambda task: masks.append(os.umask(0o022)))
+    monkeypatch.setattr(runners, "work", lambda task: masks.append(os.umask(0o022)))
     runners._attempt(asdict(Task("job", "recording", str(tmp_path))))
     assert masks == [0o077]
 
 
 def test_the_programs_are_found():
-    assert {"launcher", "capture", "engine", "pool", "check", "make"} <= {path.stem for path in programs()}
+    assert {"launcher", "capture", "engine", "pool", "check", "files"} <= {path.stem for path in programs()}
 
 
 def test_a_process_and_what_it_starts_create_private_files(tmp_path, open_umask):

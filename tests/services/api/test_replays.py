@@ -13,8 +13,7 @@ from services.api.app import ERRORS
 from services.api.problems import PROBLEM_JSON, Conflicting, Missing
 from services.api.replays import REPORT_POLICY
 from services.errors import NotFound
-from services.jobs.replays import Replays
-from services.jobs.results import Results
+from services.jobs.results import Replays, Results
 from services.jobs.store import Claims, JobProgress, JobState, JobStore
 
 REPLAYS = "/v1/replays"

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import asyncio
 
-from services.jobs.replays import DAY_S, RecordingRetention, ReplayRetention, Replays
-from services.jobs.results import Results
+from services.jobs.results import Replays, Results
 from services.jobs.store import JobStore, NewJob
 from services.recordings.store import Expired
+from services.retention import DAY_S, RecordingRetention, ReplayRetention
 
 
 class FakeStore:

@@ -18,7 +18,7 @@ import torch
 
 from gsplat_core.errors import InvalidSetting
 from operators.applications.session import Progress
-from services.jobs import runners, work
+from services.jobs import runners
 from services.jobs.pool import new_runner
 from services.jobs.results import Task
 from services.jobs.runners import Forks
@@ -35,7 +35,7 @@ def forks() -> Iterator[Forks]:
 @pytest.fixture
 def body(monkeypatch) -> Callable[[Callable[[Task], None]], None]:
     """Replace the body of jobs in the forked processes."""
-    return lambda function: monkeypatch.setattr(work, "work", function)
+    return lambda function: monkeypatch.setattr(runners, "work", function)
 
 
 def task(folder: Path, name: str = "a", **fields) -> Task:
@@ -152,7 +152,7 @@ FORKED_AFTER_OPENMP = """
 import sys, time
 from pathlib import Path
 import torch
-from services.jobs import work
+from services.jobs import runners
 from services.jobs.results import Task
 from services.jobs.runners import Forks
 
@@ -162,7 +162,7 @@ def body(task):
 
 torch.set_num_threads(2)
 torch.zeros(1 << 20).add_(1)  # makes the OpenMP team of this thread
-work.work = body
+runners.work = body
 forks = Forks()
 forks.start(Task("a", "recording", sys.argv[1]))
 deadline = time.monotonic() + 60
@@ -192,8 +192,8 @@ def replayed(monkeypatch):
             seen.append(settings)
             run(tell)
 
-        monkeypatch.setattr(work, "replay", replay)
-        monkeypatch.setattr(work, "require_shown", lambda outcome: None)
+        monkeypatch.setattr("operators.applications.replay.replay", replay)
+        monkeypatch.setattr("services.reports.build.require_shown", lambda outcome: None)
         return seen
 
     threads = torch.get_num_threads()
@@ -207,7 +207,7 @@ def test_a_finished_job_reports_its_last_frame_and_keeps_the_last_prediction(rep
         tell(Progress("replay", 3, 3, psnr_tissue_db=33.0, previous_frame_db=29.0))
 
     settings = replayed(run)
-    work.work(job := task(tmp_path, options={"eyes": "both"}, threads=2))
+    runners.work(job := task(tmp_path, options={"eyes": "both"}, threads=2))
     assert torch.get_num_threads() == 2
     assert (str(settings[0].recording), settings[0].out, settings[0].eyes) == (job.source, job.out, "both")
     assert job.outcome() == (JobState.DONE, None)
@@ -216,7 +216,7 @@ def test_a_finished_job_reports_its_last_frame_and_keeps_the_last_prediction(rep
 
 def test_progress_is_written_a_few_times_a_second(replayed, tmp_path, monkeypatch):
     now, written = [100.0], []
-    monkeypatch.setattr(work.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(runners.time, "monotonic", lambda: now[0])
     monkeypatch.setattr(Task, "say_progress", lambda self, reached: written.append(reached.frames_done))
 
     def run(tell):
@@ -225,7 +225,7 @@ def test_progress_is_written_a_few_times_a_second(replayed, tmp_path, monkeypatc
             now[0] += 0.09
 
     replayed(run)
-    work.work(task(tmp_path))
+    runners.work(task(tmp_path))
     assert written == [1, 4, 7, 10]
 
 
@@ -241,7 +241,7 @@ def test_a_failed_job_has_its_reason(replayed, tmp_path, capsys, error, reason):
         raise error
 
     replayed(run)
-    work.work(job := task(tmp_path))
+    runners.work(job := task(tmp_path))
     state, said = job.outcome()
     assert state == JobState.FAILED and reason.lower() in said.lower()
     assert type(error).__name__ in capsys.readouterr().err
@@ -252,7 +252,7 @@ def test_a_reason_does_not_name_folders_of_the_server(replayed, tmp_path):
         raise InvalidSetting(f"{tmp_path}/recordings/one is damaged; upload it again")
 
     replayed(run)
-    work.work(job := task(tmp_path))
+    runners.work(job := task(tmp_path))
     assert job.outcome() == (JobState.FAILED, "one is damaged; upload it again")
 
 
@@ -262,8 +262,8 @@ def test_a_model_is_packed_in_place_of_its_folder(replayed, tmp_path, monkeypatc
 
     job = task(tmp_path, pack_model=True)
     replayed(run)
-    monkeypatch.setattr(work, "pack", lambda folder, file: file.write_text(folder.name))
-    work.work(job)
+    monkeypatch.setattr(runners, "pack", lambda folder, file: file.write_text(folder.name))
+    runners.work(job)
     assert [path.name for path in job.out.iterdir()] == ["model.isplat"]
     assert (job.out / "model.isplat").read_text() == "model"
 

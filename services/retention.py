@@ -1,97 +1,24 @@
-"""Replay jobs of a server, and retention of recordings and ended replays.
+"""Retention of recordings and ended replays, at start and every few minutes, and the guard of the clock that it depends on.
 
-Limits are enforced at start and every few minutes.
+Nothing is deleted by age until the clock has been consistent for some time.
 """
 
 from __future__ import annotations
 
 import asyncio
+import json
 import logging
-from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
-from contextlib import asynccontextmanager, suppress
+import os
+import threading
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
 from pathlib import Path
-from typing import Any
 
 from services.audit.log import SystemEvents
 from services.errors import CheckFailed, NotFound, StoreUnavailable
-from services.jobs.results import FILES, Results
-from services.jobs.store import JobRecord, JobState, JobStore, NewJob, Submission
-from services.recordings.store import Expired, RecordingStore
-
-
-class Replays:
-    """Replay jobs with their result files. Synchronous and thread-safe."""
-
-    def __init__(self, store: JobStore, results: Results) -> None:
-        self._store, self._results = store, results
-
-    def submit(
-        self, recordings: Sequence[str], options: Mapping[str, Any], by: str, idempotency_key: str | None
-    ) -> Submission:
-        """Queue one job per recording."""
-        return self._store.submit([NewJob(name) for name in recordings], options, by, idempotency_key)
-
-    def newest(self, count: int, *, before: int | None, batch: str | None, state: str | None) -> list[JobRecord]:
-        """Return replays, newest first."""
-        return self._store.newest(count, before=before, batch=batch, state=state)
-
-    def get(self, job_id: str) -> JobRecord:
-        """Return one replay."""
-        return self._store.get(job_id)
-
-    def counts(self, batch: str | None = None) -> dict[str, int]:
-        """Return the number of replays in each state; if `batch` is given, of that batch."""
-        return self._store.counts(batch)
-
-    def cancel(self, job_id: str, by: str) -> JobRecord:
-        """Cancel a queued or running replay."""
-        return self._store.cancel(job_id, by)
-
-    def delete(self, job_id: str) -> JobRecord:
-        """Delete a finished replay and its results."""
-        record = self._store.forget(job_id)
-        self._results.remove(record.folder)
-        return record
-
-    def expire(self, max_age_s: float | None, most: int | None) -> list[Expired]:
-        """Delete ended replays beyond the limits on age and number.
-
-        Args:
-            max_age_s: age limit in seconds, or None.
-            most: number limit, or None.
-
-        Returns:
-            The deleted replays, each with the reason.
-        """
-        gone = []
-        for job_id, why in self._store.surplus(max_age_s, most):
-            with suppress(NotFound):  # a concurrent request has deleted the replay
-                self.delete(job_id)
-                gone.append(Expired(job_id, why))
-        return gone
-
-    def files(self, job: JobRecord) -> list[str]:
-        """Return the names of the result files; none unless the replay is done."""
-        return self._results.files(job.folder) if job.state == JobState.DONE else []
-
-    def file(self, job_id: str, name: str) -> Path:
-        """Return the path of a result file.
-
-        Raises:
-            NotFound: if there is no such result file.
-            StoreUnavailable: if the replay is done and its result is missing on the disk.
-        """
-        job = self.get(job_id)
-        if job.state == JobState.DONE and not self.files(job):
-            raise StoreUnavailable(
-                f"the result of the replay {job_id} is not on the disk; restore it from a backup, or delete the replay and make it again"
-            )
-        if name not in FILES or name not in self.files(job):
-            raise NotFound(
-                f"the replay {job_id} is {job.state} and has no {name[:40]}; GET /v1/replays/{job_id} lists its results"
-            )
-        return self._results.folder / job.folder / name
-
+from services.jobs.results import Replays
+from services.recordings.store import RecordingStore
 
 log = logging.getLogger(__name__)
 AGAIN_S = 300.0
@@ -207,3 +134,93 @@ async def again_and_again(enforce: Callable[[], Awaitable[None]]) -> None:
         except StoreUnavailable as error:
             log.error("%s", error)
         await asyncio.sleep(AGAIN_S)
+
+
+FILE = "clock.json"
+JUMP_S = 86_400.0
+"""Clock step or service pause in seconds, beyond which ages are not trusted."""
+CONFIRM_S = 86_400.0
+"""Seconds of running without another step after which ages are trusted again."""
+WRITE_S = 600.0
+
+
+class ClockGuard:
+    """Detector of clock jumps during and between runs of the service. Thread-safe.
+
+    `clock.json` in the data folder stores the time. While the clock is not trusted, the file keeps
+    the last trusted time, so a restart does not confirm a wrong clock. Deleting the file and
+    starting the service confirms the clock at once.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        wall: Callable[[], float] = time.time,
+        monotonic: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._path, self._wall, self._monotonic = folder / FILE, wall, monotonic
+        self._lock = threading.Lock()
+        self._looked = wall(), monotonic()
+        self._written_s: float | None = None
+        self._since_s: float | None = None
+        """Monotonic time of the jump; None while the clock is trusted."""
+        seen = self._read()
+        if seen is not None and self._looked[0] - seen > JUMP_S:
+            self._doubt(self._looked[0] - seen, "since the service last ran")
+
+    @property
+    def doubt(self) -> str | None:
+        """Check the clock. Return the reason while it is not trusted, otherwise None."""
+        with self._lock:
+            self._look()
+            if self._since_s is None:
+                return None
+            left_h = max(0.0, CONFIRM_S - (self._monotonic() - self._since_s)) / 3600
+            return (
+                f"the clock has jumped or the service stood still for long: nothing is removed by age for {left_h:.1f} h;"
+                f" set the clock right, or remove {FILE} and start the service to confirm it"
+            )
+
+    def trusts_ages(self) -> bool:
+        """Return True if data may be deleted by age."""
+        return self.doubt is None
+
+    def _look(self) -> None:
+        wall_s, mono_s = self._wall(), self._monotonic()
+        stepped_s = (wall_s - self._looked[0]) - (mono_s - self._looked[1])
+        self._looked = wall_s, mono_s
+        if abs(stepped_s) > JUMP_S:
+            self._doubt(stepped_s, "while the service runs")
+        elif self._since_s is not None and mono_s - self._since_s >= CONFIRM_S:
+            log.warning("the clock has been consistent for %.0f h: ages are believed again", CONFIRM_S / 3600)
+            self._since_s = None
+        if self._since_s is None and (self._written_s is None or mono_s - self._written_s >= WRITE_S):
+            self._write(wall_s)
+            self._written_s = mono_s
+
+    def _doubt(self, step_s: float, when: str) -> None:
+        log.error("the clock went on by %.1f days %s: nothing is removed by age for now", step_s / 86_400, when)
+        self._since_s = self._monotonic()
+
+    def _read(self) -> float | None:
+        """Return the stored time in seconds; None if the file does not exist. A damaged file gives a time that lets the
+        clock count as jumped."""
+        try:
+            return float(json.loads(self._path.read_bytes())["seen_s"])
+        except FileNotFoundError:
+            pass
+        except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
+            log.error("%s cannot be read: %s; ages are not believed for now", self._path, error)
+            return -JUMP_S
+        return None
+
+    def _write(self, wall_s: float) -> None:
+        new = self._path.with_suffix(".new")
+        try:
+            descriptor = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+            with os.fdopen(descriptor, "w") as file:
+                json.dump({"seen_s": wall_s}, file)
+            os.replace(new, self._path)
+        except OSError as error:
+            log.warning("the time cannot be kept in %s: %s", self._path, error)
