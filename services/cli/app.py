@@ -14,7 +14,6 @@ from gsplat_core.choices import RENDERERS
 from gsplat_core.errors import InvalidSetting
 from operators.settings import JobOptions, LiveOptions, ReconstructOptions, RenderOptions, ReplayOptions, TrainOptions
 from services.cli.ctl import ExpiresOption, KeyName, KeyStreamOption, RoleOption, ctl
-from services.cli.exit_codes import BAD_INPUT, INTERRUPTED, OK, exit_code_of
 from services.cli.options import (
     BatchOutOption,
     BenchVideoOption,
@@ -51,7 +50,7 @@ from services.cli.options import (
     takes_options,
     takes_run_options,
 )
-from services.cli.terminal import sentence
+from services.cli.terminal import BAD_INPUT, INTERRUPTED, OK, exit_code_of, sentence
 
 # Base class of usage errors. Its module differs between typer releases; its subclasses do not.
 _USAGE_ERRORS: Any = next(base for base in typer.BadParameter.__mro__ if base.__name__ == "ClickException")

@@ -24,9 +24,8 @@ import typer
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.exports.formats import format_of
 from gsplat_core.io.files import read_regular
-from services.cli.exit_codes import OK
 from services.cli.options import ExportedFileArgument, JsonOption, path_argument, takes_run_options
-from services.cli.terminal import KEY_COLUMNS, Columns, printable, table
+from services.cli.terminal import KEY_COLUMNS, OK, Columns, printable, table
 
 if TYPE_CHECKING:
     from pydantic import BaseModel

@@ -17,7 +17,7 @@ from pathlib import Path
 import typer
 
 from services import product_version
-from services.cli.exit_codes import BAD_INPUT, OK
+from services.cli.terminal import BAD_INPUT, OK
 
 PACKAGES = (
     "torch",

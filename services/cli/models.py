@@ -36,8 +36,7 @@ from operators.applications.render import render_model
 from operators.errors import OutputError
 from operators.output_folder import OutputFolder, check_file_path
 from operators.settings import RenderOptions
-from services.cli.exit_codes import BAD_INPUT, INTERRUPTED, OK
-from services.cli.terminal import InterruptRequest, ProgressPrinter
+from services.cli.terminal import BAD_INPUT, INTERRUPTED, OK, InterruptRequest, ProgressPrinter
 from services.registry.bundle_file import MANIFEST, PIECE_BYTES, SUFFIX, TENSORS, pack
 
 

@@ -24,9 +24,8 @@ from operators.applications.session import Progress
 from operators.errors import OutputError
 from operators.output_folder import check_file_path, check_folder_path
 from operators.storage import storage_errors
-from services.cli.exit_codes import BAD_INPUT, OK
 from services.cli.options import SynthesizeOptions
-from services.cli.terminal import InterruptRequest, ProgressPrinter, printable
+from services.cli.terminal import BAD_INPUT, OK, InterruptRequest, ProgressPrinter, printable
 
 
 def validate_command(recording: Path, *, as_json: bool) -> int:

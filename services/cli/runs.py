@@ -45,9 +45,17 @@ from operators.output_folder import OutputFolder
 from operators.pipeline import Pipeline
 from operators.settings import JobOptions, TrainOptions
 from operators.storage import mebibytes
-from services.cli.exit_codes import BAD_INPUT, INTERRUPTED, NOTHING_SHOWN, OK
 from services.cli.options import EvaluateOptions, renderer_options
-from services.cli.terminal import ASKING, InterruptRequest, ProgressPrinter, printable
+from services.cli.terminal import (
+    ASKING,
+    BAD_INPUT,
+    INTERRUPTED,
+    NOTHING_SHOWN,
+    OK,
+    InterruptRequest,
+    ProgressPrinter,
+    printable,
+)
 from services.jobs.batch import Batch, Counts, Summary
 from services.jobs.pool import PoolSettings, new_runner
 from services.reports.build import require_shown, write_reports

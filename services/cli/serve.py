@@ -20,8 +20,7 @@ from services.api.service import bind_probe
 from services.audit import AuditInUse, AuditLog, AuditUnwritable, Keeping, verify
 from services.auth.keys import ApiKey, KeyConflict, KeyStore, Role, append_key_change
 from services.backup import Backup, check_backup, make_backup, refuse_unfinished_restore, restore_backup
-from services.cli.exit_codes import BAD_INPUT, OK
-from services.cli.terminal import KEY_COLUMNS, printable, table
+from services.cli.terminal import BAD_INPUT, KEY_COLUMNS, OK, printable, table
 from services.private_files import keep_files_private, make_state_private
 from services.settings import ServiceSettings, SettingsInvalid, load_settings
 from services.settings.sections import NAME_PATTERN

@@ -19,8 +19,7 @@ from gsplat_core.io.model_sources import load_model
 from gsplat_core.models import Model
 from gsplat_core.rendering.renderer import RendererOptions, check_renderer
 from operators.applications.session import check_device
-from services.cli.exit_codes import OK
-from services.cli.terminal import InterruptRequest
+from services.cli.terminal import OK, InterruptRequest
 from services.display import KINDS
 from services.model_view import ModelView, Pictures, PictureView
 from services.openigtlink import MessageServer, StreamMessages, folder_of, send

@@ -20,7 +20,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, Protocol
 
-from services.cli.exit_codes import user_sentence
+from services.cli.terminal import user_sentence
 from services.errors import StoreUnavailable
 from services.jobs.results import Task
 from services.jobs.store import JobProgress, JobState

@@ -13,7 +13,7 @@ from gsplat_core.io.recordings.calibration import write_poses
 from operators.errors import OutputError, OutputFolderInUse
 from operators.output_folder import OutputFolder, check_file_path, is_own_file
 from services.cli.app import run
-from services.cli.exit_codes import BAD_INPUT, OK
+from services.cli.terminal import BAD_INPUT, OK
 from tests.services.registry.made import save_model
 
 

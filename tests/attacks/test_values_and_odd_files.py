@@ -18,7 +18,7 @@ from operators.output_folder import check_folder_path
 from services.audit import AuditLog
 from services.auth import keys as keys_module
 from services.cli.app import run
-from services.cli.exit_codes import BAD_INPUT
+from services.cli.terminal import BAD_INPUT
 from services.reports.evaluation import load_evaluated
 from tests.services.registry.made import save_model
 

@@ -22,7 +22,7 @@ from operators.errors import RunFailed, SourceLost
 from operators.frame_log import read_frames
 from operators.sources.recording import RealtimeSource, play
 from operators.storage import STAGING_PREFIX
-from services.cli.exit_codes import NOTHING_SHOWN, user_sentence
+from services.cli.terminal import NOTHING_SHOWN, user_sentence
 from services.reports.schema import RunReport
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from services.cli.app import run
-from services.cli.exit_codes import NOTHING_SHOWN, OK
+from services.cli.terminal import NOTHING_SHOWN, OK
 
 
 @pytest.fixture

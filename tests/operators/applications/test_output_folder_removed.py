@@ -10,7 +10,7 @@ from gsplat_core.errors import UserError
 from gsplat_core.io.recordings import synthesize
 from operators.applications.replay import ReplaySettings, replay
 from operators.errors import RunFailed
-from services.cli.exit_codes import user_sentence
+from services.cli.terminal import user_sentence
 
 
 @pytest.fixture(scope="module")

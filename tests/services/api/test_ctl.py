@@ -20,8 +20,7 @@ from services.api import new_app
 from services.cli import ctl as ctl_module
 from services.cli.app import run
 from services.cli.ctl import moment, stream_row
-from services.cli.exit_codes import BAD_INPUT, OK
-from services.cli.terminal import table
+from services.cli.terminal import BAD_INPUT, OK, table
 from services.client import Client
 from services.schemas import CheckResult, StreamView
 from services.settings import ServiceSettings

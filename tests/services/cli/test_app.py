@@ -9,7 +9,7 @@ import pytest
 import typer
 
 from services.cli.app import app, run
-from services.cli.exit_codes import BAD_INPUT
+from services.cli.terminal import BAD_INPUT
 
 
 def test_help_names_every_command(capsys):

@@ -11,7 +11,7 @@ import pytest
 
 from gsplat_core.errors import InvalidSetting
 from services.cli import runs
-from services.cli.exit_codes import BAD_INPUT, INTERRUPTED, NOTHING_SHOWN, OK
+from services.cli.terminal import BAD_INPUT, INTERRUPTED, NOTHING_SHOWN, OK
 from services.jobs.batch import Summary
 
 STATES = ("queued", "running", "done", "failed", "cancelled")

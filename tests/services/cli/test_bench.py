@@ -16,7 +16,7 @@ from gsplat_core.io.ply import save_ply
 from gsplat_core.rendering.renderer import Capabilities, FinishedFrame
 from gsplat_core.scene.gaussians import Gaussians
 from services.cli.app import run
-from services.cli.exit_codes import BAD_INPUT, OK
+from services.cli.terminal import BAD_INPUT, OK
 
 
 class Recorder:

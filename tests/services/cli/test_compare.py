@@ -16,7 +16,7 @@ from gsplat_core.geometry.mesh import Mesh, mesh_of
 from gsplat_core.io.exports.files import mesh_ply_pieces
 from gsplat_core.scene.frames import DEPTH_ORIGINS, DepthSource
 from services.cli.app import run
-from services.cli.exit_codes import BAD_INPUT, OK
+from services.cli.terminal import BAD_INPUT, OK
 
 METRIC = DepthSource(DEPTH_ORIGINS["measured"], metric=True)
 

@@ -14,7 +14,7 @@ import pytest
 
 from services.cli import ctl as ctl_module
 from services.cli.app import run
-from services.cli.exit_codes import BAD_INPUT, OK
+from services.cli.terminal import BAD_INPUT, OK
 from services.client import Client
 from services.client import requests as client_requests
 

@@ -11,7 +11,7 @@ from gsplat_core import Gaussians, Model, load_bundle, load_ply, save_bundle, sa
 from gsplat_core.deformation import BasisField
 from gsplat_core.scene.cameras import Camera
 from services.cli.app import run
-from services.cli.exit_codes import BAD_INPUT, OK
+from services.cli.terminal import BAD_INPUT, OK
 
 
 @pytest.fixture

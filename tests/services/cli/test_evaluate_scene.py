@@ -14,7 +14,7 @@ from gsplat_core.io.ply import load_ply, save_ply
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.gaussians import Gaussians
 from services.cli.app import run
-from services.cli.exit_codes import BAD_INPUT, OK
+from services.cli.terminal import BAD_INPUT, OK
 from tests.colmap_writer import write_scene
 
 

@@ -10,7 +10,7 @@ import torch
 
 from gsplat_core.errors import CoreError, InvalidInput, InvalidSetting, RecordingInvalid, UserError
 from operators.errors import GraphInvalid, OperatorFailed, OperatorsError, RunFailed, StorageFull
-from services.cli.exit_codes import BAD_INPUT, BUG, INTERRUPTED, exit_code_of
+from services.cli.terminal import BAD_INPUT, BUG, INTERRUPTED, exit_code_of
 
 
 def caused(error, cause):

@@ -10,7 +10,7 @@ import torch
 from gsplat_core import Camera, Gaussians, Model, save_bundle
 from gsplat_core.scene.frames import DEPTH_ORIGINS, DepthSource
 from services.cli.app import run
-from services.cli.exit_codes import BAD_INPUT, OK
+from services.cli.terminal import BAD_INPUT, OK
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import pytest
 
 from gsplat_core.io.bundle import load_bundle
 from services.cli.app import run
-from services.cli.exit_codes import BAD_INPUT
+from services.cli.terminal import BAD_INPUT
 from services.registry.models import ModelRegistry
 from tests.services.registry.made import save_model, sha256
 

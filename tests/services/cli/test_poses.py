@@ -16,7 +16,7 @@ from gsplat_core.poses.focal_length import FocalLength
 from gsplat_core.poses.odometry import Breathing
 from services.cli import recordings
 from services.cli.app import run
-from services.cli.exit_codes import BAD_INPUT, OK
+from services.cli.terminal import BAD_INPUT, OK
 from tests.gsplat_core.geometry.moving_scope import FOCAL, HEIGHT, SIDEWAYS, WIDTH, video
 
 COUNT = 10

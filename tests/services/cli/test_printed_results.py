@@ -14,8 +14,8 @@ from operators.applications.static_scene import SceneTraining
 from operators.settings import TrainOptions
 from services.backup import Backup
 from services.cli import runs, serve
-from services.cli.exit_codes import BAD_INPUT, INTERRUPTED, OK
 from services.cli.runs import live_command, print_live, print_report, train_command
+from services.cli.terminal import BAD_INPUT, INTERRUPTED, OK
 
 FACTS = {
     "pictures": 28, "dropped": {"late": 2, "behind": 3}, "age_p50_ms": 20.0, "age_p99_ms": 41.5, "age_max_ms": 60.25,

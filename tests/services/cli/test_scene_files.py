@@ -15,7 +15,7 @@ from gsplat_core.io.model_sources import load_model, load_splat
 from gsplat_core.io.ply import load_ply, save_ply
 from gsplat_core.scene.gaussians import Gaussians
 from services.cli.app import run
-from services.cli.exit_codes import BAD_INPUT, OK
+from services.cli.terminal import BAD_INPUT, OK
 
 
 def cloud(count: int = 200, size: float = 1.0) -> Gaussians:

@@ -12,7 +12,7 @@ import pytest
 from services.audit import AuditLog, Wanted, search
 from services.auth.keys import KeyStore
 from services.cli.app import run
-from services.cli.exit_codes import BAD_INPUT, OK
+from services.cli.terminal import BAD_INPUT, OK
 
 
 @pytest.fixture(autouse=True)

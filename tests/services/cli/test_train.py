@@ -14,7 +14,7 @@ from gsplat_core import Camera, Gaussians, load_bundle, load_ply, render
 from operators.applications.static_scene import train_scene
 from operators.settings import TrainOptions
 from services.cli.app import run
-from services.cli.exit_codes import BAD_INPUT, OK
+from services.cli.terminal import BAD_INPUT, OK
 from tests.colmap_writer import write_scene
 
 

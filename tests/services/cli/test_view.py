@@ -14,7 +14,7 @@ from gsplat_core.errors import BundleError, InvalidSetting
 from gsplat_core.io.bundle import save_bundle
 from gsplat_core.rendering.renderer import RendererOptions
 from services.cli import view as view_module
-from services.cli.exit_codes import OK
+from services.cli.terminal import OK
 from services.cli.view import bundle_in, igtl_command, view_command
 from tests.gsplat_core.io.exports.test_exports import random_model
 

@@ -17,7 +17,7 @@ from gsplat_core.errors import InvalidSetting
 from gsplat_core.models import TrainedBy
 from gsplat_core.rendering.renderer import PROGRESSIVE_SAMPLES, Capabilities, FinishedFrame, RendererOptions
 from services.cli.app import run
-from services.cli.exit_codes import BAD_INPUT
+from services.cli.terminal import BAD_INPUT
 from services.model_view import Pictures, PictureView, Viewpoint
 from tests.services.supervisor.test_model_show import uniform
 

@@ -16,7 +16,7 @@ from operators.metrics import QualityResult
 from operators.sinks.video import DisplayResult
 from operators.sources.source import SourceDescription
 from operators.training import TrainingCounts
-from services.cli.exit_codes import BAD_INPUT, NOTHING_SHOWN, exit_code_of
+from services.cli.terminal import BAD_INPUT, NOTHING_SHOWN, exit_code_of
 from services.reports.build import REMEDIES, require_shown
 
 CAMERA = Camera.from_focal(60.0, 64, 48)
