@@ -32,8 +32,7 @@ from numpy.typing import NDArray
 
 from gsplat_core.endoscope.onnx import OnnxToolFinder
 from gsplat_core.endoscope.out_of_body import BodyGate
-from gsplat_core.endoscope.tool_network import NETWORK, NetworkToolFinder, round_view
-from gsplat_core.endoscope.tools import ToolFinder, field_of_view
+from gsplat_core.endoscope.tools import NETWORK, NetworkToolFinder, ToolFinder, field_of_view, round_view
 from gsplat_core.io.recordings import open_recording
 from operators.tool_mask import MaskFinder
 

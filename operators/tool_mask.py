@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from gsplat_core.endoscope.onnx import OnnxToolFinder
 from gsplat_core.endoscope.sequence import LEAST_TISSUE
-from gsplat_core.endoscope.tool_network import NetworkToolFinder
-from gsplat_core.endoscope.tools import ToolFinder
+from gsplat_core.endoscope.tools import NetworkToolFinder, ToolFinder
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.frames import Frame
 from operators.graph import Operator, OperatorSpec

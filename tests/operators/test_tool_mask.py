@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from onnx import TensorProto, helper
 
-from gsplat_core.endoscope.tool_network import NetworkToolFinder
+from gsplat_core.endoscope.tools import NetworkToolFinder
 from gsplat_core.errors import InvalidSetting
 from operators.outcome import OutcomeBuilder
 from operators.tool_mask import (
@@ -116,7 +116,7 @@ def test_the_detectors_find_a_grey_tool(frame, compute, method):
 
 
 def test_without_its_network_the_built_in_mask_is_found_by_colour(frame, compute, monkeypatch, caplog):
-    monkeypatch.setattr("gsplat_core.endoscope.tool_network.NETWORK", Path("missing.onnx"))
+    monkeypatch.setattr("gsplat_core.endoscope.tools.NETWORK", Path("missing.onnx"))
     operator = new_tool_mask(None, "builtin")
     with caplog.at_level(logging.WARNING):
         operator.start()

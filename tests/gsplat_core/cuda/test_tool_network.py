@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from gsplat_core.endoscope.reduced import averaged
-from gsplat_core.endoscope.tool_network import (
+from gsplat_core.endoscope.tool_network_torch import PRIORITY, TorchToolNetwork
+from gsplat_core.endoscope.tools import (
     INPUT_PX,
     NETWORK,
     ROUND_INPUT_PX,
@@ -18,7 +19,6 @@ from gsplat_core.endoscope.tool_network import (
     NetworkToolFinder,
     features,
 )
-from gsplat_core.endoscope.tool_network_torch import PRIORITY, TorchToolNetwork
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.rendering.alpha import CapturedSequence, GraphMemory
 from tests.gsplat_core.endoscope.tool_pictures import in_round_view, tissue, with_rod

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsplat_core.endoscope.tool_network import (
+from gsplat_core.endoscope.tools import (
     NETWORK,
     ROUND_INPUT_PX,
     ROUND_INPUTS,

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsplat_core.endoscope import tool_network
-from gsplat_core.endoscope.tool_network import (
+from gsplat_core.endoscope import tools
+from gsplat_core.endoscope.tools import (
     CERTAIN,
-    SMALLEST_INNER_REGION,
+    NETWORK_INNER_REGION,
     along_edges,
     features,
     remove_inner_regions,
@@ -90,7 +90,7 @@ def test_a_region_within_three_pixels_of_the_border_is_kept_and_one_inside_from_
     side, left, value, is_kept
 ):
     """200 of 10,000 pixels. A level of 128 is no tool, and stays as it is."""
-    assert SMALLEST_INNER_REGION * 100 * 100 == 200
+    assert NETWORK_INNER_REGION * 100 * 100 == 200
     levels = levels_with(side, left, value)
     before = levels.copy()
     remove_inner_regions(levels, np.ones((100, 100), np.uint8))
@@ -110,10 +110,10 @@ def test_a_region_at_the_border_of_the_view_is_kept():
 @pytest.mark.parametrize(("logit", "is_tool"), [(-0.2, False), (0.2, True), (50.0, True)])
 def test_a_positive_logit_is_a_tool_inside_the_field_of_view(monkeypatch, logit, is_tool):
     logits = lambda planes: np.full((80, 80), logit, np.float32)
-    network = tool_network._Network(logits, (160, 160), 5)
-    monkeypatch.setattr(tool_network, "_loaded", lambda *_: network)
+    network = tools._Network(logits, (160, 160), 5)
+    monkeypatch.setattr(tools, "_loaded", lambda *_: network)
     image = np.full((200, 300, 3), 120, np.uint8)
-    found = tool_network.NetworkToolFinder().find(image)
+    found = tools.NetworkToolFinder().find(image)
     assert found.shape == (200, 300) and (found == 0).all() == is_tool == (not found.all())
     image[:60] = 0  # the surround is no tool
-    assert tool_network.NetworkToolFinder().find(image)[:50].all()
+    assert tools.NetworkToolFinder().find(image)[:50].all()

@@ -14,7 +14,8 @@ from torch.nn import functional
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from gsplat_core.endoscope.reduced import averaged
-from gsplat_core.endoscope.tool_network import (
+from gsplat_core.endoscope.tool_network_torch import OPERATORS, TorchToolNetwork
+from gsplat_core.endoscope.tools import (
     INPUT_PX,
     NETWORK,
     ROUND_INPUT_PX,
@@ -24,7 +25,6 @@ from gsplat_core.endoscope.tool_network import (
     features,
     round_view,
 )
-from gsplat_core.endoscope.tool_network_torch import OPERATORS, TorchToolNetwork
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings import open_recording
 

@@ -11,7 +11,7 @@ from benchmarks.tool_network.flexible import accessory, hollow_organ, narrow_ban
 from benchmarks.tool_network.network import INPUTS, ToolNetwork, features
 from benchmarks.tool_network.tissue import dark, glare, pale
 from benchmarks.tool_network.train import INPUT_PX, Store, altered, export, from_files, reduced
-from gsplat_core.endoscope import tool_network
+from gsplat_core.endoscope import tools
 
 
 def test_accessories_change_a_hollow_organ_only_under_their_mask():
@@ -56,7 +56,7 @@ def test_the_product_computes_the_planes_of_training():
     picture = np.random.default_rng(0).integers(0, 256, (*INPUT_PX, 3)).astype(np.uint8)
     picture[:, :40] = 3
     planes = torch.from_numpy(picture.transpose(2, 0, 1)[None].astype(np.float32) / 255)
-    np.testing.assert_allclose(tool_network.features(picture, INPUTS), features(planes).numpy(), atol=1e-5)
+    np.testing.assert_allclose(tools.features(picture, INPUTS), features(planes).numpy(), atol=1e-5)
 
 
 def test_opencv_computes_what_the_network_computes(tmp_path):
