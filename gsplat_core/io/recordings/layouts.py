@@ -39,7 +39,7 @@ from gsplat_core.io.recordings.calibration import (
     read_pinhole,
     rectified_by_file,
 )
-from gsplat_core.io.recordings.contents import Contents, FrameImages
+from gsplat_core.io.recordings.contents import DESCRIPTION_FILE, Beside, Contents, FrameImages
 from gsplat_core.io.recordings.frame_files import ImageFiles, check_sizes
 from gsplat_core.io.recordings.plain_files import (
     Findings,
@@ -50,7 +50,6 @@ from gsplat_core.io.recordings.plain_files import (
     list_images,
     stays_inside,
 )
-from gsplat_core.io.recordings.sidecars import DESCRIPTION_FILE, Beside
 from gsplat_core.io.recordings.video import VIDEO_SUFFIXES, open_video
 from gsplat_core.scene.frames import LONGEST_RECORDING_S
 

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from gsplat_core.errors import RecordingInvalid
 from gsplat_core.io.recordings.calibration import number, read_json, read_pinhole
+from gsplat_core.io.recordings.contents import Beside
 from gsplat_core.io.recordings.frame_files import (
     DepthFiles,
     ImageFiles,
@@ -43,7 +44,6 @@ from gsplat_core.io.recordings.plain_files import (
     read_array,
     stays_inside,
 )
-from gsplat_core.io.recordings.sidecars import Beside
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 

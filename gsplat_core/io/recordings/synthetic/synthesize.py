@@ -38,7 +38,7 @@ from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.files import PartialFolder, read_regular
-from gsplat_core.io.recordings.sidecars import RECORDING_FORMAT, RECORDING_VERSION
+from gsplat_core.io.recordings.contents import RECORDING_FORMAT, RECORDING_VERSION
 from gsplat_core.io.recordings.synthetic.optics import RadialLens
 from gsplat_core.io.recordings.synthetic.random_scene import RandomScene
 from gsplat_core.io.recordings.synthetic.renderer import Eye
