@@ -24,11 +24,12 @@ from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.depth.rectification import Rectification, Undistortion
 from gsplat_core.errors import RecordingInvalid
 from gsplat_core.io.recordings.calibration import (
     POSES_FILE,
     Calibration,
+    Rectification,
+    Undistortion,
     number,
     read_distortion,
     read_json,

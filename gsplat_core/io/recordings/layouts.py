@@ -26,11 +26,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from gsplat_core.depth.rectification import Rectification, Undistortion
 from gsplat_core.errors import InvalidInput
 from gsplat_core.io.recordings.calibration import (
     POSES_FILE,
     Calibration,
+    Rectification,
+    Undistortion,
     default_calibration,
     invert_poses,
     number,

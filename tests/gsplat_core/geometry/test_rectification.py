@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from gsplat_core.depth.rectification import Rectification, StereoCalibration, Undistortion
 from gsplat_core.errors import InvalidInput
+from gsplat_core.io.recordings.calibration import Rectification, StereoCalibration, Undistortion
 from gsplat_core.scene.cameras import Camera
 
 SIZE = (320, 256)

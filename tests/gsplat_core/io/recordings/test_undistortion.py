@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 import pytest
 
-from gsplat_core.depth.rectification import Undistortion
 from gsplat_core.errors import InvalidInput, RecordingInvalid
 from gsplat_core.io.recordings import open_recording, validate_recording
+from gsplat_core.io.recordings.calibration import Undistortion
 from gsplat_core.scene.cameras import Camera
 
 W, H = 96, 80
