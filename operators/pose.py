@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from gsplat_core.depth.registry import may_be_metric
 from gsplat_core.errors import InvalidInput, InvalidSetting
-from gsplat_core.poses.camera_path import CERTAIN_SHARE, MotionTest
 from gsplat_core.poses.live_odometry import MOSTLY, LiveOdometry
+from gsplat_core.poses.odometry import CERTAIN_SHARE, MotionTest
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import RELATIVE_DISTANCE, Frame, FrameStatus
 from operators.graph import Operator, OperatorSpec

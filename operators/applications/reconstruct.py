@@ -20,7 +20,7 @@ from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.io.recordings import is_heldout
 from gsplat_core.io.recordings.calibration import POSES_FILE, write_poses
 from gsplat_core.models import Model
-from gsplat_core.poses.camera_path import MOVING_SHARE, CameraPath, camera_path_of, rigid_share
+from gsplat_core.poses.odometry import MOVING_SHARE, CameraPath, camera_path_of, rigid_share
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training import validation
 from gsplat_core.training.observations import BothEyes

@@ -8,9 +8,8 @@ import pytest
 import torch
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.poses import camera_path
-from gsplat_core.poses.camera_path import MOVING_SHARE, CameraPath, MotionTest, camera_path_of, rigid_share
-from gsplat_core.poses.odometry import Trajectory
+from gsplat_core.poses import odometry
+from gsplat_core.poses.odometry import MOVING_SHARE, CameraPath, MotionTest, Trajectory, camera_path_of, rigid_share
 from gsplat_core.poses.se3 import exp
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
@@ -74,7 +73,7 @@ def compared(monkeypatch):
         pairs.append((first.seq, second.seq))
         return answers.get(first.seq, (10.0, 1.0))
 
-    monkeypatch.setattr(camera_path, "_compared", compare)
+    monkeypatch.setattr(odometry, "_compared", compare)
     return pairs, answers
 
 
@@ -138,7 +137,7 @@ def moved(by_px: int, side_px: int) -> np.ndarray:
 @pytest.mark.parametrize("side_px", [640, 320, 240])
 def test_motion_is_measured_in_pictures_of_320_pixels(side_px):
     first, second = (Frame(number, 0, moved(6 * number, side_px)) for number in range(2))
-    pair = camera_path._compared(first, second)
+    pair = odometry._compared(first, second)
     assert pair is not None
     assert pair[0] == pytest.approx(6 * 320 / side_px, abs=0.05) and pair[1] < 0.1
 
@@ -149,9 +148,7 @@ def test_what_is_masked_is_not_compared():
     image[:, 150:] = picture[:, 150:]
     mask = np.ones(picture.shape[:2], np.uint8)
     mask[:, 130:] = 0
-    masked, whole = (
-        camera_path._compared(Frame(0, 0, picture, mask=each), Frame(1, 0, image)) for each in (mask, None)
-    )
+    masked, whole = (odometry._compared(Frame(0, 0, picture, mask=each), Frame(1, 0, image)) for each in (mask, None))
     assert masked is not None and masked[0] == pytest.approx(4, abs=0.05) and masked[1] < 0.1
     assert whole is not None and whole[0] < 2
 
@@ -160,9 +157,9 @@ def test_what_is_masked_is_not_compared():
 def test_two_dozen_points_must_be_found_again(side_px, found):
     mask = np.zeros((240, 320), np.uint8)
     mask[60 : 60 + side_px, 60 : 60 + side_px] = 1
-    pair = camera_path._compared(Frame(0, 0, moved(0, 320), mask=mask), Frame(1, 0, moved(2, 320)))
+    pair = odometry._compared(Frame(0, 0, moved(0, 320), mask=mask), Frame(1, 0, moved(2, 320)))
     assert (pair is not None) == found
-    assert camera_path._compared(Frame(0, 0, moved(0, 320)), Frame(1, 0, np.full((240, 320, 3), 90, np.uint8))) is None
+    assert odometry._compared(Frame(0, 0, moved(0, 320)), Frame(1, 0, np.full((240, 320, 3), 90, np.uint8))) is None
 
 
 def measured(times: float, count: int = 40, depth_confidence: np.ndarray | None = None) -> Frame:
@@ -179,7 +176,7 @@ def unit_of(*frames: Frame) -> float:
     shown = np.stack([(np.arange(30, 90) + 0.5 - 60) / 100 * z, np.full(60, (30.5 - 45) / 100) * z, z], 1)
     hidden = np.array([[0.0, 0, -1], [5, 0, 1], [-5, 0, 1], [0, 5, 1], [0, -5, 1]])
     poses = np.stack([np.eye(4)] * len(frames))
-    return camera_path._unit(frames, Trajectory(poses, np.concatenate([shown, hidden]), 0.1, 1.0, ()), camera)
+    return odometry._unit(frames, Trajectory(poses, np.concatenate([shown, hidden]), 0.1, 1.0, ()), camera)
 
 
 def test_the_unit_is_the_median_over_frames_of_the_ratio_of_depths():
