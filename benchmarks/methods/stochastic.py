@@ -35,7 +35,7 @@ from gsplat_core.io.bundle import load_bundle
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.models import Model, TrainedBy
 from gsplat_core.ops.stochastic import QUEUE_BYTES, Method, SplatScene, new_sums, picture_of, sample_splats
-from gsplat_core.reference.stochastic import point_moments, sample_moments
+from gsplat_core.reference.rendering import point_moments, sample_moments
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.rendering.renderer import RendererOptions, new_renderer
 from gsplat_core.rendering.stochastic import dequantised, prepared_splats, quantised_splats, raw_splats

@@ -33,10 +33,9 @@ from gsplat_core.reference.projection import (
     quat_scale_to_covar_preci,
     spherical_harmonics,
 )
-from gsplat_core.reference.rendering import rasterization, render_frame
+from gsplat_core.reference.rendering import point_moments, rasterization, render_frame, sample_moments
 from gsplat_core.reference.splat_regression import splat_regression, splat_regression_gradients
 from gsplat_core.reference.stereo import fit_disparities, match_disparities, smooth_within_edges
-from gsplat_core.reference.stochastic import point_moments, sample_moments
 from gsplat_core.reference.surfels import fully_fused_projection_2dgs, rasterize_to_pixels_2dgs
 from gsplat_core.reference.training import (
     accumulate_gradient_norms_,

@@ -9,7 +9,7 @@ import torch
 
 from gsplat_core.ops.covariance import quat_scale_to_covar_preci
 from gsplat_core.ops.stochastic import SplatScene, new_sums, sample_splats
-from gsplat_core.reference.stochastic import point_moments, sample_moments
+from gsplat_core.reference.rendering import point_moments, sample_moments
 from gsplat_core.scene.cameras import Camera
 from tests.gsplat_core.ops.stochastic_scenes import (
     CAMERA,

@@ -12,8 +12,7 @@ import torch
 from gsplat_core import InvalidInput
 from gsplat_core.ops.covariance import quat_scale_to_covar_preci
 from gsplat_core.ops.stochastic import SplatScene, new_sums, picture_of, sample_splats
-from gsplat_core.reference.rendering import rasterization
-from gsplat_core.reference.stochastic import dilogarithm, point_moments, sample_moments
+from gsplat_core.reference.rendering import dilogarithm, point_moments, rasterization, sample_moments
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 from tests.gsplat_core.ops.stochastic_scenes import (
