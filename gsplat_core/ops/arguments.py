@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.rendering.settings import EPS2D, FAR_PLANE, NEAR_PLANE
+from gsplat_core.rendering.settings import EPS2D, FAR_PLANE, NEAR_PLANE, TILE_SIZE
 from gsplat_core.scene.cameras import CAMERA_MODELS, CameraModel
 from gsplat_core.scene.gaussians import MAX_SH_DEGREE, RAW_COLUMNS
 
@@ -77,10 +77,6 @@ def require_kernels(op: str, name: str, tensor: Tensor) -> None:
         f"{op}: {name} is on {tensor.device}, and this build has kernels for the CPU {why}; move it with .cpu(), or use"
         " gsplat_core.reference, which runs on any device"
     )
-
-
-TILE_SIZE = 16
-"""Side in pixels of the tiles of ops that blend one image."""
 
 
 def require_tiled_splats(

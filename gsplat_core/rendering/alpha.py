@@ -29,7 +29,6 @@ from gsplat_core.ops.frame import (
     STATUS_LONGEST,
     STATUS_NEEDED,
     STATUS_OVERFLOW,
-    TILE_SIZE,
     Frame,
     FrameMode,
     View,
@@ -53,6 +52,7 @@ from gsplat_core.rendering.renderer import (
     checked_outputs,
     standard_outputs,
 )
+from gsplat_core.rendering.settings import TILE_SIZE
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 

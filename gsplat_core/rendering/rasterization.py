@@ -36,12 +36,11 @@ from gsplat_core.ops.rasterization import (
     Rasterized,
     rasterize,
 )
-from gsplat_core.ops.rasterization import TILE_SIZE as NATIVE_TILE_SIZE
 from gsplat_core.ops.rasterization import View as NativeView
 from gsplat_core.ops.spherical_harmonics import spherical_harmonics
 from gsplat_core.ops.tiles import bin_splats
 from gsplat_core.rendering.pipeline import Operations, camera_centers
-from gsplat_core.rendering.settings import PLAIN_TENSORS, Arguments, RenderSettings, is_transformed
+from gsplat_core.rendering.settings import PLAIN_TENSORS, TILE_SIZE, Arguments, RenderSettings, is_transformed
 from gsplat_core.scene.cameras import CAMERA_MODELS, Camera
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.transfers import HostCopy
@@ -166,7 +165,7 @@ def single_call(arguments: Arguments, settings: RenderSettings) -> SingleCall | 
 
 
 def _takes(arguments: Arguments, settings: RenderSettings) -> bool:
-    if CUDA_MISSING is not None or settings.tile_size != NATIVE_TILE_SIZE or is_transformed():
+    if CUDA_MISSING is not None or settings.tile_size != TILE_SIZE or is_transformed():
         return False
     if settings.has_distance or settings.normals or not settings.global_z_order:
         return False

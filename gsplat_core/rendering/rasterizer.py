@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from gsplat_core.ops.arguments import require_shape
-from gsplat_core.ops.frame import TILE_SIZE as FRAME_TILE_SIZE
 from gsplat_core.ops.native import CUDA_MISSING
 from gsplat_core.rendering.alpha import FrameRenderer, TileListCapacity
 from gsplat_core.rendering.rasterization import rasterization
@@ -101,7 +100,7 @@ class Rasterizer:
         if background is not None:
             require_shape("background", background, (3,), "[3]")
         self._background = background
-        plain = RenderSettings(width=1, height=1, tile_size=FRAME_TILE_SIZE, render_mode=render_mode, packed=packed)
+        plain = RenderSettings(width=1, height=1, render_mode=render_mode, packed=packed)
         self._captures = capture and settings == plain and render_mode in _CAPTURED_MODES
         self._capacity = capacity
         self._captured: tuple[Gaussians, FrameRenderer] | None = None

@@ -28,7 +28,7 @@ EPS2D = 0.3
 """Default blur, pixels² added to the diagonal of a splat's covariance."""
 MOST_SIDE_PX = 1 << 16
 TILE_SIZE = 16
-"""Default side of a tile in pixels."""
+"""Side in pixels of the tiles of compiled ops that blend one image, and default of those that take a tile size."""
 
 
 class Constants(NamedTuple):

@@ -18,11 +18,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsplat_core.errors import InvalidInput, InvalidSetting
-from gsplat_core.ops.arguments import TILE_SIZE, TileGrid
+from gsplat_core.ops.arguments import TileGrid
 from gsplat_core.ops.range_histogram import Bins, range_histogram
 from gsplat_core.ops.splat_rays import splat_rays
 from gsplat_core.ops.tiles import bin_splats
 from gsplat_core.rendering.flow import nearest_splats, projected, render_depth, render_flow, sampled
+from gsplat_core.rendering.settings import TILE_SIZE
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.scene.range_sensors import RangeScan, RangeSensor

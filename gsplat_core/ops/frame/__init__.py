@@ -17,6 +17,7 @@ from torch import Tensor
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native
 from gsplat_core.ops.arguments import GAUSSIAN_TENSORS, View, check_inputs, require_shape
+from gsplat_core.rendering.settings import TILE_SIZE
 
 __all__ = [
     "GAUSSIAN_TENSORS",
@@ -24,7 +25,6 @@ __all__ = [
     "STATUS_LONGEST",
     "STATUS_NEEDED",
     "STATUS_OVERFLOW",
-    "TILE_SIZE",
     "Frame",
     "FrameMode",
     "View",
@@ -32,8 +32,6 @@ __all__ = [
     "render_frame",
 ]
 
-TILE_SIZE = 16
-"""Side of the square tiles that `render_frame` divides the image into, in pixels."""
 MAX_SEGMENT = 1024
 """Largest capacity of a tile's own segment, in instances."""
 STATUS_NEEDED, STATUS_LONGEST, STATUS_OVERFLOW = range(3)

@@ -13,12 +13,12 @@ from torch import Tensor
 from torch.autograd import Function
 
 from gsplat_core.ops.native import differentiable_once
+from gsplat_core.rendering.settings import TILE_SIZE
 
 PLAIN_COLORS = -1
 """Value of `Options.degree` for plain colours without spherical harmonics, at most `MOST_PLAIN_COLORS` channels."""
 MOST_PLAIN_COLORS = 3
 NO_DEPTH, DEPTH_SUM, EXPECTED_DEPTH = range(3)
-TILE_SIZE = 16
 MOST_PIXELS = 16 << 13
 """Largest width and height of a picture."""
 
