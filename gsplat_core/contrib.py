@@ -1,14 +1,15 @@
-"""Parts of gsplat 1.6's trainers under its names, for training loops of library users: example, surgical and dynamic trainer.
+"""Parts of gsplat 1.6's trainers under its names, for training loops of library users: example, surgical and dynamic
+trainer.
 
 Example trainer, in gsplat's `losses` and `color_correct`: losses and colour corrections.
 
-Surgical trainer, in `init_utils`, `losses`, `regularizers` and `training`: initialisation, losses and schedule. They follow G-SHARP.
-Masks are 1 where a pixel counts.
+Surgical trainer, in `init_utils`, `losses`, `regularizers` and `training`: initialisation, losses and schedule. They
+follow G-SHARP. Masks are 1 where a pixel counts.
 
-Dynamic trainer, in `contrib.dynamic`: HexPlane field, network, strategy and regularisers of deforming Gaussians. A training loop
-evaluates `HexPlaneField` at positions and time, passes the features to `DeformNetwork`, and renders the deformed Gaussians.
-Parameters have gsplat's names and shapes, so its checkpoints load. For new work, the fields of `gsplat_core.deformation` are faster
-and normalise time as well.
+Dynamic trainer, in `contrib.dynamic`: HexPlane field, network, strategy and regularisers of deforming Gaussians. A
+training loop evaluates `HexPlaneField` at positions and time, passes the features to `DeformNetwork`, and renders the
+deformed Gaussians. Parameters have gsplat's names and shapes, so its checkpoints load. For new work, the fields of
+`gsplat_core.deformation` are faster and normalise time as well.
 """
 
 from __future__ import annotations

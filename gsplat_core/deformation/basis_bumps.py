@@ -1,4 +1,6 @@
-"""Tensors of a `BasisField`: Gaussians as rows, bumps as columns of a ring, Adam's state, and the weights that fit given values."""
+"""Tensors of a `BasisField`: Gaussians as rows, bumps as columns of a ring, Adam's state, and the weights that fit
+given values.
+"""
 
 from __future__ import annotations
 

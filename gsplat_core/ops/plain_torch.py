@@ -1,8 +1,8 @@
-"""Operations in plain torch, for any floating dtype and device, differentiable by autograd: the deformation fields, and the
-separate steps of a projection.
+"""Operations in plain torch, for any floating dtype and device, differentiable by autograd: the deformation fields, and
+the separate steps of a projection.
 
-The fields use them where no kernels exist, and `HexPlaneField` trains with them on the CPU. They are also the reference for
-tests of the kernels. This module does not load the compiled core.
+The fields use them where no kernels exist, and `HexPlaneField` trains with them on the CPU. They are also the reference
+for tests of the kernels. This module does not load the compiled core.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Blending of projected splats in plain torch: alpha compositing (Kerbl et al. 2023, eq. 3), flow, weighted sums, values along
-rays, and the correction of colours by the residual.
+"""Blending of projected splats in plain torch: alpha compositing (Kerbl et al. 2023, eq. 3), flow, weighted sums,
+values along rays, and the correction of colours by the residual.
 
-Values along rays are depths with their blending, losses of rendered rays, and depth histograms of a range sensor. Any floating
-dtype, differentiable; test reference of the compiled ops. Constants default to those of gsplat 1.6.
+Values along rays are depths with their blending, losses of rendered rays, and depth histograms of a range sensor. Any
+floating dtype, differentiable; test reference of the compiled ops. Constants default to those of gsplat 1.6.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Steps from 3D Gaussians to coloured splats in tiles, in plain torch: test reference of the compiled ops.
 
-Projection to screen-space ellipses (EWA splatting, Zwicker et al. 2001), covariance and precision matrices (Kerbl et al. 2023,
-equation 6), binning into tiles, and real spherical harmonics up to degree 4 (Sloan 2013, "Efficient Spherical Harmonic
-Evaluation").
+Projection to screen-space ellipses (EWA splatting, Zwicker et al. 2001), covariance and precision matrices (Kerbl et
+al. 2023, equation 6), binning into tiles, and real spherical harmonics up to degree 4 (Sloan 2013, "Efficient Spherical
+Harmonic Evaluation").
 """
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
 """Whole renderers built from the reference operations: any floating-point dtype and device, slow.
 
-`rasterization`; one frame from raw Gaussians and deltas, the test reference of the CUDA op `render_frame`; and expectation and
-variance of the sort-free renderers. Functions with an underscore are the reference under the names and with the arguments of
-`gsplat.cuda._torch_impl`, which gsplat's own tests call.
+`rasterization`; one frame from raw Gaussians and deltas, the test reference of the CUDA op `render_frame`; and
+expectation and variance of the sort-free renderers. Functions with an underscore are the reference under the names and
+with the arguments of `gsplat.cuda._torch_impl`, which gsplat's own tests call.
 
-Stochastic transparency is alpha blending without early stop. In Gaussian point splatting (Rijsdijk et al., TOG 2026), the number of
-points of a splat in a pixel is Poisson distributed with the integral of -ln(1 - o G) over the pixel. Both evaluate every splat at
-every pixel, so they are for small scenes.
+Stochastic transparency is alpha blending without early stop. In Gaussian point splatting (Rijsdijk et al., TOG 2026),
+the number of points of a splat in a pixel is Poisson distributed with the integral of -ln(1 - o G) over the pixel. Both
+evaluate every splat at every pixel, so they are for small scenes.
 """
 
 from __future__ import annotations

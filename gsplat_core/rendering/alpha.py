@@ -1,10 +1,11 @@
 """Alpha-blending `Renderer` for CPU and NVIDIA GPUs (Kerbl et al. 2023, section 4), and frames as CUDA graphs.
 
-`FrameRenderer` renders whole frames on a GPU as one CUDA graph without host synchronisation. The graph deforms, projects, bins, sorts
-and blends. `CapturedSequence` captures a sequence of launches and replays it as one launch.
+`FrameRenderer` renders whole frames on a GPU as one CUDA graph without host synchronisation. The graph deforms,
+projects, bins, sorts and blends. `CapturedSequence` captures a sequence of launches and replays it as one launch.
 
-An instance is a pair of a splat and a tile that it touches. A tile's list holds the instances that it blends. `TileListCapacity`
-bounds the lists. The host reads an overflow counter after the frame and repeats a frame that needed longer lists.
+An instance is a pair of a splat and a tile that it touches. A tile's list holds the instances that it blends.
+`TileListCapacity` bounds the lists. The host reads an overflow counter after the frame and repeats a frame that needed
+longer lists.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """Rendering with the compiled operations: `rasterization` as in gsplat, and `render` for one camera.
 
-Both run a chain of operations. On CUDA, `SingleCall` renders supported inputs in one native call per pass, with the same result.
+Both run a chain of operations. On CUDA, `SingleCall` renders supported inputs in one native call per pass, with the
+same result.
 """
 
 from __future__ import annotations

@@ -246,7 +246,8 @@ def _shown(value: object) -> str:
 REFUSED: dict[str, str] = {
     "rays": "give viewmats and Ks, which define the rays",
     "lidar_coeffs": (
-        "use the camera models pinhole, ortho and fisheye, or gsplat_core.training.measured_losses.render_ranges for a range sensor"
+        "use the camera models pinhole, ortho and fisheye, or gsplat_core.training.measured_losses.render_ranges for a"
+        " range sensor"
     ),
     "external_distortion_coeffs": (
         "distortion by a windshield is not modelled; undistort the pictures and use the camera models pinhole, ortho and"

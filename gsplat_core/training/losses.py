@@ -1,8 +1,8 @@
-"""Loss terms of training: their interface, selection by name and weighted sum, and the terms of colours, depth, rays, classes
-and sparsity.
+"""Loss terms of training: their interface, selection by name and weighted sum, and the terms of colours, depth, rays,
+classes and sparsity.
 
-The rays of a step are rendered once for all losses along rays. Normals are compared with those of the rendered depth (Huang et
-al. 2024, "2D Gaussian Splatting"). Losses that need further measurements are in `measured_losses`.
+The rays of a step are rendered once for all losses along rays. Normals are compared with those of the rendered depth
+(Huang et al. 2024, "2D Gaussian Splatting"). Losses that need further measurements are in `measured_losses`.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Loss terms of measurements other than a frame's colours and depth: optical flow between frames, points triangulated from
-several frames (TriaGS), and scans of range sensors.
+"""Loss terms of measurements other than a frame's colours and depth: optical flow between frames, points triangulated
+from several frames (TriaGS), and scans of range sensors.
 
-Matches of triangulated points come from the pictures alone. Projecting the rendered point into other views and triangulating it
-there would return the same point for any surface.
+Matches of triangulated points come from the pictures alone. Projecting the rendered point into other views and
+triangulating it there would return the same point for any surface.
 """
 
 from __future__ import annotations

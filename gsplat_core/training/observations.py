@@ -1,9 +1,9 @@
-"""Observations of frames for training: pictures and masks of one or both eyes on the training device, their selection for
-each step, and the mapping between points and pixels.
+"""Observations of frames for training: pictures and masks of one or both eyes on the training device, their selection
+for each step, and the mapping between points and pixels.
 
-Sensors and light paths of a stereo scope's eyes differ slightly, and the difference changes slowly. Without correction the
-two pictures would pull every colour back and forth. A gain and an offset per channel are therefore applied to the right
-picture.
+Sensors and light paths of a stereo scope's eyes differ slightly, and the difference changes slowly. Without correction
+the two pictures would pull every colour back and forth. A gain and an offset per channel are therefore applied to the
+right picture.
 """
 
 from __future__ import annotations

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from statistics import fmean
 from typing import Any
 
 import numpy as np
@@ -23,6 +25,7 @@ from gsplat_core.scene.gaussians import Gaussians
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.covering import Covering
 from gsplat_core.training.initialisation import StartOnDevice, gaussians_from_frame
+from gsplat_core.training.metrics import psnr_tissue_db
 from gsplat_core.training.motion_prior import Following, continued, newest_state
 from gsplat_core.training.observations import BothEyes, Observation, ObservationWindow, for_eyes
 from gsplat_core.training.offline import OfflineTraining, ToFit, least_spacing_s, to_fit
@@ -476,3 +479,10 @@ class Reconstructor:
         return self._start_here(
             frame, observation, sh_degree=config.sh_degree, default_depth_mm=config.default_depth_mm
         )
+
+
+def validation_psnr_db(learned: Reconstructor, frames: Sequence[Frame]) -> float:
+    """Return the mean tissue PSNR of a reconstruction on validation frames, in dB; 0 if none has tissue."""
+    scores = [psnr_tissue_db(learned.picture(frame), frame.image, frame.mask) for frame in frames]
+    # A frame without tissue has no score.
+    return fmean([each for each in scores if math.isfinite(each)] or [0.0])

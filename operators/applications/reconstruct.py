@@ -22,24 +22,23 @@ from gsplat_core.io.recordings.calibration import POSES_FILE, write_poses
 from gsplat_core.models import Model
 from gsplat_core.poses.odometry import MOVING_SHARE, CameraPath, camera_path_of, rigid_share
 from gsplat_core.scene.frames import Frame
-from gsplat_core.training import validation
+from gsplat_core.training import offline
 from gsplat_core.training.observations import BothEyes
-from gsplat_core.training.offline import ToFit
-from gsplat_core.training.reconstructor import Reconstructor
-from gsplat_core.training.schedule import Budget, ObserveReport
-from gsplat_core.training.validation import (
+from gsplat_core.training.offline import (
     INPUT_GAIN_DB,
     LEAST_FRAMES,
     USUAL_STEPS,
     ChosenSteps,
     Clock,
+    ToFit,
     Train,
     Trained,
     choose_steps,
     split,
     trial_of,
-    validation_psnr_db,
 )
+from gsplat_core.training.reconstructor import Reconstructor, validation_psnr_db
+from gsplat_core.training.schedule import Budget, ObserveReport
 from operators.applications.replay import ReplaySettings, new_reconstructor, prepare, replay_graph
 from operators.applications.session import (
     FirstFrames,
@@ -118,7 +117,7 @@ def reconstruct(
     Args:
         settings: settings of the run, `ReconstructSettings` for options of offline training; held-out frames are always
             excluded.
-        steps: number of optimiser steps; None chooses it by validation (`gsplat_core.training.validation`).
+        steps: number of optimiser steps; None chooses it by validation (`gsplat_core.training.offline`).
         progress: called after each step or frame.
         stop_requested: polled. True during training saves the model without evaluation; True during
             evaluation acts as in a replay.
@@ -283,7 +282,7 @@ class _Fitting:
         if len(inputs.validating) < LEAST_FRAMES:
             return inputs, ChosenSteps(USUAL_STEPS, (), "few frames")
         limit_s = 60 * self._minutes
-        first = trial_of(self._trial(inputs), validation.FIRST_STEPS, self._clock)
+        first = trial_of(self._trial(inputs), offline.FIRST_STEPS, self._clock)
         learned = self._learning
         for reason, other_than in (
             ("the scope moves, and its poses were estimated from the training frames", self._with_poses),
@@ -295,7 +294,7 @@ class _Fitting:
                 break
             if (other := other_than(inputs)) is None:
                 continue
-            trial = trial_of(self._trial(other), validation.FIRST_STEPS, self._clock)
+            trial = trial_of(self._trial(other), offline.FIRST_STEPS, self._clock)
             if trial.psnr_db >= first.psnr_db + INPUT_GAIN_DB and not self._is_stopped:
                 self._notes.append(
                     f"{reason}: validation frames score {trial.psnr_db:.2f} dB, otherwise {first.psnr_db:.2f} dB"

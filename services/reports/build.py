@@ -12,7 +12,7 @@ from gsplat_core.evaluation.baselines import Baselines
 from gsplat_core.evaluation.depth import DepthShare
 from gsplat_core.evaluation.scores import finite
 from gsplat_core.training.metrics import QualityTracker
-from gsplat_core.training.validation import ChosenSteps
+from gsplat_core.training.offline import ChosenSteps
 from operators.applications.session import RunOutcome
 from operators.checks import WITHHELD as OUT_OF_BODY
 from operators.checks import OutOfBodyFrames, StageCounts

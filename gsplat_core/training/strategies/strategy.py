@@ -1,10 +1,10 @@
-"""Base of the strategies that change the number of Gaussians during training, and their row operations, in gsplat's calling
-convention.
+"""Base of the strategies that change the number of Gaussians during training, and their row operations, in gsplat's
+calling convention.
 
-A strategy works on a user's own training loop. The Gaussians are tensors of one row each in a dict `params`: `means` [N, 3],
-`quats` [N, 4] wxyz, `scales` [N, 3] as logarithms, `opacities` [N] or [N, 1] as logits, and any further ones. `optimizers`
-holds one optimiser with one parameter group for each trainable tensor, under the same names. `state` comes from
-`initialize_state` and keeps statistics between steps. `info` is the third result of `rasterization`.
+A strategy works on a user's own training loop. The Gaussians are tensors of one row each in a dict `params`: `means`
+[N, 3], `quats` [N, 4] wxyz, `scales` [N, 3] as logarithms, `opacities` [N] or [N, 1] as logits, and any further ones.
+`optimizers` holds one optimiser with one parameter group for each trainable tensor, under the same names. `state` comes
+from `initialize_state` and keeps statistics between steps. `info` is the third result of `rasterization`.
 
     strategy = DefaultStrategy()
     strategy.check_sanity(params, optimizers)
@@ -18,9 +18,10 @@ holds one optimiser with one parameter group for each trainable tensor, under th
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
 
-Row operations add, remove or change Gaussians together with the state of their optimisers. They change `params`, the optimisers
-and `state` in place. Tensors in `state` have a row for each Gaussian; numbers and tensors without dimensions are left alone. Random
-numbers come from torch's default generator of the device, or from `generator`, so a seed gives the same Gaussians.
+Row operations add, remove or change Gaussians together with the state of their optimisers. They change `params`, the
+optimisers and `state` in place. Tensors in `state` have a row for each Gaussian; numbers and tensors without dimensions
+are left alone. Random numbers come from torch's default generator of the device, or from `generator`, so a seed gives
+the same Gaussians.
 
 `StrategyKind` and its adapter run such a strategy on a scene that deforms, in offline reconstructions.
 """

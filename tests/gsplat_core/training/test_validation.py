@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from gsplat_core.training.validation import Trained, choose_steps, validating
+from gsplat_core.training.offline import Trained, choose_steps, validating
 
 
 class Training:

@@ -11,7 +11,7 @@ import pytest
 from gsplat_core.errors import RecordingInvalid
 from gsplat_core.io.bundle import load_bundle
 from gsplat_core.io.recordings import synthesize
-from gsplat_core.training import validation
+from gsplat_core.training import offline
 from operators.applications import reconstruct as module
 from operators.applications.evaluate import EvaluationSettings, evaluate
 from operators.applications.evaluated import EvaluatedRun
@@ -22,13 +22,13 @@ from tests.gsplat_core.geometry.moving_scope import SIDEWAYS, video
 
 
 @pytest.mark.parametrize(
-    ("gain_db", "dropped"), [(2 * validation.INPUT_GAIN_DB, True), (0.5 * validation.INPUT_GAIN_DB, False)]
+    ("gain_db", "dropped"), [(2 * offline.INPUT_GAIN_DB, True), (0.5 * offline.INPUT_GAIN_DB, False)]
 )
 def test_depth_and_the_right_eye_are_left_out_where_they_hurt(tmp_path, monkeypatch, gain_db, dropped):
     """The scores of the validation frames are the test's; each input that is left out gains the same."""
     folder = synthesize(tmp_path / "take", frames=8, width_px=40, height_px=32)
-    monkeypatch.setattr(validation, "FIRST_STEPS", 1)
-    monkeypatch.setattr(validation, "MOST_STEPS", 1)
+    monkeypatch.setattr(offline, "FIRST_STEPS", 1)
+    monkeypatch.setattr(offline, "MOST_STEPS", 1)
 
     def score(learned, frames):
         without = (learned.snapshot().depth_source is None) + (learned.config.eyes == "left")
@@ -54,13 +54,11 @@ def moving(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("gain_db", "kept"), [(2 * validation.INPUT_GAIN_DB, True), (0.5 * validation.INPUT_GAIN_DB, False)]
-)
+@pytest.mark.parametrize(("gain_db", "kept"), [(2 * offline.INPUT_GAIN_DB, True), (0.5 * offline.INPUT_GAIN_DB, False)])
 def test_poses_of_a_moving_scope_are_used_where_they_help(moving, tmp_path, monkeypatch, gain_db, kept):
     """The scores of the validation frames are the test's; estimated poses gain."""
-    monkeypatch.setattr(validation, "FIRST_STEPS", 1)
-    monkeypatch.setattr(validation, "MOST_STEPS", 1)
+    monkeypatch.setattr(offline, "FIRST_STEPS", 1)
+    monkeypatch.setattr(offline, "MOST_STEPS", 1)
     monkeypatch.setattr(
         module, "validation_psnr_db", lambda learned, frames: 30.0 + gain_db * (frames[0].pose is not None)
     )

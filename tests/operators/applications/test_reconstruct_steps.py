@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from gsplat_core.training import validation
+from gsplat_core.training import offline
 from operators.applications.reconstruct import ReconstructSettings, reconstruct
 from services.reports.build import write_reports
 from tests.gsplat_core.geometry.moving_scope import SIDEWAYS, video
@@ -24,8 +24,8 @@ def settings(tmp_path):
 
 
 def test_the_chosen_steps_and_their_reason_are_reported(settings, monkeypatch):
-    monkeypatch.setattr(validation, "FIRST_STEPS", 2)
-    monkeypatch.setattr(validation, "MOST_STEPS", 4)
+    monkeypatch.setattr(offline, "FIRST_STEPS", 2)
+    monkeypatch.setattr(offline, "MOST_STEPS", 4)
     reconstruct(settings, clock=lambda: 0.0, report=write_reports)
     run = json.loads((settings.out / "report.json").read_text())["run"]["training_steps"]
     assert [trial["steps"] for trial in run["trials"]] == [2, 4]
@@ -33,7 +33,7 @@ def test_the_chosen_steps_and_their_reason_are_reported(settings, monkeypatch):
 
 
 def test_the_time_limit_ends_the_search(settings, monkeypatch):
-    monkeypatch.setattr(validation, "FIRST_STEPS", 2)
+    monkeypatch.setattr(offline, "FIRST_STEPS", 2)
     seconds = iter(range(0, 10_000, 25))
     trained = set()
     outcome = reconstruct(settings, progress=lambda each: trained.add(each.stage), clock=lambda: float(next(seconds)))
