@@ -23,8 +23,8 @@ from services import product_version
 from services.api import audit as audit_routes
 from services.api import display, models, pages, recordings, replays, service, snapshots, streams
 from services.api import keys as key_routes
-from services.api.guard import AddressRate, HeadLength, KnownHosts, SecurityHeaders, operation_id
-from services.api.observability import Measures, Observed, StreamMeasures
+from services.api.guard import AddressRate, HeadLength, KnownHosts, Observed, SecurityHeaders, operation_id
+from services.api.observability import Measures, StreamMeasures
 from services.api.pages import ABOUT, describe
 from services.api.problems import Conflicting, Missing, Problem, Unavailable, Unprocessable, answer_with_problems
 from services.api.state import ControlState, Parts, Storage, TokenBuckets, ViewerCount, folders_of

@@ -1,7 +1,7 @@
-"""Checks of every request before its route runs: access, body, host, head and rate; and the audit entries of changes.
+"""Checks of every request before its route runs, and its records: access, body, host, head and rate; log line, metrics and audit entry.
 
 Every route declares its role, which is checked before any byte of the body is read. Bodies have limits on size and speed, and JSON is parsed strictly.
-The middleware checks what is independent of the route. A change is written to the audit log before the caller gets the answer.
+The middleware records the request and checks what is independent of the route. A change is written to the audit log before the caller gets the answer.
 """
 
 from __future__ import annotations
@@ -9,7 +9,9 @@ from __future__ import annotations
 import asyncio
 import ipaddress
 import json
+import logging
 import re
+import secrets
 import time
 from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager
@@ -24,11 +26,12 @@ from starlette.requests import ClientDisconnect, HTTPConnection, Request
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from services.api.observability import Measures
+from services.api.observability import FACTS, REQUEST_ID, Measures
 from services.api.problems import (
     BadRequest,
     Forbidden,
     HeadTooLarge,
+    Internal,
     Misdirected,
     Problem,
     TooLarge,
@@ -39,6 +42,7 @@ from services.api.problems import (
     Unprocessable,
     WrongContent,
     refuse,
+    response_of,
 )
 from services.api.state import KEYS_UNREADABLE, ControlState, TokenBuckets, control_of, known_problem
 from services.audit import AuditUnwritable
@@ -46,6 +50,7 @@ from services.audit.log import Detail, Outcome
 from services.auth.keys import ANYBODY, Caller, KeysUnreadable, Role
 from services.settings.sections import LimitSettings, ServerSettings
 
+log = logging.getLogger("intrasplat.requests")
 JSON = "application/json"
 MOST_TOKEN_LENGTH = 256
 BodyLimit = Literal["body_bytes", "model_bytes", "recording_bytes"]
@@ -443,6 +448,69 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
             raise BadRequest(f"the body gives the key {key!r:.60} twice in one object; give it once")
         found[key] = value
     return found
+
+
+METHODS = {"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"}
+QUIET = {"/livez", "/readyz", "/metrics"}
+"""Routes polled by monitoring systems; their requests are logged only on failure."""
+
+
+class Observed:
+    """Middleware that numbers, logs and measures each request, and answers 500 after a bug. Outermost except for the
+    security headers and, with trusted proxies, the proxy headers.
+    """
+
+    def __init__(self, app: ASGIApp, measures: Measures) -> None:
+        self._app = app
+        self._measures = measures
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] == "lifespan":
+            return await self._app(scope, receive, send)
+        request_id = secrets.token_hex(8)
+        scope["state"] = {**scope.get("state", {}), "request_id": request_id}
+        token = REQUEST_ID.set(request_id)
+        status = 0
+
+        async def send_numbered(message: Message) -> None:
+            nonlocal status
+            if message["type"] in ("http.response.start", "websocket.http.response.start"):
+                status = message["status"]
+                MutableHeaders(scope=message)["X-Request-ID"] = request_id
+            elif message["type"] == "websocket.accept":
+                status = 101
+            await send(message)
+
+        started_s = time.monotonic()
+        try:
+            await self._app(scope, receive, send_numbered)
+        except Exception:  # outermost handler: a bug becomes a plain 500, the traceback goes to the log
+            log.exception("a request failed by a bug in this program")
+            if status == 0 and scope["type"] == "http":
+                problem = Internal(f"a bug in this server; its log has the cause under request {request_id}")
+                await response_of(problem, scope)(scope, receive, send_numbered)
+            else:
+                raise  # the answer has begun: the server closes the connection
+        finally:
+            self._note(scope, status, time.monotonic() - started_s)
+            REQUEST_ID.reset(token)
+
+    def _note(self, scope: Scope, status: int, took_s: float) -> None:
+        route = str(getattr(scope.get("route"), "path", "unmatched"))
+        method = scope["method"] if scope.get("method") in METHODS else "other"
+        if scope["type"] == "websocket":
+            method = "WEBSOCKET"
+        self._measures.requests.labels(method, route, str(status)).inc()
+        if status != 101:
+            self._measures.duration.labels(method, route).observe(took_s)
+        if route in QUIET and status < 400:
+            return
+        caller = scope["state"].get("caller")
+        said = dict(
+            method=method, route=route, status=status, took_ms=round(took_s * 1e3, 2),
+            address=(scope.get("client") or ("",))[0], key=str(caller or ""),
+        )  # fmt: skip
+        log.info("%s %s %d", method, route, status, extra={FACTS: said})
 
 
 CONTENT_SECURITY_POLICY = "; ".join(

@@ -1,7 +1,7 @@
-"""Service log and record of each request, and Prometheus metrics of the control plane and of the streams.
+"""Service log, and Prometheus metrics of the control plane and of the streams.
 
 The log is on standard error, one line per event, with the request id. Labels of metrics hold route templates and stream names, and no other
-text of a request. Metrics of streams are collected from heartbeats at scrape time. `Observed` logs and counts requests, and answers uncaught errors.
+text of a request. Metrics of streams are collected from heartbeats at scrape time.
 """
 
 from __future__ import annotations
@@ -9,10 +9,8 @@ from __future__ import annotations
 import collections
 import json
 import logging
-import secrets
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from datetime import UTC, datetime
@@ -24,11 +22,8 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Histo
 from prometheus_client.platform_collector import PlatformCollector
 from prometheus_client.process_collector import ProcessCollector
 from prometheus_client.registry import Collector
-from starlette.datastructures import MutableHeaders
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from services import product_version
-from services.api.problems import Internal, response_of
 from services.bus.messages import cumulative
 from services.display import KINDS
 from services.settings.sections import LogSettings, masked_address
@@ -38,7 +33,8 @@ if TYPE_CHECKING:
     from services.supervisor.stream import SupervisedStreams
 
 REQUEST_ID: ContextVar[str] = ContextVar("request_id", default="")
-_FACTS = "facts"
+FACTS = "facts"
+"""Name of the further fields of a log line: `log.info("…", extra={FACTS: {"route": "/v1/models"}})`."""
 
 
 class JsonFormatter(logging.Formatter):
@@ -54,7 +50,7 @@ class JsonFormatter(logging.Formatter):
         }
         if REQUEST_ID.get():
             entry["request_id"] = REQUEST_ID.get()
-        entry.update(getattr(record, _FACTS, {}))
+        entry.update(getattr(record, FACTS, {}))
         if record.exc_info:
             entry["exception"] = masked_address(self.formatException(record.exc_info))
         return json.dumps(entry, ensure_ascii=True, default=str)
@@ -66,7 +62,7 @@ class TextFormatter(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
         time = datetime.fromtimestamp(record.created).strftime("%H:%M:%S")
         line = f"{time} {record.levelname.lower():7} {masked_address(record.getMessage())}"
-        line += "".join(f" {name}={value}" for name, value in getattr(record, _FACTS, {}).items())
+        line += "".join(f" {name}={value}" for name, value in getattr(record, FACTS, {}).items())
         line = line.replace("\r", "\\r").replace("\n", "\\n")
         return f"{line}\n{masked_address(self.formatException(record.exc_info))}" if record.exc_info else line
 
@@ -103,11 +99,6 @@ def say_start(*lines: str) -> None:
 def _is_no_refused_websocket(record: logging.LogRecord) -> bool:
     """Log filter: return False for uvicorn's error about a refused WebSocket, which the request log already records."""
     return record.getMessage() != "ASGI callable returned without completing handshake."
-
-
-def facts(**values: object) -> dict[str, dict[str, object]]:
-    """Return extra fields for a log line: `log.info("…", extra=facts(route="/v1/models"))`."""
-    return {_FACTS: values}
 
 
 DURATIONS_S = (0.001, 0.0025, 0.005, 0.01, 0.0167, 0.0333, 0.05, 0.0667, 0.1, 0.25, 0.5, 1.0, 2.5, 10.0)
@@ -319,67 +310,3 @@ class StreamMeasures(Collector):
         for (name, of_role, what), count in self._events.items():
             events.add_metric([name, of_role, what], count)
         return [state, restarts, events, encoded, dropped, viewers, ages, *graphs.families()]
-
-
-log = logging.getLogger("intrasplat.requests")
-METHODS = {"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"}
-QUIET = {"/livez", "/readyz", "/metrics"}
-"""Routes polled by monitoring systems; their requests are logged only on failure."""
-
-
-class Observed:
-    """Middleware that numbers, logs and measures each request, and answers 500 after a bug. Outermost except for the
-    security headers and, with trusted proxies, the proxy headers.
-    """
-
-    def __init__(self, app: ASGIApp, measures: Measures) -> None:
-        self._app = app
-        self._measures = measures
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] == "lifespan":
-            return await self._app(scope, receive, send)
-        request_id = secrets.token_hex(8)
-        scope["state"] = {**scope.get("state", {}), "request_id": request_id}
-        token = REQUEST_ID.set(request_id)
-        status = 0
-
-        async def send_numbered(message: Message) -> None:
-            nonlocal status
-            if message["type"] in ("http.response.start", "websocket.http.response.start"):
-                status = message["status"]
-                MutableHeaders(scope=message)["X-Request-ID"] = request_id
-            elif message["type"] == "websocket.accept":
-                status = 101
-            await send(message)
-
-        started_s = time.monotonic()
-        try:
-            await self._app(scope, receive, send_numbered)
-        except Exception:  # outermost handler: a bug becomes a plain 500, the traceback goes to the log
-            log.exception("a request failed by a bug in this program")
-            if status == 0 and scope["type"] == "http":
-                problem = Internal(f"a bug in this server; its log has the cause under request {request_id}")
-                await response_of(problem, scope)(scope, receive, send_numbered)
-            else:
-                raise  # the answer has begun: the server closes the connection
-        finally:
-            self._note(scope, status, time.monotonic() - started_s)
-            REQUEST_ID.reset(token)
-
-    def _note(self, scope: Scope, status: int, took_s: float) -> None:
-        route = str(getattr(scope.get("route"), "path", "unmatched"))
-        method = scope["method"] if scope.get("method") in METHODS else "other"
-        if scope["type"] == "websocket":
-            method = "WEBSOCKET"
-        self._measures.requests.labels(method, route, str(status)).inc()
-        if status != 101:
-            self._measures.duration.labels(method, route).observe(took_s)
-        if route in QUIET and status < 400:
-            return
-        caller = scope["state"].get("caller")
-        said = facts(
-            method=method, route=route, status=status, took_ms=round(took_s * 1e3, 2),
-            address=(scope.get("client") or ("",))[0], key=str(caller or ""),
-        )  # fmt: skip
-        log.info("%s %s %d", method, route, status, extra=said)

@@ -9,7 +9,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from services.api import new_app
-from services.api.observability import JsonFormatter, facts
+from services.api.observability import FACTS, JsonFormatter
 from services.api.problems import PROBLEM_JSON
 from services.settings import ServiceSettings
 
@@ -159,7 +159,7 @@ def test_paths_are_no_labels(served):
 def test_a_line_of_the_log_cannot_be_forged():
     message = 'x\n{"level": "info", "message": "forged"}\r\n\x1b[31m rtsp://u:pa55@h/'
     record = logging.LogRecord("x", logging.INFO, "", 0, "%s", (message,), None)
-    record.__dict__.update(facts(address="a\nb"))
+    record.__dict__[FACTS] = {"address": "a\nb"}
     line = JsonFormatter().format(record)
     assert "\n" not in line and "\x1b" not in line and "pa55" not in line
     assert json.loads(line)["address"] == "a\nb"

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import pytest
 
 from services.api import observability
-from services.api.observability import TextFormatter, _log_uncaught, facts, log_to_stderr
+from services.api.observability import FACTS, TextFormatter, _log_uncaught, log_to_stderr
 from services.settings.sections import LogSettings
 
 
@@ -40,7 +40,7 @@ def test_a_terminal_gets_text_and_everything_else_json_unless_the_settings_say_w
     monkeypatch.setattr(sys, "stderr", written := stream())
     log_to_stderr(LogSettings.model_validate({"format": form}))
 
-    logging.getLogger("services").warning("a stream stopped", extra=facts(stream="room-1"))
+    logging.getLogger("services").warning("a stream stopped", extra={FACTS: {"stream": "room-1"}})
 
     assert written.getvalue().startswith("{") is json
     assert "a stream stopped" in written.getvalue() and "room-1" in written.getvalue()
@@ -48,7 +48,7 @@ def test_a_terminal_gets_text_and_everything_else_json_unless_the_settings_say_w
 
 def test_text_hides_passwords_and_cannot_be_made_to_hold_a_second_line() -> None:
     record = logging.makeLogRecord(
-        {"msg": "rtsp://user:secret@camera/\n12:00:00 info forged", "levelname": "INFO", **facts(source="a\nb")}
+        {"msg": "rtsp://user:secret@camera/\n12:00:00 info forged", "levelname": "INFO", FACTS: {"source": "a\nb"}}
     )
 
     line = TextFormatter().format(record)
