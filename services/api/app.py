@@ -29,8 +29,9 @@ from services.api.pages import ABOUT, describe
 from services.api.problems import Conflicting, Missing, Problem, Unavailable, Unprocessable, answer_with_problems
 from services.api.state import ControlState, Parts, Storage, TokenBuckets, ViewerCount, folders_of
 from services.audit import AuditLog, AuditUnwritable, Keeping
-from services.audit.log import Outcome, SystemEvents
-from services.auth.keys import KeyStore, Tickets, changed_outside, first_admin_key, keys_read_again
+from services.audit.log import AUDIT_FILE, Outcome, SystemEvents
+from services.auth.keys import KEYS_FILE, KeyStore, Tickets, changed_outside, first_admin_key, keys_read_again
+from services.backup import StoredFiles, StoredFilesWatch
 from services.bus.runtime import RuntimeFolder
 from services.errors import (
     BusError,
@@ -48,7 +49,6 @@ from services.exports.snapshots import ModelExports, SnapshotStore, StreamSnapsh
 from services.jobs.pool import PoolKeeper, PoolProcess, PoolSettings
 from services.jobs.results import Replays, Results
 from services.jobs.store import JobStore, uses_recording
-from services.missing_files import StoredFiles, StoredFilesWatch
 from services.recordings.store import RecordingStore, State
 from services.registry.models import DATABASE_FILE, ModelRegistry
 from services.registry.records import NICENESS
@@ -66,8 +66,6 @@ ROUTERS: tuple[APIRouter, ...] = (
     service.router, service.service_router, streams.router, display.router, models.router, snapshots.router, snapshots.exports_router, replays.router,
     recordings.router, key_routes.router, audit_routes.router, pages.router,
 )  # fmt: skip
-KEYS_FILE = "keys.json"
-AUDIT_FILE = "audit.jsonl"
 
 
 def new_app(settings: ServiceSettings, parts: Parts | None = None) -> FastAPI:

@@ -34,6 +34,8 @@ from gsplat_core.io.files import open_regular, read_regular, sync_folder
 from services.errors import AuditInUse, AuditUnwritable, disk_advice
 
 log = logging.getLogger(__name__)
+AUDIT_FILE = "audit.jsonl"
+"""Name of the audit log in the data folder of the service."""
 FIRST = 64 * "0"
 """Digest that the first entry of a log states for its missing predecessor."""
 MOST_LINE_BYTES = 8192

@@ -115,6 +115,8 @@ class Tickets:
             del self._waiting[next(iter(self._waiting))]
 
 
+KEYS_FILE = "keys.json"
+"""Name of the key file in the data folder of the service."""
 PREFIX = "intrasplat"
 MOST_LIVE = 2
 """Largest number of valid keys per name: old and new key during a change-over."""

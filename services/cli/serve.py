@@ -13,12 +13,13 @@ from pathlib import Path
 import typer
 
 from gsplat_core.errors import UserError
-from services.api.app import AUDIT_FILE, KEYS_FILE, assembled, new_app
+from services.api.app import assembled, new_app
 from services.api.observability import log_to_stderr, say_start
 from services.api.server import bind, certificate_of, serve
 from services.api.service import bind_probe
 from services.audit import AuditInUse, AuditLog, AuditUnwritable, Keeping, verify
-from services.auth.keys import ApiKey, KeyConflict, KeyStore, Role, append_key_change
+from services.audit.log import AUDIT_FILE
+from services.auth.keys import KEYS_FILE, ApiKey, KeyConflict, KeyStore, Role, append_key_change
 from services.backup import Backup, check_backup, make_backup, refuse_unfinished_restore, restore_backup
 from services.cli.terminal import BAD_INPUT, KEY_COLUMNS, OK, printable, table
 from services.private_files import keep_files_private, make_state_private

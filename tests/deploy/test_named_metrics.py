@@ -17,7 +17,7 @@ from services.api.server import ServerCertificate
 from services.api.state import Storage
 from services.audit import AuditLog
 from services.audit.log import SystemEvents
-from services.missing_files import StoredFiles, StoredFilesWatch
+from services.backup import StoredFiles, StoredFilesWatch
 from services.registry.database import Database
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"

@@ -19,10 +19,10 @@ import pytest
 import sqlalchemy as sa
 
 from services import backup as backups
-from services.api.app import AUDIT_FILE, KEYS_FILE, Archive, new_archive, registry_of
+from services.api.app import Archive, new_archive, registry_of
 from services.audit import AuditLog, verify
-from services.audit.log import SystemEvents
-from services.auth.keys import KeyStore, Role
+from services.audit.log import AUDIT_FILE, SystemEvents
+from services.auth.keys import KEYS_FILE, KeyStore, Role
 from services.backup import MANIFEST, BackupFailed, check_backup, make_backup, refuse_unfinished_restore, restore_backup
 from services.cli.serve import backup_command, restore_command
 from services.errors import StoreUnavailable

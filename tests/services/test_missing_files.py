@@ -8,9 +8,9 @@ import pytest
 import sqlalchemy as sa
 
 from services.audit.log import SystemEvents
+from services.backup import MissingFile, StoredFiles, StoredFilesWatch, count_by_kind, missing_files
 from services.jobs.results import REPORT
 from services.jobs.store import JOBS, JobState
-from services.missing_files import MissingFile, StoredFiles, StoredFilesWatch, count_by_kind, missing_files
 from services.recordings.store import RECORDINGS, UPLOAD, State
 from services.registry.database import Database
 from services.registry.records import MODELS, VERSIONS

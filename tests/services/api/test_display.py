@@ -14,9 +14,8 @@ from starlette.testclient import WebSocketDenialResponse
 from starlette.websockets import WebSocketDisconnect
 
 from services.api import display as display_module
-from services.api.app import KEYS_FILE
 from services.api.guard import still_valid
-from services.auth.keys import Caller, KeyStore, Role
+from services.auth.keys import KEYS_FILE, Caller, KeyStore, Role
 
 SOCKET = "/v1/streams/endoscope/display"
 MJPEG = "/v1/streams/endoscope/mjpeg"

@@ -15,8 +15,8 @@ from prometheus_client.parser import text_string_to_metric_families
 from starlette.testclient import TestClient
 
 from services.api import Parts, new_app, state
-from services.api.app import AUDIT_FILE
 from services.audit import AuditLog, verify
+from services.audit.log import AUDIT_FILE
 from services.settings import ServiceSettings
 
 Usage = namedtuple("Usage", "total used free")
