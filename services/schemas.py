@@ -24,8 +24,7 @@ from pydantic import (
 from operators.settings import CallerJobOptions, CallerRenderOptions, stream_options_schema
 from services.auth.keys import MOST_STREAMS, Role
 from services.exports.files import PICTURES, RenderWish
-from services.settings import ResourceName, StreamSettings
-from services.settings.sections import masked_address
+from services.settings import ResourceName, StreamSettings, masked_address
 
 
 class VersionView(BaseModel):

@@ -42,6 +42,7 @@ from services.errors import (
     NoSnapshot,
     NotFound,
     Rejected,
+    SettingsInvalid,
     StoreUnavailable,
 )
 from services.exports.files import ExportCache
@@ -54,7 +55,7 @@ from services.registry.models import DATABASE_FILE, ModelRegistry
 from services.registry.records import NICENESS
 from services.retention import ClockGuard, RecordingRetention, ReplayRetention
 from services.schemas import CheckResult
-from services.settings import ServiceSettings, SettingsInvalid
+from services.settings import ServiceSettings
 from services.supervisor.process import StreamEvent
 from services.supervisor.stream import ShownModels, SupervisedStreams
 

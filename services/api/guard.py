@@ -48,7 +48,7 @@ from services.api.state import KEYS_UNREADABLE, ControlState, TokenBuckets, cont
 from services.audit import AuditUnwritable
 from services.audit.log import Detail, Outcome
 from services.auth.keys import ANYBODY, Caller, KeysUnreadable, Role
-from services.settings.sections import LimitSettings, ServerSettings
+from services.settings import LimitSettings, ServerSettings
 
 log = logging.getLogger("intrasplat.requests")
 JSON = "application/json"

@@ -26,7 +26,7 @@ from prometheus_client.registry import Collector
 from services import product_version
 from services.bus.messages import cumulative
 from services.display import KINDS
-from services.settings.sections import LogSettings, masked_address
+from services.settings import LogSettings, masked_address
 from services.supervisor.process import StreamEvent
 
 if TYPE_CHECKING:

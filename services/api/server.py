@@ -40,7 +40,7 @@ from services.api.state import ControlState
 from services.audit.log import SystemEvents
 from services.errors import CannotServe
 from services.schemas import CheckResult
-from services.settings import ServiceSettings
+from services.settings import ServiceSettings, is_loopback
 
 log = logging.getLogger(__name__)
 TOO_LONG = 431
@@ -451,18 +451,11 @@ def bind(settings: ServiceSettings) -> socket.socket:
 
 def _refuse_plaintext(settings: ServiceSettings) -> None:
     server = settings.server
-    if server.certfile is None and not server.plaintext and not _is_loopback(server.host):
+    if server.certfile is None and not server.plaintext and not is_loopback(server.host):
         raise CannotServe(
             f"server.host is {server.host}, which others reach, without TLS: keys would travel in the clear; give server.certfile and"
             " server.keyfile, or server.plaintext: true where something before this server does TLS"
         )
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
 
 
 def _address(listener: socket.socket, settings: ServiceSettings) -> str:

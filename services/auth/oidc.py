@@ -21,7 +21,7 @@ import jwt
 
 from services.api.problems import Forbidden, Unauthenticated, Unavailable
 from services.auth.keys import Caller, Role
-from services.settings.sections import OidcSettings
+from services.settings import OidcSettings
 
 log = logging.getLogger(__name__)
 FRESH_S = 600.0

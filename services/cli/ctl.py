@@ -518,7 +518,7 @@ def assigned(texts: Iterable[str]) -> dict[str, Any]:
 
 def _assigned(text: str) -> tuple[str, Any]:
     """Parse `name=value`, with the value as YAML: a number, a boolean or a word."""
-    from services.settings.load import yaml_value
+    from services.settings import yaml_value
 
     name, equals, value = text.partition("=")
     if not equals or not name:

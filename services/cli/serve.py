@@ -22,9 +22,9 @@ from services.audit.log import AUDIT_FILE
 from services.auth.keys import KEYS_FILE, ApiKey, KeyConflict, KeyStore, Role, append_key_change
 from services.backup import Backup, check_backup, make_backup, refuse_unfinished_restore, restore_backup
 from services.cli.terminal import BAD_INPUT, KEY_COLUMNS, OK, printable, table
+from services.errors import SettingsInvalid
 from services.private_files import keep_files_private, make_state_private
-from services.settings import ServiceSettings, SettingsInvalid, load_settings
-from services.settings.sections import NAME_PATTERN
+from services.settings import NAME_PATTERN, ServiceSettings, load_settings
 
 
 def serve_command(

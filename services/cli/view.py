@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ipaddress
 import json
 import os
 import sys
@@ -24,7 +23,7 @@ from services.display import KINDS
 from services.model_view import ModelView, Pictures, PictureView
 from services.openigtlink import MessageServer, StreamMessages, folder_of, send
 from services.registry.bundle_file import SUFFIX, unpack
-from services.settings import load_settings
+from services.settings import is_loopback, load_settings
 
 
 def check_host(host: str, plaintext: bool, why: str) -> None:
@@ -38,11 +37,7 @@ def check_host(host: str, plaintext: bool, why: str) -> None:
     Raises:
         InvalidSetting: if the address is reachable from other machines.
     """
-    try:
-        here = host == "localhost" or ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        here = False
-    if not here and not plaintext:
+    if not is_loopback(host) and not plaintext:
         raise InvalidSetting(
             f"{host} is beyond this machine: {why}; give --plaintext on a network that is closed to others"
         )

@@ -31,7 +31,7 @@ from services.bus.messages import MOST_BYTES, packed_json, parsed_json
 from services.bus.runtime import ProcessIdentity, RuntimeFolder, check_path, read_json, write_json
 from services.errors import AlreadyRunning, BadMessage, NoAnswer
 from services.private_files import keep_files_private
-from services.settings.sections import masked_address
+from services.settings import masked_address
 from services.supervisor.worker import ORPHAN_DRAIN_S, Parent, identity_of
 
 FINISHED = 0

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from services.settings.sections import ServerSettings
+from services.settings import ServerSettings
 
 ROOT = Path(__file__).resolve().parents[2]
 CHART = ROOT / "deploy" / "helm"

@@ -19,7 +19,7 @@ from services.errors import ClientError, Rejected
 from services.jobs import store as jobs
 from services.recordings import check
 from services.registry import models
-from services.settings.sections import SourceRules
+from services.settings import SourceRules
 
 
 def entry(parts: int) -> Any:

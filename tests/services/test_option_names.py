@@ -24,8 +24,9 @@ from operators.settings import (
 from operators.sources.registry import SOURCES
 from services.api import streams
 from services.cli import app as command_line
+from services.errors import SettingsInvalid
 from services.schemas import ReplayRequest, StreamRequest
-from services.settings import SettingsInvalid, StreamSettings, load_settings
+from services.settings import StreamSettings, load_settings
 from services.supervisor.worker import specs_of
 
 NAMES = [

@@ -11,7 +11,7 @@ from starlette.testclient import WebSocketDenialResponse
 from services.api.guard import KnownHosts
 from services.api.observability import Measures
 from services.api.problems import PROBLEM_JSON
-from services.settings.sections import ServerSettings
+from services.settings import ServerSettings
 
 
 def knows(host: str, /, **server: object) -> bool:

@@ -10,7 +10,7 @@ import pytest
 from services.api.guard import BoundedBody, network_of
 from services.api.problems import PROBLEM_JSON, TooLarge, TooSlow
 from services.api.state import MOST_BUCKETS, TokenBuckets
-from services.settings.sections import LimitSettings
+from services.settings import LimitSettings
 
 
 def test_a_bucket_fills_with_its_rate():

@@ -12,7 +12,7 @@ import pytest
 
 from services.api import observability
 from services.api.observability import FACTS, TextFormatter, _log_uncaught, log_to_stderr
-from services.settings.sections import LogSettings
+from services.settings import LogSettings
 
 
 class Terminal(io.StringIO):

@@ -18,8 +18,8 @@ from pydantic import ValidationError
 
 from services.api.problems import PROBLEM_JSON
 from services.audit import Wanted, search
-from services.settings import SettingsInvalid
-from services.settings.sections import OidcSettings
+from services.errors import SettingsInvalid
+from services.settings import OidcSettings
 
 jwt = pytest.importorskip("jwt", reason="PyJWT is in the extra oidc")
 from cryptography.hazmat.primitives import serialization  # noqa: E402

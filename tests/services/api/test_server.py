@@ -25,8 +25,8 @@ from websockets.sync.client import connect
 from services.api.server import bind, serve
 from services.cli.serve import serve_command
 from services.client import Client, Unreachable
-from services.errors import CannotServe
-from services.settings import ServiceSettings, SettingsInvalid
+from services.errors import CannotServe, SettingsInvalid
+from services.settings import ServiceSettings
 
 ROOT = Path(__file__).resolve().parents[3]
 SERVE = [sys.executable, "-m", "services.cli", "serve", "--port", "0", "--set", "streams={}"]

@@ -121,7 +121,7 @@ def test_what_is_deleted_during_its_check_is_no_error(new_plane, caplog, what, d
 NOISY = """
 import logging, sys, threading, warnings
 from services.api.observability import log_to_stderr, say_start
-from services.settings.sections import LogSettings
+from services.settings import LogSettings
 log_to_stderr(LogSettings(format="json", level=sys.argv[1]))
 say_start("IntraSplat is on http://127.0.0.1:1/", "a second line")
 warnings.warn("a warning\\nof two lines", stacklevel=1)

@@ -6,8 +6,8 @@ import os
 
 import pytest
 
-from services.settings import ServiceSettings, SettingsInvalid, load_settings
-from services.settings.load import yaml_value
+from services.errors import SettingsInvalid
+from services.settings import ServiceSettings, load_settings, yaml_value
 
 
 @pytest.fixture(autouse=True)

@@ -8,8 +8,8 @@ import os
 import pytest
 from pydantic import ValidationError
 
-from services.settings import ServiceSettings, SettingsInvalid, load_settings
-from services.settings.sections import masked_address
+from services.errors import SettingsInvalid
+from services.settings import ServiceSettings, load_settings, masked_address
 
 
 @pytest.fixture(autouse=True)

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from services.settings import SettingsInvalid
-from services.settings.load import _keys, load_settings
+from services.errors import SettingsInvalid
+from services.settings import _keys, load_settings
 
 
 def refused(file: Path | None = None, flags: dict[str, str] | None = None) -> str:

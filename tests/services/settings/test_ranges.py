@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from pydantic import ValidationError
 
-from services.settings import sections
+from services import settings
 
 MIB, DAYS, SECONDS = 2**20, 36_600, 366 * 86_400
 MOST = 10**15
@@ -40,7 +40,7 @@ RANGES = {
     ("section", "name"), [(section, name) for section, fields in RANGES.items() for name in fields]
 )
 def test_a_number_has_a_default_and_is_accepted_in_its_range(section, name):
-    kind, (default, least, most) = getattr(sections, section), RANGES[section][name]
+    kind, (default, least, most) = getattr(settings, section), RANGES[section][name]
     field = kind.model_fields[name]
     assert field.get_default() == default
     others = {"uploads": 64} if name == "uploads_per_key" else {}
