@@ -10,8 +10,7 @@ import pytest
 
 from gsplat_core.depth.registry import DEPTHS
 from gsplat_core.experimental import light
-from gsplat_core.experimental.light import FLAT, UNSEEN, LightDepth
-from gsplat_core.experimental.relief import Grid, Places
+from gsplat_core.experimental.light import FLAT, UNSEEN, Grid, LightDepth, Places
 from gsplat_core.experimental.shading import SmallPicture, shading_in
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DEPTH_ORIGINS, Frame

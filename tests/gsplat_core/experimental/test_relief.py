@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsplat_core.experimental.relief import ROUND, SOFTNESS, Grid, Places, appearance
+from gsplat_core.experimental.light import ROUND, SOFTNESS, Grid, Places, appearance
 from gsplat_core.scene.cameras import Camera
 
 CAMERA = Camera.from_focal(140.0, 160, 128)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsplat_core.experimental import relief as relief_module
-from gsplat_core.experimental.relief import Equations, Grid, Places, appearance, find_change, find_reliefs
+from gsplat_core.experimental import light as light_module
+from gsplat_core.experimental.light import Equations, Grid, Places, appearance, find_change, find_reliefs
 from gsplat_core.experimental.shading import LEAST_DETAIL, Change, Shading
 from gsplat_core.scene.cameras import Camera
 
@@ -156,7 +156,7 @@ def equations(monkeypatch):
         given.append(dict(own=own, relief=relief, off=off, weight=weight, prior=prior, away=away, tell=tell))
         return Equations(own, relief, off, weight, prior, away, tell)
 
-    monkeypatch.setattr(relief_module, "Equations", record)
+    monkeypatch.setattr(light_module, "Equations", record)
     return given
 
 
@@ -166,7 +166,7 @@ FLAT = np.zeros(len(GRID.half_waves))
 def test_a_change_of_light_is_held_against_an_error_of_2_percent_and_weighs_three_tenths(equations):
     share = 0.5 * ONES
     brighter = np.where(np.arange(40) < 20, 0.0, 0.06) * ONES
-    relief_module.Followed(GRID, Change(brighter, share, np.zeros((32, 40, 2)), 1.0)).equations(FLAT, FLAT)
+    light_module.Followed(GRID, Change(brighter, share, np.zeros((32, 40, 2)), 1.0)).equations(FLAT, FLAT)
     (one,) = equations
     # An error of three deviations weighs 1 / sqrt(10) of one that is none.
     np.testing.assert_allclose(one["weight"].reshape(32, 40)[0, [0, 39]], [1250, 1250 / np.sqrt(10)])
@@ -181,7 +181,7 @@ def test_a_change_of_light_is_held_against_an_error_of_2_percent_and_weighs_thre
 def test_brightness_is_held_against_its_detail_and_pigment_is_expected_to_be_coarse(equations):
     seen = np.where(np.arange(40) < 20, 0.0, 0.2) * ONES
     seen[:, 19] = 0.0
-    brightness = relief_module.Brightness(GRID, [Shading(seen, ONES, 0.1, NOTHING, NOTHING)] * 2, [0, 1], 0.5)
+    brightness = light_module.Brightness(GRID, [Shading(seen, ONES, 0.1, NOTHING, NOTHING)] * 2, [0, 1], 0.5)
     brightness.equations(FLAT, np.zeros((2, len(FLAT))), 0.0)
     (one,) = equations
     expected = 0.5 * (2 / 0.1**2) / 2 / np.sqrt(1 + one["off"] ** 2 * 2 / 0.1**2)
@@ -194,7 +194,7 @@ def test_brightness_is_held_against_its_detail_and_pigment_is_expected_to_be_coa
 
 
 def test_glints_become_rarer_by_a_twelfth_radian(equations):
-    found = relief_module.Glints(GRID, [Shading(NOTHING, ONES, 0.1, 0.1 * ONES, ONES)] * 8)
+    found = light_module.Glints(GRID, [Shading(NOTHING, ONES, 0.1, 0.1 * ONES, ONES)] * 8)
     found.equations(FLAT, np.zeros((8, len(FLAT))))
     (one,) = equations
     angle = np.tile(appearance(PLACES, FLAT).angle, 8)
@@ -211,7 +211,7 @@ def test_glints_become_rarer_by_a_twelfth_radian(equations):
 
 def test_cells_that_are_hardly_wet_say_nothing_of_glints(equations):
     wet = np.where(np.arange(40) < 20, 0.4, 0.6) * ONES
-    relief_module.Glints(GRID, [Shading(NOTHING, ONES, 0.1, NOTHING, wet)]).equations(FLAT, FLAT[None])
+    light_module.Glints(GRID, [Shading(NOTHING, ONES, 0.1, NOTHING, wet)]).equations(FLAT, FLAT[None])
     weight = equations[0]["weight"].reshape(32, 40)
     assert not weight[:, :20].any() and weight[:, 20:].all()
 
@@ -226,8 +226,8 @@ def test_cells_that_are_hardly_wet_say_nothing_of_glints(equations):
     ],
 )
 def test_the_width_of_a_prior_is_that_of_what_was_found_and_of_a_hundred_expected(scaled, undecided, width):
-    found = relief_module._width(
-        scaled, undecided, relief_module.RELIEF, relief_module.RELIEF_COUNT, relief_module.RELIEF_LIMITS
+    found = light_module._width(
+        scaled, undecided, light_module.RELIEF, light_module.RELIEF_COUNT, light_module.RELIEF_LIMITS
     )
     assert found == pytest.approx(width)
 
