@@ -11,8 +11,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from gsplat_core.errors import InvalidInput, InvalidSetting
-from gsplat_core.evaluation.live import NOTHING_SHOWN, Live, LiveSums
-from gsplat_core.evaluation.scores import Entry, Record, number
+from gsplat_core.evaluation.scores import NOTHING_SHOWN, Entry, Live, LiveSums, Record, number
 from gsplat_core.io.files import open_regular
 from gsplat_core.training.metrics import MEASURES, FrameQuality
 from operators.storage import StorageReserve, storage_errors

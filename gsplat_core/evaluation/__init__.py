@@ -2,10 +2,9 @@
 
 * `baselines`: copies and means of frames, and optical flow.
 * `protocols`: the held-out, causal and retention protocols on rendered pictures.
-* `live`: the picture on the screen when the next frame arrived.
-* `geometry`: accuracy in three dimensions, from `depth`, `motion`, `views` and `trajectory`.
+* `geometry`: accuracy in three dimensions, from `depth`, `motion` and `views`.
 * `views`: further cameras and the right eye.
-* `scores`: sums of fixed size that the protocols share.
+* `scores`: sums of fixed size that the protocols share, and the picture on the screen when the next frame arrived.
 
 Each protocol takes frames one at a time, keeps sums of fixed size and passes every frame's figures to a callback.
 """

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.evaluation.scores import Entry, Record, finite, why_left_out
+from gsplat_core.evaluation.scores import BaselineScore, Entry, Record, finite, why_left_out
 from gsplat_core.io.recordings.recording import is_heldout
 from gsplat_core.scene.frames import Frame
 from gsplat_core.training.metrics import ImageLike, ScoredMean, psnr_tissue_db, psnrs_db, unit_image
@@ -91,20 +91,6 @@ HALF_VELOCITY, HALF_WAY = "half_velocity_flow", "half_way_flow"
 SEES_THE_FUTURE = frozenset({NEIGHBOUR_MEAN, HALF_WAY})
 """Baselines computed from the frame after the scored one, which a live system does not have yet."""
 _MAX_THREADS = 4
-
-
-@dataclass(frozen=True)
-class BaselineScore:
-    """Score of one baseline: means in decibels over `frames` frames; None if no frame has the measure."""
-
-    psnr_tissue_db: float | None = None
-    psnr_frame_db: float | None = None
-    frames: int = 0
-    psnr_both_db: float | None = None
-    """PSNR of a copy over pixels that are tissue both in the frame and in the copy.
-
-    Published frame-hold curves use this mask, so tissue occluded in the copy does not count as error.
-    """
 
 
 @dataclass(frozen=True)

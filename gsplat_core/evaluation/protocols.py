@@ -17,9 +17,18 @@ from numpy.typing import NDArray
 
 from gsplat_core.choices import RENDERERS
 from gsplat_core.errors import InvalidInput
-from gsplat_core.evaluation.baselines import BaselineScore
 from gsplat_core.evaluation.depth import DepthErrors, DepthSums
-from gsplat_core.evaluation.scores import Entry, Record, Score, ScoreSums, finite, measures, number, why_left_out
+from gsplat_core.evaluation.scores import (
+    BaselineScore,
+    Entry,
+    Record,
+    Score,
+    ScoreSums,
+    finite,
+    measures,
+    number,
+    why_left_out,
+)
 from gsplat_core.io.recordings.recording import is_heldout
 from gsplat_core.models import Model, Snapshot
 from gsplat_core.rendering.renderer import STANDARD_OUTPUTS, Renderer, new_renderer, standard_outputs

@@ -20,9 +20,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.evaluation.baselines import BaselineScore
 from gsplat_core.evaluation.protocols import OUTSIDE, Picture
-from gsplat_core.evaluation.scores import Record, Score, ScoreSums, finite, why_left_out
+from gsplat_core.evaluation.scores import BaselineScore, Record, Score, ScoreSums, finite, why_left_out
 from gsplat_core.io.recordings.truth import GroundTruth
 from gsplat_core.scene.cameras import Camera, at_pixels, inverse, moved, pixel_rays, pixels_of, points_of
 from gsplat_core.scene.frames import Frame

@@ -16,7 +16,6 @@ from gsplat_core.choices import MOTION_PRIORS
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.evaluation.baselines import AGES, Baselines, measure_baselines
 from gsplat_core.evaluation.geometry import Geometry, evaluate_geometry
-from gsplat_core.evaluation.live import Live
 from gsplat_core.evaluation.protocols import (
     LAST_S,
     HeldOut,
@@ -31,7 +30,7 @@ from gsplat_core.evaluation.protocols import (
     find_places,
     returns,
 )
-from gsplat_core.evaluation.scores import Record, Score
+from gsplat_core.evaluation.scores import Live, Record, Score
 from gsplat_core.evaluation.views import SecondEye, evaluate_second_eye
 from gsplat_core.io.recordings.calibration import read_poses
 from gsplat_core.io.recordings.plain_files import Findings

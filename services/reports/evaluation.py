@@ -19,10 +19,9 @@ from gsplat_core.evaluation.baselines import (
     PREVIOUS_FRAME,
     SEES_THE_FUTURE,
     TRAIN_MEAN,
-    BaselineScore,
 )
-from gsplat_core.evaluation.live import Live
 from gsplat_core.evaluation.protocols import PlaceScore
+from gsplat_core.evaluation.scores import BaselineScore, Live
 from gsplat_core.evaluation.views import MATCHED, RIGHT_BEFORE, SHIFTED, SecondEye
 from gsplat_core.io.bundle import load_bundle
 from gsplat_core.io.files import read_regular

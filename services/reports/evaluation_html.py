@@ -10,7 +10,7 @@ from html import escape
 from itertools import pairwise
 from pathlib import Path
 
-from gsplat_core.evaluation.live import MOST_BEHIND
+from gsplat_core.evaluation.scores import MOST_BEHIND
 from operators.storage import write_whole
 from services.reports.evaluation import BaselineFacts, EndPointFacts, EvaluationReport, GeometryFacts, ScoreFacts
 from services.reports.figures import NARROW, Chart, Line

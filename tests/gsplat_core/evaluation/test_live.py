@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from gsplat_core.evaluation.live import MOST_BEHIND, NOTHING_SHOWN, LiveSums
+from gsplat_core.evaluation.scores import MOST_BEHIND, NOTHING_SHOWN, LiveSums
 from gsplat_core.training.metrics import frame_quality
 
 NOTHING_BEFORE = (math.nan, math.nan)

@@ -7,7 +7,7 @@ import json
 import pytest
 
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.evaluation.live import NOTHING_SHOWN
+from gsplat_core.evaluation.scores import NOTHING_SHOWN
 from operators.frame_log import NO_FIGURE, NOT_SCORED, is_live_log, read_live_log
 
 MS = 1_000_000
