@@ -1,4 +1,6 @@
-"""Contents of a recording independent of its layout: images, cameras, and optional sidecars (masks, depth, right eye, poses, description).
+"""Contents of a recording independent of its layout: images, cameras and optional sidecars.
+
+Sidecars are masks, depth, labels, scans of range sensors, the right eye, poses, and the description of the recording.
 
 A sidecar is absent if no entry has its name. An entry with its name that cannot be used is a problem: a file in place of a
 folder, a dangling link, a link out of the recording, or an empty folder. Ignoring a broken mask would let tools be learned as
