@@ -17,8 +17,8 @@ from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians
 from operators.sources.source import SourceState
 from services.errors import BadMessage, CommandRefused
-from services.supervisor import model_show
-from services.supervisor.model_show import LATE_IN_A_ROW, FinishedModel, ModelShow, NotFinite, Showing
+from services.supervisor import engine
+from services.supervisor.engine import LATE_IN_A_ROW, FinishedModel, ModelShow, NotFinite, Showing
 from services.supervisor.screen import Screen
 from services.supervisor.worker import EngineSpec
 
@@ -73,7 +73,7 @@ def bundles(tmp_path):
 
 @pytest.fixture
 def show(runtime, monkeypatch):
-    monkeypatch.setattr(model_show, "CapturedSource", Frames)
+    monkeypatch.setattr(engine, "CapturedSource", Frames)
     stop = threading.Event()
     worker = SimpleNamespace(folder=runtime.stream("a"), stop_requested=stop.is_set)
     published = Published()
