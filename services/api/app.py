@@ -237,7 +237,7 @@ def new_archive(
         RecordingRetention(recordings, wanted.keep_days, wanted.keep_bytes, events, trusts_ages),
         replays,
         ReplayRetention(replays, jobs.keep_days, jobs.keep_results, events, trusts_ages),
-        PoolKeeper(process, lambda: _open(store.counts())),
+        PoolKeeper(process, store.open_jobs),
         ArchiveMeasures(recordings, store),
         StoredFilesWatch(
             store.database,
@@ -247,10 +247,6 @@ def new_archive(
             events,
         ),
     )
-
-
-def _open(counts: dict[str, int]) -> int:
-    return counts["queued"] + counts["running"]
 
 
 class ArchiveMeasures(Collector):

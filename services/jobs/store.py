@@ -264,6 +264,11 @@ class JobStore:
             found = {str(state): int(count) for state, count in connection.execute(query)}
         return {str(state): found.get(str(state), 0) for state in JobState}
 
+    def open_jobs(self) -> int:
+        """Return the number of queued and running jobs."""
+        counts = self.counts()
+        return sum(counts[str(state)] for state in OPEN)
+
     def cancel(self, job_id: str, by: str) -> JobRecord:
         """Cancel a job: a queued one at once, a running one within a second.
 

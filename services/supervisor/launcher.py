@@ -329,7 +329,6 @@ def _runs(pid: int) -> bool:
 LOADED = (
     "operators.sources.process",
     "operators.sources.recording",
-    "operators.sources.recording",
     "operators.sources.zeromq",
 )
 """Modules of frame sources that the launcher imports in advance, because capture processes are likely to use them."""
