@@ -38,7 +38,6 @@ from gsplat_core.training.initialisation import SIGMA_IN_SPACINGS
 from gsplat_core.training.motion_prior import Following
 from gsplat_core.training.observations import Observation, depth_of, pixels_of, value_at
 from gsplat_core.training.steps.step import TrainingStep
-from gsplat_core.training.strategies.streaming import halves
 
 RELAX_EVERY = 128
 """Training steps between two relaxation rounds."""
@@ -112,7 +111,7 @@ class Upkeep:
             self._renew(step, seen, observation, last_seen, first)
             count = step.gaussians.count
             if count < self._capacity:
-                step.split(step.busiest(1, first.new_ones(count)), halves)
+                step.split(step.busiest(1, first.new_ones(count)))
             if last_seen is not None:
                 last_seen.join(step.gaussians.count, observation.time_s)
 
@@ -194,7 +193,7 @@ class Upkeep:
         missing = int(wanted - torch.count_nonzero(shown))
         count = min(missing, round(MOST_SPLIT * step.gaussians.count), self._capacity - step.gaussians.count)
         if count > 0:
-            step.split(step.busiest(count, shown), halves)
+            step.split(step.busiest(count, shown))
 
 
 REVEALED_SHARE = 0.01

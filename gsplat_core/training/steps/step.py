@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import cast
 
 import torch
@@ -37,6 +38,7 @@ from gsplat_core.training.steps.photometric import (
     with_eye,
     with_losses,
 )
+from gsplat_core.training.strategies.strategy import SHRINK
 
 
 class AutogradTraining:
@@ -126,6 +128,30 @@ class PictureTraining:
         self._adam.step(self._logs, gradients, rates)
         unused = {name: torch.zeros_like(t) for name, t in scene.tensors().items() if name not in compared.gradients}
         return Compared(compared.loss, {**compared.gradients, **unused})
+
+
+APART = 0.5
+"""Distance of the halves from their parent's centre, in its standard deviations along its longest axis."""
+
+
+def halves(parents: Gaussians) -> tuple[Gaussians, Gaussians]:
+    """Split each Gaussian into two smaller ones along its longest axis."""
+    longest = parents.log_scales.argmax(1)
+    along = torch.nn.functional.one_hot(longest, 3).to(parents.dtype)
+    axis = _turned(parents.quats, along)
+    reach = parents.log_scales.gather(1, longest[:, None]).exp() * APART
+    smaller = parents.log_scales - math.log(SHRINK) * along
+    sides = (replace(parents, means=parents.means + side * reach * axis, log_scales=smaller) for side in (-1, 1))
+    first, second = sides
+    return first, second
+
+
+def _turned(quats: Tensor, vectors: Tensor) -> Tensor:
+    """Rotate vectors [N, 3] by quaternions wxyz [N, 4] of any norm: v + 2 w (q x v) + 2 q x (q x v)."""
+    unit = torch.nn.functional.normalize(quats, dim=1)
+    w, q = unit[:, :1], unit[:, 1:]
+    across = torch.linalg.cross(q, vectors)
+    return vectors + 2 * (w * across + torch.linalg.cross(q, across))
 
 
 SETTLE_EVERY = 32
@@ -373,13 +399,13 @@ class TrainingStep:
             self.capabilities.rows.append(added.count, parents)
         self._adam.append(added.count, usual=self._has_no_end)
 
-    def split(self, parents: Tensor, halves: Callable[[Gaussians], tuple[Gaussians, Gaussians]]) -> None:
-        """Replace each Gaussian at `parents` (int64 indices) by two made by `halves`, which move like their parent.
+    def split(self, parents: Tensor, parts: Callable[[Gaussians], tuple[Gaussians, Gaussians]] = halves) -> None:
+        """Replace each Gaussian at `parents` (int64 indices) by two made by `parts`, which move like their parent.
 
         The second ones are appended. All start with fresh moments, except that in an endless stream the first ones keep
         their parent's.
         """
-        first, second = halves(self.gaussians.select(parents))
+        first, second = parts(self.gaussians.select(parents))
         for name, tensor in self.gaussians.tensors().items():
             tensor[parents] = first.tensors()[name]
             if not self._has_no_end:

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from gsplat_core.regression import probabilities
 from gsplat_core.scene.gaussians import Gaussians
-from gsplat_core.training.steps.step import TrainingStep
+from gsplat_core.training.steps.step import TrainingStep, halves
 from gsplat_core.training.strategies.strategy import (
     GEOMETRY,
     Optimizers,
@@ -33,7 +33,7 @@ from gsplat_core.training.strategies.strategy import (
     sample_add,
     views_of,
 )
-from gsplat_core.training.strategies.streaming import UNSEEN_PX, Rounds, Shares, halves
+from gsplat_core.training.strategies.streaming import UNSEEN_PX, Rounds, Shares
 
 GROWTH = 1.05
 """Factor of the number of Gaussians per refinement."""

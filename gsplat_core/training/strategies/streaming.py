@@ -7,25 +7,22 @@ error, is the error under their blending weights.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from gsplat_core.scene.gaussians import SH_C0, Gaussians
+from gsplat_core.scene.gaussians import SH_C0
 from gsplat_core.training.image_motion import Seen
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.steps.step import TrainingStep
-from gsplat_core.training.strategies.strategy import SHRINK, Plan, StrategyKind
+from gsplat_core.training.strategies.strategy import Plan, StrategyKind
 
 UNSEEN_PX = 0.5
 """Largest sum of blending weights over the pixels of any picture, in pixels, below which a Gaussian counts as
 invisible.
 """
-APART = 0.5
-"""Distance of the halves from their parent's centre, in its standard deviations along its longest axis."""
 
 
 @dataclass(frozen=True)
@@ -142,27 +139,7 @@ def densify(step: TrainingStep, shares: Shares, count: int) -> None:
     if wanted <= 0:
         return
     order = step.remove(unseen).order
-    step.split(shares.error[order].argsort(descending=True, stable=True)[:wanted], halves)
-
-
-def halves(parents: Gaussians) -> tuple[Gaussians, Gaussians]:
-    """Split each Gaussian into two smaller ones along its longest axis."""
-    longest = parents.log_scales.argmax(1)
-    along = torch.nn.functional.one_hot(longest, 3).to(parents.dtype)
-    axis = _turned(parents.quats, along)
-    reach = parents.log_scales.gather(1, longest[:, None]).exp() * APART
-    smaller = parents.log_scales - math.log(SHRINK) * along
-    sides = (replace(parents, means=parents.means + side * reach * axis, log_scales=smaller) for side in (-1, 1))
-    first, second = sides
-    return first, second
-
-
-def _turned(quats: Tensor, vectors: Tensor) -> Tensor:
-    """Rotate vectors [N, 3] by quaternions wxyz [N, 4] of any norm: v + 2 w (q x v) + 2 q x (q x v)."""
-    unit = torch.nn.functional.normalize(quats, dim=1)
-    w, q = unit[:, :1], unit[:, 1:]
-    across = torch.linalg.cross(q, vectors)
-    return vectors + 2 * (w * across + torch.linalg.cross(q, across))
+    step.split(shares.error[order].argsort(descending=True, stable=True)[:wanted])
 
 
 KIND = StrategyKind(lambda plan: Rounds(plan, densify))

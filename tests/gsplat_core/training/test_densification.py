@@ -15,9 +15,9 @@ from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.initialisation import gaussians_from_frame
 from gsplat_core.training.observations import Observation
 from gsplat_core.training.reconstructor import Reconstructor
-from gsplat_core.training.steps.step import TrainingStep
+from gsplat_core.training.steps.step import TrainingStep, halves
 from gsplat_core.training.strategies.mcmc import birth_death, relocated
-from gsplat_core.training.strategies.streaming import UNSEEN_PX, Shares, densify, halves, shares_of
+from gsplat_core.training.strategies.streaming import UNSEEN_PX, Shares, densify, shares_of
 
 
 @pytest.fixture(params=[False, True], ids=["exact", "preallocated"])
