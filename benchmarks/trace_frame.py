@@ -2,10 +2,13 @@
 
     python benchmarks/trace_frame.py [--seconds 5] [--source synthetic:]
 
-A server runs with one stream and one viewer. Every Python process of it records the code objects that are called: first for some seconds of
-live frames, where heartbeats and other periodic work are counted, too. Then the stream is stopped, and the control process is recorded while
-it is idle and while another stream is created; modules that an idle server calls are left out. `lines` counts all lines of a module,
-`called_lines` those of the functions that were called, with their docstrings.
+A server runs with one stream and one viewer. Every Python process of it counts the calls of code objects: first for some seconds of live
+frames. Then the stream is stopped, and the control process is recorded while it is idle and while another stream is created; modules that an
+idle server calls are left out.
+
+`frame` has all modules that are called, also for heartbeats and other work at intervals; `every frame` those with a function that is called at
+least half as often as a picture is displayed. `lines` counts all lines of a module, `called_lines` those of the functions that were called,
+with their docstrings.
 """
 
 from __future__ import annotations
@@ -18,7 +21,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -29,11 +32,11 @@ PACKAGES = ("gsplat_core", "operators", "services")
 RECORDER = """
 import os, sys, threading, time
 
-folder, called, recording = os.environ["INTRASPLAT_TRACE"], set(), False
+folder, called, recording = os.environ["INTRASPLAT_TRACE"], {}, False
 
 def profile(frame, event, argument):
     if recording and event == "call":
-        called.add(frame.f_code)
+        called[frame.f_code] = called.get(frame.f_code, 0) + 1
 
 def watch():
     global recording
@@ -51,7 +54,8 @@ def watch():
                 time.sleep(0.2)  # until calls in progress have been added
                 path = os.path.join(folder, f"{name[:-4]}.{os.getpid()}")
                 with open(path + ".part", "w") as file:
-                    file.write("\\n".join(sorted({f"{code.co_filename}:{code.co_firstlineno}" for code in called})))
+                    for code, calls in list(called.items()):
+                        file.write(f"{code.co_filename}:{code.co_firstlineno}:{calls}\\n")
                 os.replace(path + ".part", path + ".files")
 
 def begin():
@@ -65,8 +69,8 @@ begin()
 """Module that Python imports at the start of every process of the server."""
 
 
-Called = dict[str, set[int]]
-"""Path of a module, relative to the root, to the first lines of its functions that were called."""
+Called = dict[str, dict[int, int]]
+"""Path of a module, relative to the root, to the numbers of calls of its functions, by their first lines."""
 
 
 @contextmanager
@@ -83,14 +87,24 @@ def recorded(folder: Path, name: str, pids: list[int], found: dict[int, Called])
     for file in filter(Path.exists, files):
         called: Called = {}
         for line in filter(None, file.read_text().split("\n")):
-            path, _, first = line.rpartition(":")
+            path, first, calls = line.rsplit(":", 2)
             module = os.path.relpath(path, ROOT)
             if module.startswith(PACKAGES):
-                called.setdefault(module, set()).add(int(first))
+                functions = called.setdefault(module, {})
+                functions[int(first)] = functions.get(int(first), 0) + int(calls)
         found[int(file.name.split(".")[1])] = called
 
 
-def called_lines(source: str, first_lines: set[int]) -> int:
+def often(trace: Called, least_calls: float) -> Called:
+    """Return the functions that were called so many times or more."""
+    kept = {
+        module: {first: calls for first, calls in functions.items() if calls >= least_calls}
+        for module, functions in trace.items()
+    }
+    return {module: functions for module, functions in kept.items() if functions}
+
+
+def called_lines(source: str, first_lines: Collection[int]) -> int:
     """Return the number of lines of the functions that begin at these lines, with decorators."""
     lines: set[int] = set()
     for node in ast.walk(ast.parse(source)):
@@ -105,8 +119,8 @@ def summary(*traces: Called) -> dict[str, object]:
     """Return the number of modules, their lines, those of called functions, and the lines of each module."""
     together: Called = {}
     for trace in traces:
-        for module, first_lines in trace.items():
-            together.setdefault(module, set()).update(first_lines)
+        for module, functions in trace.items():
+            together.setdefault(module, {}).update(functions)
     sources = {module: (ROOT / module).read_text(encoding="utf-8") for module in sorted(together)}
     lines = {module: len(source.splitlines()) for module, source in sources.items()}
     called = sum(called_lines(source, together[module]) for module, source in sources.items())
@@ -134,8 +148,10 @@ def main() -> int:
             viewer = threading.Thread(target=watch_pictures, args=(server, stop), daemon=True)
             viewer.start()
             time.sleep(3.0)
+            before = shown(server)
             with recorded(folder, "frame", list(pids.values()), frame):
                 time.sleep(options.seconds)
+            pictures = shown(server) - before
             stop.set()
             viewer.join(30)
             server.ask(f"/v1/streams/{STREAM}/stop", "POST")
@@ -150,7 +166,9 @@ def main() -> int:
             print(f"no modules were recorded in: {', '.join(missing)}", file=sys.stderr)
             return 1
         report = {
+            "pictures": pictures,
             "frame": summary(*roles.values()),
+            "every frame": summary(*(often(trace, pictures / 2) for trace in roles.values())),
             **{f"frame, {role} process": summary(modules) for role, modules in roles.items()},
             "creation of a stream": summary(
                 {
@@ -162,6 +180,11 @@ def main() -> int:
         }
     print(json.dumps(report, indent=1))
     return 0
+
+
+def shown(server: Server) -> int:
+    """Return the number of pictures that the stream has displayed."""
+    return server.stream()["processes"]["engine"]["figures"]["pictures"]
 
 
 def watch_pictures(server: Server, stop: threading.Event) -> None:
