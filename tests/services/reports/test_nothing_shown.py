@@ -129,7 +129,8 @@ def test_every_reason_of_a_gate_has_a_remedy():
     words = set()
     for make in (*PICTURE_STAGES.values(), MaskAndDepthStage):
         module = inspect.getsource(inspect.getmodule(make))
-        for core in re.findall(r"from gsplat_core\.endoscope\.(\w+) import", module):
+        # The gate reports frames that it withholds with one reason, whatever it saw.
+        for core in set(re.findall(r"from gsplat_core\.endoscope\.(\w+) import", module)) - {"out_of_body"}:
             tree = ast.parse(inspect.getsource(__import__(f"gsplat_core.endoscope.{core}", fromlist=["x"])))
             words |= {
                 each.value
