@@ -523,7 +523,7 @@ def igtl(
     ] = False,
 ) -> int:
     """Send a stream's pictures and the pose of its camera over OpenIGTLink, for example to 3D Slicer."""
-    from services.cli.view import igtl_command
+    from services.cli.serve import igtl_command
 
     return igtl_command(
         stream, config, runtime, kind=kind, host=host, port=port, name=name, spacing_mm=spacing_mm, plaintext=plaintext
@@ -556,7 +556,7 @@ def view(
     device: DeviceOption = "cpu",
 ) -> int:
     """Show a model in browsers, with free viewpoint and playback."""
-    from services.cli.view import view_command
+    from services.cli.models import view_command
 
     sampled = renderer is not None and renderer in RENDERERS and "samples" in RENDERERS[renderer].capabilities.options
     if sampled and samples is None:

@@ -1,16 +1,18 @@
-"""Implementation of the commands for finished models: `intrasplat render`, `bench`, `pack`, `export`, `measure`, `compare` and
-`edit`.
-"""
+"""Implementation of the commands for finished models: `intrasplat render`, `bench`, `pack`, `export`, `measure`, `compare`, `edit` and `view`."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import math
+import os
 import re
-from collections.abc import Callable, Sequence
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -25,19 +27,24 @@ from gsplat_core.geometry.registration import ClosestPoints, distances, from_pai
 from gsplat_core.io.bundle import load_bundle, parse_manifest, save_bundle
 from gsplat_core.io.exports.export import export_model
 from gsplat_core.io.exports.formats import ExportWish, format_named, format_of
+from gsplat_core.io.model_files import open_model_file
 from gsplat_core.io.model_sources import load_model, wrong_extent
 from gsplat_core.io.surface_files import read_surface
 from gsplat_core.machine import in_gib
 from gsplat_core.models import Model
+from gsplat_core.rendering.renderer import RendererOptions, check_renderer
 from gsplat_core.scene.collection import GaussianCollection
 from gsplat_core.value_ranges import plain_float
 from operators.applications.bench import BenchSettings, bench_model
 from operators.applications.render import render_model
+from operators.applications.session import check_device
 from operators.errors import OutputError
 from operators.output_folder import OutputFolder, check_file_path
 from operators.settings import RenderOptions
+from services.cli.options import check_host
 from services.cli.terminal import BAD_INPUT, INTERRUPTED, OK, InterruptRequest, ProgressPrinter
-from services.registry.bundle_file import MANIFEST, PIECE_BYTES, SUFFIX, TENSORS, pack
+from services.model_view import ModelView, Pictures, PictureView
+from services.registry.bundle_file import MANIFEST, PIECE_BYTES, SUFFIX, TENSORS, pack, unpack
 
 
 def render_command(model: Path, out: Path, options: RenderOptions, *, as_json: bool, **further: Any) -> int:
@@ -500,3 +507,50 @@ def _rotation(text: str) -> Tensor:
     skew = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
     angle = math.radians(degrees)
     return torch.eye(3, dtype=torch.float64) + math.sin(angle) * skew + (1 - math.cos(angle)) * (skew @ skew)
+
+
+def view_command(
+    model: Path, host: str, port: int, *, plaintext: bool, renderer: str | None, options: RendererOptions, device: str
+) -> int:
+    """Serve a model to browsers until interrupted: as Gaussians, or as pictures of a renderer."""
+    check_host(host, plaintext, "the viewer has no keys and shows the model to every client")
+    if renderer is None and (options.changed() or device != "cpu"):
+        raise InvalidSetting("the browser draws the model without a renderer; give --renderer with its options")
+    if renderer is not None:
+        check_device(device)
+        check_renderer(renderer, device, options=options)
+    with bundle_in(model) as folder:
+        loaded = load_model(folder)
+    with InterruptRequest() as interrupt, _server(loaded, host, port, renderer, options, device) as view:
+        print(f"the model is on http://{view.address[0]}:{view.address[1]}/", file=sys.stderr, flush=True)  # noqa: T201
+        view.run(interrupt)
+    return OK
+
+
+def _server(
+    model: Model, host: str, port: int, renderer: str | None, options: RendererOptions, device: str
+) -> ModelView | PictureView:
+    if renderer is None:
+        return ModelView(model, host, port)
+    pictures = Pictures(model.to(device), renderer, options, device)
+    return PictureView(pictures, model.time_window_s, host, port)
+
+
+@contextmanager
+def bundle_in(model: Path) -> Iterator[Path]:
+    """Provide the folder of a model, unpacking a packed model temporarily.
+
+    Raises:
+        BundleError: if the model cannot be read.
+        Rejected: if the packed model is not valid.
+    """
+    if model.suffix != SUFFIX or model.is_dir():
+        yield model
+        return
+    with TemporaryDirectory(prefix="intrasplat-view-") as folder:
+        try:
+            with open_model_file(model) as file:
+                unpack(file, os.fstat(file.fileno()).st_size, Path(folder))
+        except OSError as error:
+            raise BundleError(f"{model} cannot be read: {error.strerror or error}; check the name") from error
+        yield Path(folder)

@@ -351,3 +351,22 @@ def _processed(parameter: Any, process: Callable[[Any, Any], Any], context: Any,
             param_hint=parameter.opts[-1],
         )
     return found
+
+
+def check_host(host: str, plaintext: bool, why: str) -> None:
+    """Check that an address is a loopback address, unless `plaintext` is set.
+
+    Args:
+        host: address to listen on.
+        plaintext: allow other addresses.
+        why: explanation for the error message.
+
+    Raises:
+        InvalidSetting: if the address is reachable from other machines.
+    """
+    from services.settings import is_loopback  # takes longer to import than the options
+
+    if not is_loopback(host) and not plaintext:
+        raise InvalidSetting(
+            f"{host} is beyond this machine: {why}; give --plaintext on a network that is closed to others"
+        )

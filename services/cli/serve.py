@@ -1,9 +1,10 @@
-"""Implementation of the commands for a server and its data: `intrasplat serve`, `schema`, `keys`, `audit`, `backup` and `restore`."""
+"""Implementation of the commands for a server, its data and its streams: `intrasplat serve`, `schema`, `keys`, `audit`, `backup`, `restore` and `igtl`."""
 
 from __future__ import annotations
 
 import json
 import re
+import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
@@ -12,7 +13,7 @@ from pathlib import Path
 
 import typer
 
-from gsplat_core.errors import UserError
+from gsplat_core.errors import InvalidSetting, UserError
 from services.api.app import assembled, new_app
 from services.api.observability import log_to_stderr, say_start
 from services.api.server import bind, certificate_of, serve
@@ -21,8 +22,11 @@ from services.audit import AuditInUse, AuditLog, AuditUnwritable, Keeping, verif
 from services.audit.log import AUDIT_FILE
 from services.auth.keys import KEYS_FILE, ApiKey, KeyConflict, KeyStore, Role, append_key_change
 from services.backup import Backup, check_backup, make_backup, refuse_unfinished_restore, restore_backup
-from services.cli.terminal import BAD_INPUT, KEY_COLUMNS, OK, printable, table
+from services.cli.options import check_host
+from services.cli.terminal import BAD_INPUT, KEY_COLUMNS, OK, InterruptRequest, printable, table
+from services.display import KINDS
 from services.errors import SettingsInvalid
+from services.openigtlink import MessageServer, StreamMessages, folder_of, send
 from services.private_files import keep_files_private, make_state_private
 from services.settings import NAME_PATTERN, ServiceSettings, load_settings
 
@@ -72,6 +76,27 @@ def _assigned(setting: Sequence[str]) -> dict[str, str]:
 
 def _say(address: str, settings: ServiceSettings) -> None:
     say_start(f"IntraSplat is on {address}/", f"the administrator's key is in {settings.admin_key_file}")
+
+
+def igtl_command(
+    stream: str, config: Path | None, runtime: Path | None, *, kind: str, host: str, port: int, name: str | None,
+    spacing_mm: float, plaintext: bool,
+) -> int:  # fmt: skip
+    """Send a stream's pictures to OpenIGTLink clients until interrupted."""
+    if kind not in KINDS:
+        raise InvalidSetting(f"there is no picture {kind!r:.60}; choose {', '.join(KINDS)}")
+    check_host(host, plaintext, "OpenIGTLink has no keys and sends unencrypted pictures to every client")
+    folder = folder_of(runtime or load_settings(config, {}).runtime_dir, stream)
+    messages = StreamMessages(name or stream[:13], spacing_mm)
+    server = MessageServer(host, port)
+    try:
+        with InterruptRequest() as interrupt:
+            print(f"OpenIGTLink server on {server.address[0]}:{server.address[1]}", file=sys.stderr, flush=True)  # noqa: T201
+            counts = send(folder.endpoint(kind), messages, server, interrupt)
+    finally:
+        server.close()
+    typer.echo(json.dumps(counts))
+    return OK
 
 
 class KeyRefused(UserError):

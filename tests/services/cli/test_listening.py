@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from gsplat_core.errors import InvalidSetting
-from services.cli.view import check_host
+from services.cli.options import check_host
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.3.2.1", "::1", "localhost"])

@@ -13,9 +13,10 @@ import pytest
 from gsplat_core.errors import BundleError, InvalidSetting
 from gsplat_core.io.bundle import save_bundle
 from gsplat_core.rendering.renderer import RendererOptions
-from services.cli import view as view_module
+from services.cli import models, serve
+from services.cli.models import bundle_in, view_command
+from services.cli.serve import igtl_command
 from services.cli.terminal import OK
-from services.cli.view import bundle_in, igtl_command, view_command
 from tests.gsplat_core.io.exports.test_exports import random_model
 
 HERE = {"plaintext": False, "options": RendererOptions(), "device": "cpu"}
@@ -53,9 +54,9 @@ def model(tmp_path: Path) -> Path:
 @pytest.fixture
 def made(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
     monkeypatch.setattr(Server, "made", [])
-    for name in ("ModelView", "PictureView", "MessageServer"):
-        monkeypatch.setattr(view_module, name, type(name, (Server,), {}))
-    monkeypatch.setattr(view_module, "Pictures", lambda *given: given)
+    for module, name in ((models, "ModelView"), (models, "PictureView"), (serve, "MessageServer")):
+        monkeypatch.setattr(module, name, type(name, (Server,), {}))
+    monkeypatch.setattr(models, "Pictures", lambda *given: given)
     return Server.made
 
 
@@ -98,9 +99,9 @@ def test_pictures_are_sent_to_clients_and_the_counts_printed(
         sent.append((endpoint, messages, server))
         return {"pictures": 3}
 
-    monkeypatch.setattr(view_module, "folder_of", lambda runtime, stream: SimpleNamespace(endpoint=lambda kind: f"{runtime.name}/{stream}/{kind}"))  # fmt: skip
-    monkeypatch.setattr(view_module, "StreamMessages", lambda name, spacing_mm: (name, spacing_mm))
-    monkeypatch.setattr(view_module, "send", send)
+    monkeypatch.setattr(serve, "folder_of", lambda runtime, stream: SimpleNamespace(endpoint=lambda kind: f"{runtime.name}/{stream}/{kind}"))  # fmt: skip
+    monkeypatch.setattr(serve, "StreamMessages", lambda name, spacing_mm: (name, spacing_mm))
+    monkeypatch.setattr(serve, "send", send)
     given = {"config": None, "host": "127.0.0.1", "port": 8, "spacing_mm": 0.5, "plaintext": False}
     long = "a-stream-with-a-long-name"
     assert igtl_command(long, runtime=tmp_path, kind="shown", name=None, **given) == OK
@@ -126,8 +127,8 @@ def test_a_server_is_closed_when_sending_fails(
         servers.append(server)
         raise OSError("broken")
 
-    monkeypatch.setattr(view_module, "folder_of", lambda runtime, stream: SimpleNamespace(endpoint=str))
-    monkeypatch.setattr(view_module, "send", send)
+    monkeypatch.setattr(serve, "folder_of", lambda runtime, stream: SimpleNamespace(endpoint=str))
+    monkeypatch.setattr(serve, "send", send)
     with pytest.raises(OSError, match="broken"):
         igtl_command("theatre", None, tmp_path, kind="shown", host="127.0.0.1", port=8, name=None, spacing_mm=1.0, plaintext=False)  # fmt: skip
     assert servers[0].closed
@@ -143,7 +144,7 @@ def test_a_folder_is_used_in_place_and_a_packed_model_is_unpacked_for_the_time_o
         assert folder == folder_with_suffix
     packed = tmp_path / "packed.isplat"
     packed.write_bytes(b"packed")
-    monkeypatch.setattr(view_module, "unpack", lambda file, size, into: (into / "content").write_bytes(file.read(size)))
+    monkeypatch.setattr(models, "unpack", lambda file, size, into: (into / "content").write_bytes(file.read(size)))
     with bundle_in(packed) as folder:
         assert (folder / "content").read_bytes() == b"packed"
     assert not folder.exists()
@@ -151,6 +152,6 @@ def test_a_folder_is_used_in_place_and_a_packed_model_is_unpacked_for_the_time_o
     def unpack(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(view_module, "unpack", unpack)
+    monkeypatch.setattr(models, "unpack", unpack)
     with pytest.raises(BundleError, match="cannot be read: No space left"), bundle_in(packed):
         pass

@@ -13,7 +13,7 @@ import torch
 from gsplat_core.io.bundle import save_bundle
 from gsplat_core.models import Model
 from gsplat_core.ops.covariance import quat_scale_to_covar_preci
-from services.cli.view import bundle_in
+from services.cli.models import bundle_in
 from services.errors import Rejected
 from services.model_view import DISTANCE, ModelView, rotation_matrices, scene_to_view
 from services.registry.bundle_file import pack
