@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from gsplat_core.depth.registry import DepthFinder
+from gsplat_core.depth.maps import DepthFinder
 from gsplat_core.evaluation.views import EVERY, evaluate_second_eye, matched_disparity
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.models import Model

@@ -17,7 +17,7 @@ from typing import Any
 
 from sparse_points import SparseDepthErrors, SparseDepthSums, SparsePoints
 
-from gsplat_core.depth.registry import DepthFinder
+from gsplat_core.depth.maps import DepthFinder
 from gsplat_core.io.recordings import FileRecording, open_recording
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.training.metrics import psnr_tissue_db

@@ -17,8 +17,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from gsplat_core.depth.maps import measured_confidence
-from gsplat_core.depth.registry import DepthFinder
+from gsplat_core.depth.maps import DepthFinder, measured_confidence
 from gsplat_core.evaluation.depth import DepthShareSums
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.models import Model

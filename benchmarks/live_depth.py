@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sparse_points import SparseDepthSums, SparsePoints
 
-from gsplat_core.depth.registry import DepthFinder
+from gsplat_core.depth.maps import DepthFinder
 from gsplat_core.io.recordings import FileRecording, open_recording
 from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.frames import Frame

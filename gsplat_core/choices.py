@@ -68,13 +68,13 @@ OUTPUTS: Registry[OutputKind] = Registry(
 DEPTHS: Registry[type[Estimator]] = Registry(
     "depth",
     {
-        "recorded": "gsplat_core.depth.registry:RecordedDepth",
+        "recorded": "gsplat_core.depth.maps:RecordedDepth",
         "stereo": "gsplat_core.depth.stereo:StereoDepth",
         "light": "gsplat_core.experimental.light:LightDepth",
         "parallax": "gsplat_core.depth.multiview:ParallaxDepth",
         "onnx": "gsplat_core.depth.learned:LearnedDepth",
         "breathing": "gsplat_core.experimental.breathing_depth:BreathingDepth",
-        "none": "gsplat_core.depth.registry:NoDepth",
+        "none": "gsplat_core.depth.maps:NoDepth",
     },
 )
 """Depth estimators by name. The constructor takes an address if the name is in `DEPTHS_WITH_ADDRESS`."""

@@ -15,7 +15,7 @@ from typing import Any
 
 import cv2
 
-from gsplat_core.depth.registry import DepthFinder, check_depth, evidence, keeps_recorded
+from gsplat_core.depth.maps import DepthFinder, check_depth, evidence, keeps_recorded
 from gsplat_core.machine import step_back, usable_cores, use_one_thread
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import BELIEVED, Frame

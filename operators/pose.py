@@ -9,7 +9,7 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.depth.registry import may_be_metric
+from gsplat_core.depth.maps import may_be_metric
 from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.poses.live_odometry import MOSTLY, LiveOdometry
 from gsplat_core.poses.odometry import CERTAIN_SHARE, MotionTest

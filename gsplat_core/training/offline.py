@@ -31,9 +31,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsplat_core.choices import STRATEGIES
-from gsplat_core.depth.maps import OfRecording, possible_depth
+from gsplat_core.depth.maps import OfRecording, new_estimator, possible_depth, with_surface
 from gsplat_core.depth.plane_fits import filled_depth
-from gsplat_core.depth.registry import new_estimator, with_surface
 from gsplat_core.errors import InvalidInput
 from gsplat_core.geometry.registration import nearest_others
 from gsplat_core.machine import usable_cores

@@ -6,7 +6,7 @@ import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 
-from gsplat_core.depth.registry import check_depth, depth_inputs
+from gsplat_core.depth.maps import check_depth, depth_inputs
 from gsplat_core.io.sessions import WriterOptions
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.image_motion import Detail

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from torch import Tensor
 
-from gsplat_core.depth.registry import DepthFinder, of_recording
+from gsplat_core.depth.maps import DepthFinder, of_recording
 from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.io.recordings import is_heldout
 from gsplat_core.io.recordings.calibration import POSES_FILE, write_poses

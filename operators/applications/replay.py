@@ -15,7 +15,7 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 
 from gsplat_core.choices import check_compared
-from gsplat_core.depth.registry import check_depth, depth_inputs, of_recording
+from gsplat_core.depth.maps import check_depth, depth_inputs, of_recording
 from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.io.frame_codec import camera_of
 from gsplat_core.io.recordings import is_heldout, open_recording

@@ -19,7 +19,7 @@ from typing import Any
 
 import typer
 
-from gsplat_core.depth.registry import check_depth
+from gsplat_core.depth.maps import check_depth
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.evaluation.protocols import Visits
 from gsplat_core.io.model_sources import is_scene_file

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_core.depth.maps import DepthMap, doubted
-from gsplat_core.depth.registry import DEPTHS
+from gsplat_core.depth.maps import DEPTHS, DepthMap, doubted
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DEPTH_ORIGINS

@@ -7,9 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from gsplat_core.depth import registry
-from gsplat_core.depth.maps import DepthMap, doubted
-from gsplat_core.depth.registry import DEPTHS
+from gsplat_core.depth import maps
+from gsplat_core.depth.maps import DEPTHS, DepthMap, doubted
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import BELIEVED, DEPTH_ORIGINS, FrameStatus
@@ -169,7 +168,7 @@ def test_a_scene_that_depth_by_light_starts_is_not_said_to_start_on_a_plane_for_
 @pytest.mark.parametrize("fields", [{}, {"pose": np.eye(4)}], ids=["fixed", "with poses"])
 def test_no_default_finds_depth_by_light(frame, compute, monkeypatch, has_time, fields):
     by_light = Fixed(None)
-    monkeypatch.setattr(registry, "DEPTHS", {**{name: DEPTHS[name] for name in DEPTHS}, "light": lambda: by_light})
+    monkeypatch.setattr(maps, "DEPTHS", {**{name: DEPTHS[name] for name in DEPTHS}, "light": lambda: by_light})
     operator = DepthOp(None, choice="auto", camera=CAMERA, has_time=has_time)
     operator.start()
     for seq in range(3):
@@ -184,7 +183,7 @@ def test_auto_asks_what_takes_long_where_there_is_time_and_never_about_held_out_
     frame, compute, monkeypatch, has_time, asked
 ):
     slow = Fixed(None)
-    monkeypatch.setattr(registry, "DEPTHS", {**{name: DEPTHS[name] for name in DEPTHS}, "parallax": lambda: slow})
+    monkeypatch.setattr(maps, "DEPTHS", {**{name: DEPTHS[name] for name in DEPTHS}, "parallax": lambda: slow})
     operator = DepthOp(None, choice="auto", camera=CAMERA, has_time=has_time, held_out=lambda given: given.seq == 1)
     operator.start()
     for seq in range(4):

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from gsplat_core.depth.registry import DEPTHS
+from gsplat_core.depth.maps import DEPTHS
 from gsplat_core.experimental import light
 from gsplat_core.experimental.light import FLAT, UNSEEN, Grid, LightDepth, Places
 from gsplat_core.experimental.shading import SmallPicture, shading_in

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from gsplat_core.depth.maps import DepthMap
+from gsplat_core.depth.maps import DEPTHS, DepthMap
 from gsplat_core.depth.multiview import MOST_KEY_FRAMES, ParallaxDepth
-from gsplat_core.depth.registry import DEPTHS
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import BELIEVED, Frame
 from tests.gsplat_core.geometry.moving_scope import FIRST, HEIGHT, SIDEWAYS, WIDTH, camera_at, video

@@ -11,7 +11,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from gsplat_core.depth import learned
 from gsplat_core.depth.learned import AGAINST, FLAT, GIVEN, NOT_FINITE, UNLIKE, UNSEEN, LearnedDepth
-from gsplat_core.depth.registry import DepthFinder, check_depth, new_estimator
+from gsplat_core.depth.maps import DepthFinder, check_depth, new_estimator
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import BELIEVED, DEPTH_ORIGINS, RELATIVE_DISTANCE, Frame

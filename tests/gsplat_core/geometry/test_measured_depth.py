@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsplat_core.depth.maps import STRIDE, _median, believed_depth, measured_confidence, possible_depth
-from gsplat_core.depth.registry import DepthFinder
+from gsplat_core.depth.maps import STRIDE, DepthFinder, _median, believed_depth, measured_confidence, possible_depth
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DEPTH_ORIGINS, Frame
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsplat_core.depth import registry
-from gsplat_core.depth.registry import DepthFinder, Sentences
+from gsplat_core.depth import maps
+from gsplat_core.depth.maps import DepthFinder, Sentences
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.frames import DEPTH_ORIGINS, DepthOrigin, Frame
 from tests.gsplat_core.geometry.moving_scope import FIRST, HEIGHT, SIDEWAYS, WIDTH, video
@@ -57,7 +57,7 @@ def test_a_stream_that_changes_its_size_keeps_its_camera(stream, monkeypatch):
         def estimate(self, frame, camera):
             asked.append(camera)
 
-    monkeypatch.setattr(registry, "DEPTHS", {"light": Watched})
+    monkeypatch.setattr(maps, "DEPTHS", {"light": Watched})
     half = stream[1].with_fields(image=np.ascontiguousarray(stream[1].image[::2, ::2]))
     finder = DepthFinder("light", FIRST)
     for frame in (stream[1], half):

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from gsplat_core.depth import registry
+from gsplat_core.depth import maps
 from gsplat_core.depth.multiview import ParallaxDepth
 from gsplat_core.io.recordings import is_heldout
 from gsplat_core.io.recordings.calibration import write_poses
@@ -53,8 +53,8 @@ def asked(monkeypatch):
             numbers.append(frame.seq)
             return super().estimate(frame, camera)
 
-    others = {name: registry.DEPTHS[name] for name in registry.DEPTHS if name != "parallax"}
-    monkeypatch.setattr(registry, "DEPTHS", {**others, "parallax": Watched})
+    others = {name: maps.DEPTHS[name] for name in maps.DEPTHS if name != "parallax"}
+    monkeypatch.setattr(maps, "DEPTHS", {**others, "parallax": Watched})
     return numbers
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from gsplat_core.depth.registry import DEPTHS
+from gsplat_core.depth.maps import DEPTHS
 from gsplat_core.errors import InvalidSetting
 from operators.output_folder import OutputFolder
 from operators.settings import CallerJobOptions, JobOptions
