@@ -30,7 +30,7 @@ from run_facts import run_facts
 from gsplat_core.depth.maps import DepthMap
 from gsplat_core.depth.multiview import ParallaxDepth
 from gsplat_core.depth.stereo import StereoDepth
-from gsplat_core.endoscope.field_of_view import FieldOfView
+from gsplat_core.endoscope.artefacts import FieldOfView
 from gsplat_core.evaluation.depth import MOST_DEPTH_PIXELS, flat_depths, pixels_to_compare
 from gsplat_core.evaluation.geometry import evaluate_trajectory
 from gsplat_core.experimental.breathing_depth import MovingTissue

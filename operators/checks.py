@@ -19,10 +19,9 @@ from typing import Any, ClassVar, Protocol, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from gsplat_core.endoscope.artefacts import Deinterlacer, FieldOfView, StripDetector, without_combs
 from gsplat_core.endoscope.cuts import CutDetector
-from gsplat_core.endoscope.field_of_view import FieldOfView
 from gsplat_core.endoscope.out_of_body import BodyGate
-from gsplat_core.endoscope.recorder import Deinterlacer, StripDetector, without_combs
 from gsplat_core.endoscope.sequence import (
     LOOK_EVERY_S,
     OUT_OF_ORDER,

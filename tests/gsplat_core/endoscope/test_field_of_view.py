@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gsplat_core.endoscope import field_of_view
-from gsplat_core.endoscope.field_of_view import FieldOfView
+from gsplat_core.endoscope import artefacts
+from gsplat_core.endoscope.artefacts import FieldOfView
 from tests.gsplat_core.endoscope.clips import clip, texture
 
 HEIGHT, WIDTH = 256, 320
@@ -205,7 +205,7 @@ def test_no_picture_of_any_size_raises(height, width, seed):
     rng = np.random.default_rng(seed)
     view = FieldOfView()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(field_of_view, "WINDOW_FRAMES", 2)
+        patch.setattr(artefacts, "WINDOW_FRAMES", 2)
         for _ in range(7):
             image = rng.integers(0, rng.integers(1, 257), (height, width, 3), np.uint8)
             image[:, : rng.integers(0, width)] = 0
@@ -215,7 +215,7 @@ def test_no_picture_of_any_size_raises(height, width, seed):
 
 @pytest.mark.parametrize(("windows", "is_taken"), [(1, False), (2, False), (3, True)])
 def test_a_smaller_field_is_accepted_after_three_windows(monkeypatch, windows, is_taken):
-    monkeypatch.setattr(field_of_view, "WINDOW_FRAMES", 2)
+    monkeypatch.setattr(artefacts, "WINDOW_FRAMES", 2)
     large, small = disc(radius=120), disc(radius=80)
     # The first frame is a window of its own, and the window after a change still contains frames before it.
     found = masks([*seen_through(large, count=3), *seen_through(small, count=1 + 2 * windows)])
@@ -225,7 +225,7 @@ def test_a_smaller_field_is_accepted_after_three_windows(monkeypatch, windows, i
 
 def test_a_window_of_thirty_frames_is_judged_by_the_brightest_and_darkest_level_of_each_pixel(monkeypatch):
     judged = []
-    monkeypatch.setattr(field_of_view, "find_outline", lambda *levels: judged.append(levels))
+    monkeypatch.setattr(artefacts, "find_outline", lambda *levels: judged.append(levels))
     view, levels = FieldOfView(), np.random.default_rng(0).integers(30, 220, (61, 12, 16))
     for each in levels:
         view.observe(np.repeat(each[..., None], 3, 2).astype(np.uint8))
@@ -248,7 +248,7 @@ def test_a_round_outline_becomes_the_ellipse_within_its_bounding_box(radii):
     """The hull of 24 corners is at most 0.9 % of the radius inside of the ellipse."""
     hull = polygon(24, radii)
     hull = np.clip(hull, 0, [WIDTH - 1, HEIGHT - 1])  # a larger field is cut off by the picture
-    found = field_of_view._as_ellipse(hull, (HEIGHT, WIDTH))
+    found = artefacts._as_ellipse(hull, (HEIGHT, WIDTH))
     assert len(found) > len(hull)
     assert (found >= hull.min(0) - 1e-9).all() and (found <= hull.max(0) + 1e-9).all()
     free = found[(found[:, 1] > 0) & (found[:, 1] < HEIGHT - 1)]
@@ -267,7 +267,7 @@ def test_a_round_outline_becomes_the_ellipse_within_its_bounding_box(radii):
     ids=["rectangle", "triangle", "long", "small"],
 )
 def test_another_outline_stays_as_it_is(hull):
-    assert field_of_view._as_ellipse(hull, (HEIGHT, WIDTH)) is hull
+    assert artefacts._as_ellipse(hull, (HEIGHT, WIDTH)) is hull
 
 
 @pytest.mark.parametrize(("dented", "is_round"), [(0.2, True), (0.5, False)])
@@ -275,7 +275,7 @@ def test_an_ellipse_needs_seven_tenths_of_the_outline(dented, is_round):
     """A straight side cuts off a share of the outline."""
     angles = np.linspace(-np.pi * (1 - dented), np.pi * (1 - dented), 200)
     hull = np.stack([160 + 100 * np.cos(angles), 128 + 100 * np.sin(angles)], 1)
-    found = field_of_view._as_ellipse(hull, (HEIGHT, WIDTH))
+    found = artefacts._as_ellipse(hull, (HEIGHT, WIDTH))
     assert (found is hull) != is_round
 
 
@@ -286,10 +286,10 @@ def box(left, right, top=0.0, bottom=1.0):
 
 def decided(monkeypatch, outlines):
     """Return the columns of the mask after each window of one frame in which an outline is found."""
-    monkeypatch.setattr(field_of_view, "WINDOW_FRAMES", 1)
-    monkeypatch.setattr(field_of_view, "MARGIN_SHARE", 0.0)
+    monkeypatch.setattr(artefacts, "WINDOW_FRAMES", 1)
+    monkeypatch.setattr(artefacts, "MARGIN_SHARE", 0.0)
     left, view, found = list(outlines), FieldOfView(), []
-    monkeypatch.setattr(field_of_view, "find_outline", lambda *_: left.pop(0))
+    monkeypatch.setattr(artefacts, "find_outline", lambda *_: left.pop(0))
     monkeypatch.setattr(view, "_shows_more", lambda grey: False)
     for _ in outlines:
         mask = view.observe(np.full((80, 160, 3), 90, np.uint8))
@@ -341,7 +341,7 @@ def test_a_picture_that_is_lit_outside_shows_more(level, share, is_more):
 @pytest.mark.parametrize(("size", "margin"), [((160, 320), 3), ((40, 45), 0), ((60, 80), 1)])
 def test_a_hundredth_of_the_longer_side_is_left_out_except_at_the_pictures_edge(monkeypatch, size, margin):
     view = FieldOfView()
-    monkeypatch.setattr(field_of_view, "find_outline", lambda *_: box(0.25, 1.0))
+    monkeypatch.setattr(artefacts, "find_outline", lambda *_: box(0.25, 1.0))
     mask = view.observe(np.full((*size, 3), 90, np.uint8))
     expected = np.zeros(size, np.uint8)
     expected[:, round(0.25 * size[1]) + margin :] = 1

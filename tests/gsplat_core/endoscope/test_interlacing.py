@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gsplat_core.endoscope import recorder
-from gsplat_core.endoscope.recorder import Deinterlacer, comb_share, without_combs
+from gsplat_core.endoscope import artefacts
+from gsplat_core.endoscope.artefacts import Deinterlacer, comb_share, without_combs
 from tests.gsplat_core.endoscope.clips import PLACES, clip, texture
 
 
@@ -74,11 +74,11 @@ def test_sensor_noise_is_no_comb():
     rng = np.random.default_rng(0)
     for image in texture(3, 20, 320, 256):
         noisy = np.clip(image + rng.normal(0, 12, image.shape), 0, 255).astype(np.uint8)
-        assert comb_share(noisy) < recorder.COMB_SHARE
+        assert comb_share(noisy) < artefacts.COMB_SHARE
 
 
 def test_a_stream_that_has_become_progressive_is_left_alone_again(monkeypatch):
-    monkeypatch.setattr(recorder, "FORGOTTEN_FRAMES", 15)
+    monkeypatch.setattr(artefacts, "FORGOTTEN_FRAMES", 15)
     images = [np.roll(image, 5 * k, axis=1) for k, image in enumerate(texture(4, 30, 320, 256))]
     deinterlacer = Deinterlacer()
     for image in woven(images):
@@ -94,7 +94,7 @@ def test_no_picture_of_any_size_raises(height, width, seed):
     rng = np.random.default_rng(seed)
     deinterlacer = Deinterlacer()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(recorder, "COMBED_FRAMES", 1)
+        patch.setattr(artefacts, "COMBED_FRAMES", 1)
         for k in range(4):
             image = rng.integers(0, 256, (height, width, 3), np.uint8)
             image[1::2] //= 1 + k

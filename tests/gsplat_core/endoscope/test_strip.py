@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gsplat_core.endoscope import recorder
-from gsplat_core.endoscope.recorder import StripDetector
+from gsplat_core.endoscope import artefacts
+from gsplat_core.endoscope.artefacts import StripDetector
 from tests.gsplat_core.endoscope.clips import PLACES, clip, texture
 
 HEIGHT, WIDTH = 256, 320
@@ -110,8 +110,8 @@ def test_no_picture_of_any_size_raises(height, width, seed):
     rng = np.random.default_rng(seed)
     image = rng.integers(0, 256, (height, width, 3), np.uint8)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(recorder, "EXAMINE_EVERY", 1)
-        patch.setattr(recorder, "DECIDE_EVERY", 2)
+        patch.setattr(artefacts, "EXAMINE_EVERY", 1)
+        patch.setattr(artefacts, "DECIDE_EVERY", 2)
         detector = StripDetector()
         for _ in range(8):
             mask = detector.observe(image if rng.random() < 0.8 else image[:, ::-1])

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gsplat_core.endoscope import recorder
-from gsplat_core.endoscope.recorder import StripDetector, _Band, _text
+from gsplat_core.endoscope import artefacts
+from gsplat_core.endoscope.artefacts import StripDetector, _Band, _text
 
 
 class Fixed:
@@ -81,7 +81,7 @@ def test_the_same_overlays_keep_the_same_array_and_another_size_forgets_them() -
 
 def test_a_large_picture_is_subsampled_and_its_mask_is_as_large_as_it_is() -> None:
     bands = [Fixed() for _ in range(4)]
-    side = 2 * recorder.LONG_SIDE_PX
+    side = 2 * artefacts.LONG_SIDE_PX
     detector, image = detector_with(bands, (side // 2, side))
     assert detector._small == (side // 4, side // 2)
     bands[0].rows = slice(3, 4)
@@ -91,7 +91,7 @@ def test_a_large_picture_is_subsampled_and_its_mask_is_as_large_as_it_is() -> No
     assert np.flatnonzero((mask == 0).all(1)).tolist() == [6, 7]
 
 
-@pytest.mark.parametrize(("side", "has_bands"), [(recorder.SMALLEST_PX, True), (recorder.SMALLEST_PX - 1, False)])
+@pytest.mark.parametrize(("side", "has_bands"), [(artefacts.SMALLEST_PX, True), (artefacts.SMALLEST_PX - 1, False)])
 def test_small_pictures_have_no_overlays(side: int, has_bands: bool) -> None:
     detector = StripDetector()
     for shape in ((side, 200), (200, side)):
