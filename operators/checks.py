@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.endoscope.artefacts import Deinterlacer, FieldOfView, StripDetector, without_combs
-from gsplat_core.endoscope.cuts import CutDetector
+from gsplat_core.endoscope.changes import CutDetector, SharpnessGate
 from gsplat_core.endoscope.out_of_body import BodyGate
 from gsplat_core.endoscope.sequence import (
     LOOK_EVERY_S,
@@ -32,7 +32,6 @@ from gsplat_core.endoscope.sequence import (
     StreamClock,
     Turns,
 )
-from gsplat_core.endoscope.sharpness import SharpnessGate
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.scene.frames import CUT_IN_DOUBT, Frame, FrameStatus
 from operators.graph import Operator, OperatorSpec

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gsplat_core.endoscope import cuts
-from gsplat_core.endoscope.cuts import CutDetector, FrameRate, View
+from gsplat_core.endoscope import changes
+from gsplat_core.endoscope.changes import CutDetector, FrameRate, View
 from tests.gsplat_core.endoscope.clips import FRAME_NS, PLACES, brightened, clip, resized, texture
 
 OTHERS = list(itertools.permutations(PLACES, 2))
@@ -184,7 +184,7 @@ def test_no_picture_of_any_size_raises(height, width, seed):
     ("usual", "now", "is_other"), [(10, 14, False), (10, 15, True), (14, 10, False), (14, 9, True), (10, 10, False)]
 )
 def test_a_rate_is_another_one_beyond_a_factor_of_1_4(usual, now, is_other, monkeypatch):
-    monkeypatch.setattr(cuts, "RATE_FRAMES", 3)
+    monkeypatch.setattr(changes, "RATE_FRAMES", 3)
     rate, seq, at = FrameRate(), 0, 0
     said = [rate.changed(seq, at)]
     for interval in [usual] * 3 + [now] * 3:
@@ -195,7 +195,7 @@ def test_a_rate_is_another_one_beyond_a_factor_of_1_4(usual, now, is_other, monk
 
 def likeness_of(monkeypatch, difference, structure=0.0, moved=0.0, colours=0.0):
     for name, value in {"difference": difference, "structure": structure, "moved": moved, "colours": colours}.items():
-        monkeypatch.setattr(cuts, name, lambda *_, value=value: value)
+        monkeypatch.setattr(changes, name, lambda *_, value=value: value)
 
 
 @pytest.mark.parametrize(
@@ -239,11 +239,11 @@ def test_colours_agree_by_the_share_of_pixels_of_equal_hue():
     def view(left, right):
         image = np.zeros((96, 128, 3), np.uint8)
         image[:, :64], image[:, 64:] = left, right
-        return cuts.View(image)
+        return changes.View(image)
 
-    assert cuts.colours(view(red, green), view(red, green)) == pytest.approx(1)
-    assert cuts.colours(view(red, green), view(green, red)) == pytest.approx(1)
-    assert cuts.colours(view(red, green), view(red, blue)) == pytest.approx(0.5)
+    assert changes.colours(view(red, green), view(red, green)) == pytest.approx(1)
+    assert changes.colours(view(red, green), view(green, red)) == pytest.approx(1)
+    assert changes.colours(view(red, green), view(red, blue)) == pytest.approx(0.5)
 
 
 def test_structure_is_that_of_the_blocks_up_to_a_shift_of_eight_pixels():
@@ -251,14 +251,14 @@ def test_structure_is_that_of_the_blocks_up_to_a_shift_of_eight_pixels():
     image = texture(1, 1, 200, 160)[0]
     one, shifted = image[:128, :160], image[4:132, 6:166]
     other = texture(2, 1)[0]
-    found = [cuts.structure(cuts.View(one), cuts.View(picture)) for picture in (one, shifted, other)]
+    found = [changes.structure(changes.View(one), changes.View(picture)) for picture in (one, shifted, other)]
     assert found[0] == pytest.approx(1, abs=1e-4)
     assert found[1] > 0.9 > 0.6 > found[2] > 0
-    assert cuts.structure(cuts.View(np.full_like(one, 120)), cuts.View(one)) == 0
+    assert changes.structure(changes.View(np.full_like(one, 120)), changes.View(one)) == 0
 
 
 def test_a_quarter_that_moved_far_is_found_anywhere():
     image = texture(1, 1, 260, 208)[0]
-    one, moved = cuts.View(image[:128, :160]), cuts.View(image[60:188, 76:236])
-    assert cuts.moved(one, moved) == cuts.moved(moved, one) > 0.8
-    assert cuts.moved(one, cuts.View(texture(2, 1)[0])) < 0.6
+    one, moved = changes.View(image[:128, :160]), changes.View(image[60:188, 76:236])
+    assert changes.moved(one, moved) == changes.moved(moved, one) > 0.8
+    assert changes.moved(one, changes.View(texture(2, 1)[0])) < 0.6

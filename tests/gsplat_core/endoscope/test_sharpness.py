@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gsplat_core.endoscope import sharpness
-from gsplat_core.endoscope.sharpness import Appearance, SharpnessGate, appearance
+from gsplat_core.endoscope import changes
+from gsplat_core.endoscope.changes import Appearance, SharpnessGate, appearance
 from gsplat_core.io.recordings import open_recording
 from tests.gsplat_core.endoscope.clips import PLACES, brightened, clip, texture
 
@@ -208,8 +208,8 @@ def test_what_is_left_out_does_not_count():
 def test_no_picture_of_any_size_raises(height, width, seed):
     rng = np.random.default_rng(seed)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sharpness, "RECENT_FRAMES", 1)
-        patch.setattr(sharpness, "CLEAR_FRAMES", 2)
+        patch.setattr(changes, "RECENT_FRAMES", 1)
+        patch.setattr(changes, "CLEAR_FRAMES", 2)
         gate = SharpnessGate()
         for k in range(6):
             image = rng.integers(0, rng.integers(1, 257), (height, width, 3), np.uint8)
@@ -237,7 +237,7 @@ def test_limits_of_blur_and_smoke(before, sharpness, clear, said):
 def gate_of(monkeypatch, seen):
     """A gate to which every frame looks like what `seen` gives next."""
     looks = iter(seen)
-    monkeypatch.setattr(sharpness, "appearance", lambda image, kept: next(looks))
+    monkeypatch.setattr(changes, "appearance", lambda image, kept: next(looks))
     return SharpnessGate()
 
 
