@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from gsplat_core.errors import InvalidInput
 from gsplat_core.registry import Registry
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.range_sensors import RangeScan
+from gsplat_core.scene.range_sensors import RangeScan, resized_scan
 
 BELIEVED = 0.5
 """Confidence from which a depth is used, in steps that either use or reject it."""
@@ -234,6 +234,38 @@ class Frame:
     def with_fields(self, **fields: Any) -> Frame:
         """Return a copy with some fields replaced."""
         return replace(self, **fields)
+
+
+def resized_frame(frame: Frame, width_px: int, height_px: int) -> Frame:
+    """Resize a frame: images and scans by area averaging, masks, labels and depth by nearest-neighbour sampling."""
+    if (width_px, height_px) == (frame.width_px, frame.height_px):
+        return frame
+    planes = {name: getattr(frame, name) for name in ("depth", "depth_confidence", "mask", "loss_mask", "labels")}
+    scan = frame.ranges
+    right, right_camera = frame.right_image, frame.right_camera
+    return frame.with_fields(
+        image=resize_area(frame.image, width_px, height_px),
+        ranges=None if scan is None else resized_scan(scan, width_px, height_px / frame.height_px),
+        right_image=None if right is None else resize_area(right, width_px, height_px),
+        right_camera=None if right_camera is None else right_camera.resized(width_px, height_px),
+        **{name: resize_nearest(plane, width_px, height_px) for name, plane in planes.items() if plane is not None},
+    )
+
+
+def resize_area(image: NDArray[np.uint8], width_px: int, height_px: int) -> NDArray[np.uint8]:
+    """Resize an image; area-averaged when reduced."""
+    import cv2  # here, because the control plane passes frames on without OpenCV
+
+    shrinks = width_px <= image.shape[1] and height_px <= image.shape[0]
+    interpolation = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(image, (width_px, height_px), interpolation=interpolation), dtype=np.uint8)
+
+
+def resize_nearest(plane: NDArray[Any], width_px: int, height_px: int) -> NDArray[Any]:
+    """Resize a mask or depth map by nearest-neighbour sampling, which creates no new values."""
+    import cv2
+
+    return cv2.resize(plane, (width_px, height_px), interpolation=cv2.INTER_NEAREST_EXACT)
 
 
 class DepthError(NamedTuple):

@@ -7,7 +7,7 @@ what a bin measures (Z-Splat, Qu et al. 2024).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Literal, get_args
 
 import numpy as np
@@ -133,6 +133,22 @@ class RangeScan:
             )
         if self.sensor.form == "image" and len(self.counts) != 1:
             raise InvalidInput(f"a scan of form image has one row of counts, got {len(self.counts)}")
+
+
+def resized_scan(scan: RangeScan, width_px: int, scale: float) -> RangeScan:
+    """Return a scan for a resized picture. Columns are averaged over the columns that each new one covers; the single
+    histogram of a sensor of form `image` is unchanged.
+    """
+    sensor = scan.sensor
+    if isinstance(sensor, OctLine):
+        sensor = replace(sensor, thickness_px=max(1, round(sensor.thickness_px * scale)))
+    if sensor.form == "image":
+        return RangeScan(sensor, scan.counts)
+    edges = np.linspace(0, len(scan.counts), width_px + 1)
+    sums = np.concatenate([np.zeros((1, scan.counts.shape[1])), np.cumsum(scan.counts, 0, np.float64)])
+    low = np.floor(edges).astype(int).clip(max=len(scan.counts) - 1)
+    at_edges = sums[low] + (edges - low)[:, None] * (sums[low + 1] - sums[low])
+    return RangeScan(sensor, (np.diff(at_edges, axis=0) / np.diff(edges)[:, None]).astype(np.float32))
 
 
 def simulate_scan(

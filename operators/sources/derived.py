@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings.calibration import default_camera
-from gsplat_core.io.recordings.frame_files import resized_frame
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import Frame, resized_frame
 from operators.sources.address import StereoLayout
 from operators.sources.live import LiveSource
 from operators.sources.source import FrameSource, ReportingSource, SourceDescription, SourceState

@@ -18,10 +18,9 @@ import numpy as np
 
 from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.io.recordings.calibration import default_camera
-from gsplat_core.io.recordings.frame_files import resized_frame
 from gsplat_core.io.recordings.plain_files import MAX_PIXELS
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import Frame, FrameStatus
+from gsplat_core.scene.frames import Frame, FrameStatus, resized_frame
 from operators.sources.address import SourceOptions
 from operators.sources.source import SourceDescription, SourceState, ThreadedSource
 

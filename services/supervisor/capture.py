@@ -21,8 +21,7 @@ from zmq.utils.monitor import recv_monitor_message
 
 from gsplat_core.errors import InvalidInput, UserError
 from gsplat_core.io.frame_codec import InvalidMessage
-from gsplat_core.io.recordings.frame_files import resized_frame
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import Frame, resized_frame
 from operators.errors import SourceError, SourceUnavailable
 from operators.sources.address import SourceOptions
 from operators.sources.derived import scaled_description

@@ -11,7 +11,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -32,8 +31,7 @@ from gsplat_core.io.recordings.plain_files import (
     read_array,
     read_header,
 )
-from gsplat_core.scene.frames import Frame
-from gsplat_core.scene.range_sensors import OctLine, RangeScan, RangeSensor
+from gsplat_core.scene.range_sensors import RangeScan, RangeSensor
 
 SENSOR_FILE = "sensor.json"
 CLASSES = 4
@@ -169,22 +167,6 @@ def read_sensor(path: Path, findings: Findings) -> RangeSensor | None:
     except InvalidSetting as error:
         findings.problem(path, str(error), "Correct the description of the sensor")
         return None
-
-
-def resized_scan(scan: RangeScan, width_px: int, scale: float) -> RangeScan:
-    """Return a scan for a resized picture. Columns are averaged over the columns that each new one covers; the single
-    histogram of a sensor of form `image` is unchanged.
-    """
-    sensor = scan.sensor
-    if isinstance(sensor, OctLine):
-        sensor = dataclasses.replace(sensor, thickness_px=max(1, round(sensor.thickness_px * scale)))
-    if sensor.form == "image":
-        return RangeScan(sensor, scan.counts)
-    edges = np.linspace(0, len(scan.counts), width_px + 1)
-    sums = np.concatenate([np.zeros((1, scan.counts.shape[1])), np.cumsum(scan.counts, 0, np.float64)])
-    low = np.floor(edges).astype(int).clip(max=len(scan.counts) - 1)
-    at_edges = sums[low] + (edges - low)[:, None] * (sums[low + 1] - sums[low])
-    return RangeScan(sensor, (np.diff(at_edges, axis=0) / np.diff(edges)[:, None]).astype(np.float32))
 
 
 SAMPLES = 16
@@ -438,31 +420,3 @@ def check_pairing(
             )
             return False
     return True
-
-
-def resize_area(image: NDArray[np.uint8], width_px: int, height_px: int) -> NDArray[np.uint8]:
-    """Resize an image; area-averaged when reduced."""
-    shrinks = width_px <= image.shape[1] and height_px <= image.shape[0]
-    interpolation = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-    return np.asarray(cv2.resize(image, (width_px, height_px), interpolation=interpolation), dtype=np.uint8)
-
-
-def resize_nearest(plane: NDArray, width_px: int, height_px: int) -> NDArray:
-    """Resize a mask or depth map by nearest-neighbour sampling, which creates no new values."""
-    return cv2.resize(plane, (width_px, height_px), interpolation=cv2.INTER_NEAREST_EXACT)
-
-
-def resized_frame(frame: Frame, width_px: int, height_px: int) -> Frame:
-    """Resize a frame: images and scans by area averaging, masks, labels and depth by nearest-neighbour sampling."""
-    if (width_px, height_px) == (frame.width_px, frame.height_px):
-        return frame
-    planes = {name: getattr(frame, name) for name in ("depth", "depth_confidence", "mask", "loss_mask", "labels")}
-    scan = frame.ranges
-    right, right_camera = frame.right_image, frame.right_camera
-    return frame.with_fields(
-        image=resize_area(frame.image, width_px, height_px),
-        ranges=None if scan is None else resized_scan(scan, width_px, height_px / frame.height_px),
-        right_image=None if right is None else resize_area(right, width_px, height_px),
-        right_camera=None if right_camera is None else right_camera.resized(width_px, height_px),
-        **{name: resize_nearest(plane, width_px, height_px) for name, plane in planes.items() if plane is not None},
-    )

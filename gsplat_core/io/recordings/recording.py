@@ -18,7 +18,6 @@ import numpy as np
 
 from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.io.recordings.contents import Contents
-from gsplat_core.io.recordings.frame_files import resized_frame
 from gsplat_core.io.recordings.layouts import inspect
 from gsplat_core.io.recordings.plain_files import (
     DEPENDS,
@@ -29,7 +28,7 @@ from gsplat_core.io.recordings.plain_files import (
     printable,
 )
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import Frame, FrameStatus
+from gsplat_core.scene.frames import Frame, FrameStatus, resized_frame
 
 if TYPE_CHECKING:
     from gsplat_core.io.sessions.reader import SessionContents

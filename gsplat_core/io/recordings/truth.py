@@ -29,9 +29,6 @@ from gsplat_core.io.recordings.frame_files import (
     ImageFiles,
     MaskFiles,
     check_sizes,
-    resize_area,
-    resize_nearest,
-    resized_frame,
 )
 from gsplat_core.io.recordings.plain_files import (
     MAX_PIXELS,
@@ -45,7 +42,7 @@ from gsplat_core.io.recordings.plain_files import (
     stays_inside,
 )
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import Frame
+from gsplat_core.scene.frames import Frame, resize_area, resize_nearest, resized_frame
 
 VIEWS_FILE = "views.json"
 VIEWS_FORMAT = "intrasplat-views"
