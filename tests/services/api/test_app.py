@@ -26,7 +26,7 @@ PUBLIC = {"/livez", "/readyz", "/openapi.json", "/docs", "/docs/{file}"}
 @pytest.mark.slow
 def test_the_control_plane_loads_neither_torch_nor_opencv(tmp_path):
     code = (
-        "import sys, services.api, services.settings, services.audit, services.cli.serve, services.cli.serve, services.cli.serve\n"
+        "import sys, services.api, services.settings, services.audit, services.cli.serve\n"
         "from services.settings import ServiceSettings\n"
         f"services.api.new_app(ServiceSettings(paths={{'data': {str(tmp_path)!r}}}))\n"
         "print(sorted({'torch', 'cv2', 'av', 'onnxruntime'} & set(sys.modules)))"
