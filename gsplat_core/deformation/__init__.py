@@ -1,4 +1,4 @@
-"""Deformation fields, which move canonical Gaussians over time."""
+"""Deformation fields, which move, rotate and scale canonical Gaussians over time; some also change colour or opacity."""
 
 from __future__ import annotations
 

@@ -445,7 +445,7 @@ BUMPS_AT_START = 5
 
 
 def training_bytes(gaussians: int, spacings: float) -> int:
-    """Return the estimated memory of bumps in training."""
+    """Return the estimated memory in bytes for training the bumps of `gaussians` over `spacings` bump spacings."""
     return PARAMETER_BYTES * gaussians * (BASIS_CHANNELS + 2) * (BUMPS_AT_START + round(spacings))
 
 
@@ -459,7 +459,7 @@ KIND = FieldKind(
         "spacing_s": NumberIn(1e-6, 1e6),
     },
     rates=BasisLearningRates(),
-    # Bumps that move towards trained times leave the times between without one.
+    # Bump centres are fixed offline. Moving to the times of training frames would leave no bump between these times.
     offline_rates=BasisLearningRates(timing=0.0),
     training=BasisTraining,
     captured_training=CapturedBasisTraining,

@@ -60,7 +60,7 @@ INERT_CENTER = 1e9
 INERT = (INERT_CENTER, 0.0, 0.0)
 """Centre, log-width and weights of an unused column."""
 CAPACITY_STEP = 16
-"""Granularity of the capacity for bumps."""
+"""Number of bump columns to a multiple of which the allocated capacity is rounded up."""
 HEADROOM = 1.25
 COLUMNS_AHEAD = 1
 """Number of columns kept ahead of the newest frame in a live session."""
@@ -75,7 +75,7 @@ class Columns:
     """
 
     origin_s: float
-    """Time at which the oldest column was created; times are counted in spacings from it."""
+    """Time in seconds of the oldest column's initial bump centre. Normalised times are counted in spacings from it."""
     spacing_s: float
     count: int
     """Number of columns in use."""
@@ -399,7 +399,9 @@ class BumpTensors(ContinuedField):
             self._add_places((end if self.weights.is_cpu else bump_capacity(end)) - before.places)
         self._columns, passed = self._columns.moved_on(added)
         if passed:
-            self.centers.data[: self.count] -= passed  # exact for whole numbers of decreasing magnitude
+            self.centers.data[: self.count] -= (
+                passed  # no rounding: initial centres are whole numbers, and this makes them smaller
+            )
         for places, numbers in self._columns.newest_places(min(added, self.bumps)):
             self._lay_out(places, numbers, held)
         return passed

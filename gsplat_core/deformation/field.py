@@ -487,7 +487,7 @@ class ContinuedField(DeformationField):
     def __init__(self, time_window_s: tuple[float, float]) -> None:
         super().__init__(time_window_s)
         self.continuation: Continuation | None = None
-        """Extrapolation after the newest frame; None for none."""
+        """Extrapolation after the newest frame; None if the field is constant after it."""
 
     def continued_window(self, window_s: tuple[float, float]) -> tuple[float, float]:
         continuation = self.continuation

@@ -48,7 +48,7 @@ def uncovered_pixels(alpha: Tensor, mask: Tensor) -> Tensor:
 
 
 def are_worth_filling(uncovered: Tensor) -> bool:
-    """Return True if the uncovered pixels [H, W] are more than single gaps. Synchronises with the device."""
+    """Return True if the marked pixels, bool [H, W], are at least the share `SMALLEST_SHARE` of the picture. Synchronises."""
     return HostCopy(torch.count_nonzero(uncovered)).item() >= SMALLEST_SHARE * uncovered.numel()
 
 
@@ -61,7 +61,9 @@ class CapturedCoverage:
 
     def __init__(self, camera: Camera, device: torch.device, rows: int = 0) -> None:
         """Prepare the test for at most `rows` Gaussians; 0 for a quarter more than the scene's first size."""
-        self._slots = SnapshotSlots(device, most=2, rows=rows)  # the renderer holds one while the other is written
+        self._slots = SnapshotSlots(
+            device, most=2, rows=rows
+        )  # two slots: the renderer reads one while the other is written
         self._renderer = AlphaRenderer(camera, device)
 
     def leaves_much_uncovered(self, gaussians: Gaussians, field: DeformationField, observation: Observation) -> bool:
@@ -93,9 +95,9 @@ class Uncovered:
     """Tissue of one frame that the scene does not cover, as tensors that are being copied to the host."""
 
     pixels: HostCopy
-    """Pixels of tissue that no Gaussian covers, bool [H, W]."""
+    """True for tissue pixels that Gaussians cover by less than `UNCOVERED_ALPHA`, bool [H, W]."""
     depth: HostCopy | None
-    """Depth of the scene, float32 [H, W], 0 where uncovered; None if the frame's own depth is used."""
+    """Rendered depth of the scene, float32 [H, W], 0 where uncovered; None if the frame has depth, which is used instead."""
 
     def gaussians(
         self, frame: Frame, observation: Observation, config: ReconstructorConfig, most: int
@@ -410,7 +412,7 @@ class LastSeen:
         return unseen
 
     def restart(self) -> None:
-        """Remove all Gaussians; those of the next scene get their times when they join."""
+        """Discard all visibility times, for a new scene whose Gaussians get theirs in `join`. The memory is kept."""
         self._count = 0
 
     def see(self, now: Gaussians, observation: Observation) -> None:
@@ -447,7 +449,7 @@ class Archive:
         self._capacity = capacity
         self._kept: Gaussians | None = None
         self.forgotten = 0
-        """Number of Gaussians dropped because of the capacity, oldest first."""
+        """Number of Gaussians deleted from the full archive to make space for new ones, oldest first."""
 
     def __len__(self) -> int:
         return 0 if self._kept is None else self._kept.count
@@ -460,7 +462,7 @@ class Archive:
         self._kept = kept.map(lambda tensor: tensor[-self._capacity :].clone()) if self._capacity else None
 
     def in_view(self, camera: Camera) -> Tensor:
-        """Return which archived Gaussians have their centre in a camera's picture, bool [len]."""
+        """Return a mask of the archived Gaussians whose centre is in a camera's picture, one bool for each."""
         return torch.zeros(0, dtype=torch.bool) if self._kept is None else pixels_of(self._kept.means, camera)[1]
 
     def take_uncovered(self, camera: Camera, uncovered: Tensor, most: int) -> Gaussians | None:
@@ -481,17 +483,23 @@ class Archive:
 
 
 USUAL_DENSITY = 0.3
-"""Mean number of Gaussians in a cell and its eight neighbours below which the cell counts as empty; about 1 at first."""
+"""Mean number of Gaussians per cell, over a cell and its eight neighbours, below which the cell counts as empty. A new
+scene has about 1 per cell.
+"""
 LOOKS_AFTER = 0.02
 """Motion of the picture, as a share of its width, after which the picture is searched again for new tissue; each search
 takes some milliseconds.
 """
 EDGE_CELLS = 1.0
-"""Margin in cells at the previous picture's edge that counts as new, so that slow motion leaves no gap."""
+"""Width in cells of the margin inside the previous picture's edge that counts as not yet seen, so that slow camera motion
+leaves no gap.
+"""
 
 
 def has_moved(camera: Camera, before: Camera, distance: float) -> bool:
-    """Return True if content at `distance` is somewhere displaced by `LOOKS_AFTER` or more between two cameras."""
+    """Return True if a point at `distance` moves in the picture by the share `LOOKS_AFTER` of its width or more between two
+    cameras, at the edges or the centre of the picture.
+    """
     sides = np.array([0.0, 0.5, 1.0])
     pixels = np.stack(np.meshgrid(sides * camera.width_px, sides * camera.height_px), -1).reshape(-1, 2)
     if camera.model == before.model == "pinhole":
@@ -512,9 +520,9 @@ def _points_of(pixels: NDArray[np.float64], camera: Camera, distance: float) -> 
 def _by_homography(
     pixels: NDArray[np.float64], camera: Camera, before: Camera, distance: float
 ) -> NDArray[np.floating]:
-    """Return homogeneous coordinates [3, M] in an earlier camera of the content of `pixels` [M, 2] at a distance.
+    """Return homogeneous pixel coordinates [3, M] in an earlier camera of the points that `pixels` [M, 2] show at a distance.
 
-    Training waits for the result. Projecting the points of all cells instead takes ten times as long.
+    Training waits for the result. Unprojecting and projecting each point instead takes ten times as long.
     """
     between = before.world_to_camera @ np.linalg.inv(camera.world_to_camera)
     homography = distance * before.K @ between[:3, :3] @ np.linalg.inv(camera.K)
@@ -525,17 +533,17 @@ def _by_homography(
 def entered(
     pixels: NDArray[np.float64], camera: Camera, before: Camera, distance: float, edge_px: float = 0.0
 ) -> NDArray[np.bool_]:
-    """Find pixels whose content was not visible to an earlier camera.
+    """Find pixels that show points outside of an earlier camera's picture.
 
     Args:
         pixels: positions [M, 2].
         camera: present camera.
         before: earlier camera.
-        distance: assumed distance of the content.
+        distance: assumed distance of the points from the present camera.
         edge_px: margin at the edge of the earlier picture that counts as not visible.
 
     Returns:
-        bool [M].
+        bool [M]; True for pixels that came into view.
     """
     if camera.model == before.model == "pinhole":
         x, y, z = _by_homography(pixels, camera, before, distance)
@@ -582,7 +590,7 @@ class NewTissue:
         return self._grid[wanted.numpy()], depth_mm.numpy()
 
     def _of_cells(self, values: Tensor) -> Tensor:
-        """Return the values of cells [rows, columns] at each pixel in them, [H, W]."""
+        """Expand the values of grid cells [rows, columns] to all pixels of each cell, [H, W]."""
         size = self._camera.height_px, self._camera.width_px
         row, column = (
             (torch.arange(pixels, device=values.device) / self._spacing).long().clamp(max=cells - 1)

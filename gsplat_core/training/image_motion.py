@@ -29,9 +29,9 @@ CELL_PX = 4
 SMALLEST_PX = 48
 """Shortest side of a picture for which flow is computed; the method needs patches of 8 pixels in a pyramid."""
 WIDE_CELLS = 6.0
-"""Standard deviation of the neighbourhood used where no tissue is visible, in cells."""
+"""Standard deviation in flow cells of the wide average that fills in the flow where little or no tissue is visible."""
 WIDE_WEIGHT = 0.02
-"""Weight of the neighbourhood relative to a cell's own flow."""
+"""Weight of the wide average of flow (`WIDE_CELLS`) relative to the flow of the cell itself."""
 Detail: TypeAlias = Literal["full", "half"]
 """Resolution of the flow. `full` searches thoroughly at full size. `half` searches quickly and halves pictures of more
 than `SMALL_PIXELS` pixels.
@@ -211,12 +211,12 @@ class SurfaceMotion:
         return sampled[0, :, 0].T
 
     def _is_compiled_for(self, points: Tensor) -> bool:
-        """Return True if the compiled op supports these points; it is not differentiable."""
+        """Return True if the compiled op, which has no gradient, supports these points: float32 on the CPU without gradient."""
         return all(t.is_cpu and t.dtype == torch.float32 and not t.requires_grad for t in (points, self.flow))
 
 
 class Seen:
-    """Projection of points by a pinhole camera."""
+    """World points projected into the picture of a pinhole camera."""
 
     def __init__(self, camera: Camera, points: Tensor) -> None:
         """Compute `pixels` [N, 2], `depth` [N, 1] and `inside` (in the picture) [N, 1]."""

@@ -208,7 +208,7 @@ def tissue_depth(frame: Frame, default_depth_mm: float) -> NDArray[np.float32]:
 
 
 COARSE = 4
-"""Reduction factor at which tissue under tools is filled, equal to that of the host's in-painting."""
+"""Factor by which pictures are reduced before tissue under tools is filled in, equal to that of the host's in-painting."""
 
 
 def filled(picture: Tensor, known: Tensor, coarse: int = COARSE) -> Tensor:
@@ -243,7 +243,7 @@ def _shrunk(total: Tensor, weight: Tensor, factor: int) -> tuple[Tensor, Tensor]
 
 
 class StartOnDevice:
-    """Jittered grid for one size and camera, prepared before the first frame."""
+    """Creator of a scene's first Gaussians on the device, with a pixel grid prepared before the first frame for one camera."""
 
     def __init__(self, camera: Camera, count: int, device: torch.device, seed: int = 0) -> None:
         """Prepare the grid as `gaussians_from_frame` does. Only the camera's pose may differ later."""

@@ -315,7 +315,7 @@ class NormalConsistency:
     needs_depth: ClassVar[bool] = False
 
     def compare(self, rays: RenderedRays) -> Tensor:
-        """Return the mean difference of both kinds of normals over the observation's tissue."""
+        """Return the mean difference between blended splat normals and depth normals over the observation's tissue."""
         view = rays.view
         return ray_normal_loss(rays.depths, rays.alphas, rays.normals, rays.tissue, view.K, view.camera_model)
 
@@ -337,7 +337,7 @@ class Semantics:
     rates: ClassVar[Mapping[str, float]] = {SEMANTICS: 0.05}
 
     def extended(self, gaussians: Gaussians) -> Gaussians:
-        """Return the Gaussians with logits, 0 for those without."""
+        """Return the Gaussians with class logits in `extra`: present ones unchanged, new ones 0."""
         if SEMANTICS in gaussians.extra:
             return gaussians
         logits = gaussians.means.new_zeros(gaussians.count, CLASSES)
@@ -357,7 +357,7 @@ class Semantics:
 
 
 SMALL_PIXELS = 24_000
-"""Number of pixels up to which pictures are compared at full size."""
+"""Number of pixels up to which losses along rays compare pictures at full size; larger pictures are compared at half size."""
 
 
 class RenderedRays(NamedTuple):
@@ -366,13 +366,13 @@ class RenderedRays(NamedTuple):
     view: View
     """Camera of the compared pixels."""
     stride: int
-    """Pixels of the observation per compared pixel along each axis."""
+    """Distance of compared pixels in the observation's pixels: 1 for full size, 2 for half size."""
     alphas: Tensor
     depths: Tensor
     normals: Tensor
-    """Sum of weight times normal [h, w, 3]; its length is at most the opacity."""
+    """Normals of the splats, summed with their blending weights [h, w, 3]; the sum's length is at most the opacity."""
     values: Tensor
-    """Sum of weight times further value of the splats [h, w, K]."""
+    """Further values of the splats, such as class logits, summed with their blending weights [h, w, K]."""
     tissue: Tensor
     """Mask bool [h, w] of observed pixels that are tissue."""
     known_depth: Tensor | None

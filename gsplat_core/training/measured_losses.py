@@ -33,11 +33,11 @@ from gsplat_core.training.observations import Observation
 from gsplat_core.transfers import HostCopy, tensor_of
 
 SMOOTH_PX = 0.1
-"""Error in pixels below which the loss is quadratic."""
+"""Flow error in pixels around which the loss changes from quadratic (smaller errors) to linear (larger errors)."""
 KEPT_PAIRS = 256
-"""Number of frame pairs whose flow is kept."""
+"""Largest number of frame pairs whose observed flow is cached."""
 SEARCH_EVERY = 200
-"""Number of comparisons after which the nearest splats are searched again."""
+"""Number of loss evaluations after which the nearest splats of each splat, needed to render flow, are searched again."""
 
 
 class FlowLoss:
@@ -83,8 +83,8 @@ class FlowLoss:
         return lengths.sum() / known.sum().clamp(min=1)
 
     def _other(self, observation: Observation, context: LossContext) -> Observation | None:
-        """Return the preceding or the following frame, by turns; the only one at an end of the window. None without such
-        a frame of the same size.
+        """Return the frame before or the frame after the observation, in alternating calls. The first and the last frame
+        have only one of them. Return None if no such frame has the same size.
         """
         left = [one for one in context.frames if not one.of_right]
         index = next((k for k, one in enumerate(left) if one.seq == observation.seq), None)
@@ -126,30 +126,30 @@ def _compared_size(camera: Camera) -> Camera:
 
 
 LEAST_ANGLE_DEG = 1.5
-"""Least angle between the rays of two views at a point."""
+"""Smallest angle between the rays of two camera views to a point at which the point is triangulated."""
 LARGEST_ANGLE_DEG = 15.0
-"""Largest angle of views that are chosen; beyond it optical flow finds few matches."""
+"""Largest angle between the viewing directions of two frames that are matched; beyond it optical flow finds few matches."""
 MOST_VIEWS, LEAST_VIEWS = 8, 2
-"""Largest and smallest number of other views in which a point is matched."""
+"""Largest and smallest number of other frames in which a frame's point is matched for triangulation."""
 SIGMA = 0.01
-"""Scale of the robust loss relative to a point's depth."""
+"""Distance σ at which the robust loss of triangulated points saturates, relative to a point's depth."""
 FAR = 0.25
-"""Weight of the term that also attracts a distant surface."""
+"""Weight of the logarithmic loss term, whose gradient also moves a surface far from the triangulated points."""
 MOST_REPROJECTION_PX = 1.0
 """Largest root mean square distance of a triangulated point from its matches."""
 KEPT_FRAMES = 512
-"""Number of frames whose points are kept."""
+"""Largest number of frames whose triangulated points are cached."""
 STRIDE_PX = 4
-"""Distance of the compared pixels."""
+"""Distance in pixels between neighbouring pixels of a frame that are triangulated."""
 
 
 class Triangulated(NamedTuple):
-    """Points seen by one frame, in its camera's axes."""
+    """Points of one frame that were triangulated from other frames."""
 
     pixels: Tensor
     """Pixel coordinates [P, 2] in the frame."""
     points: Tensor
-    """Positions of triangulated points, [P, 3]."""
+    """Positions of the triangulated points in the axes of the frame's camera, [P, 3]."""
 
 
 class TriangulationLoss:
@@ -165,10 +165,10 @@ class TriangulationLoss:
 
     def __init__(self) -> None:
         self._points: OrderedDict[tuple[int, bool], Triangulated] = OrderedDict()
-        """Points by the number and eye of their frame."""
+        """Triangulated points by frame number and eye (True for the right one)."""
         self._missed: dict[tuple[int, bool], int] = {}
-        """Number of other frames with which triangulation gave no points for a frame. It is tried again once there are
-        more.
+        """Number of other frames that were available when the triangulation of a frame gave no points, by frame number and
+        eye. The triangulation is tried again once more frames are available.
         """
         self._has_parallax = False
 
@@ -210,7 +210,7 @@ class TriangulationLoss:
 
 
 def check_parallax(observation: Observation, others: Sequence[Observation]) -> None:
-    """Raise InvalidSetting if all of several frames were taken from one place."""
+    """Raise InvalidSetting if there are at least two other frames and all have the observation's camera position."""
     position = observation.camera.position
     if len(others) >= LEAST_VIEWS and all(np.allclose(one.camera.position, position, atol=1e-9) for one in others):
         raise InvalidSetting(
@@ -347,7 +347,7 @@ def render_ranges(gaussians: Gaussians, camera: Camera, sensor: RangeSensor, fac
 DISTANCE_WEIGHT = 0.5
 """Weight of the Wasserstein distance in bins relative to the L1 difference."""
 KEPT_SCANS = 256
-"""Number of scans whose tensors are kept on the device."""
+"""Largest number of range scans whose tensors are cached on the device."""
 
 
 def normalised(histograms: Tensor) -> Tensor:

@@ -27,7 +27,9 @@ ImageLike: TypeAlias = NDArray[np.generic] | Tensor
 PSNR_CAP_DB = 100.0
 """PSNR of equal images and highest reported value, corresponding to a mean squared error of 1e-10."""
 SETTLING_S = 1.0
-"""Start of a live stream in seconds that settled scores and ages exclude, because the model is being initialised."""
+"""Duration in seconds of the start of a live stream, which "settled" quality scores and picture ages leave out because the
+model is still being initialised.
+"""
 
 
 _UNIT_OF_BYTE: NDArray[np.float32] = (torch.arange(256, dtype=torch.float32) / 255).numpy()
@@ -53,7 +55,7 @@ class _MaskedPair:
         return int(self.image.shape[0] * self.image.shape[1])
 
     def masked(self) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Return both images with 0 outside the tissue."""
+        """Return image and target with pixels outside the tissue set to 0."""
         if self.tissue is None:
             return self.image, self.target
         # Without a destination, OpenCV sets masked-out pixels to 0.
@@ -118,7 +120,7 @@ def _masked_pair(image: ImageLike, target: ImageLike, mask: ImageLike | None) ->
 
 
 def _psnr_db(squared_error: float, pixels: int) -> float:
-    """Return the PSNR of a squared error averaged over `pixels`; NaN for none."""
+    """Return the PSNR in dB of a sum of squared errors over a number of RGB pixels; NaN for 0 pixels."""
     return _decibels(squared_error / (3 * pixels)) if pixels else math.nan
 
 

@@ -80,7 +80,7 @@ LEAST_EXPLAINED = 0.5
 SMALLEST_SHIFT = 1e-9
 """Smallest displacement of a camera along an axis in scene units; less is rounding."""
 ROUNDS = 4
-"""Rounds of reweighting, which reduce the influence of independently moving points on the distance."""
+"""Rounds of reweighting in the fit of the scene's distance, which reduce the influence of points that move on their own."""
 
 
 class DepthFromMotion:
@@ -190,7 +190,7 @@ LONGEST_GAP_S = 0.15
 UNCERTAINTY = 0.05
 """Variance of a Gaussian's predicted position, relative to the squared length of its last motion."""
 MOST_WIDENED = 0.7
-"""Largest increase of a log-scale by `widened`."""
+"""Largest increase of a Gaussian's log-scales that accounts for the uncertainty of its predicted position (`widened`)."""
 SUDDEN = 5.0
 """Ratio to the usual median motion of frames above which a motion over `SUDDEN_PX` pixels is a jump, not extrapolated."""
 SUDDEN_PX = 1.0
@@ -207,7 +207,7 @@ class MotionPrior(Protocol):
         """
 
     def velocity(self, step: TrainingStep, deltas: Tensor | None = None) -> Tensor | None:
-        """Return the rate of change of the raw parameters after the newest frame per second, [N, 16], or None for none.
+        """Return the rate of change per second of the raw parameters after the newest frame, [N, 16]; None if unknown.
         `deltas` are the field's raw deltas at that frame's time, if already computed.
         """
 
@@ -310,11 +310,11 @@ class FlowPrior:
         """
 
     def _usable_motion(self) -> SurfaceMotion | None:
-        """Return the newest motion; None after a jump or an interval of more than `LONGEST_GAP_S`."""
+        """Return the motion between the last two frames; None if it was a jump, or took more than `LONGEST_GAP_S`."""
         return self._motion if 0 < self._interval_s <= LONGEST_GAP_S and not self._is_sudden else None
 
     def _judge(self, moved_px: float) -> None:
-        """Update the usual motion, and mark the newest motion as a jump if it is far larger."""
+        """Update the moving average of the median motion in pixels, and mark a far larger newest motion as a jump."""
         usual = moved_px if self._usual_px is None else self._usual_px
         self._is_sudden = moved_px > max(SUDDEN * usual, SUDDEN_PX)
         self._usual_px = usual + USUAL_DECAY * (min(moved_px, SUDDEN * usual) - usual)

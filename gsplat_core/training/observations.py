@@ -69,7 +69,7 @@ class Observation:
         return self if self.right_eye is None or turn % 2 == 0 else self.right_eye.observation
 
     def as_frame(self) -> Frame:
-        """Return the frame as training sees it. Synchronises with the device."""
+        """Return picture, mask and pose as a frame on the host, without depth and labels. Synchronises with the device."""
         image, mask = HostCopy(self.image).numpy(), HostCopy(self.mask).numpy()
         return Frame(self.seq, round(self.time_s * 1e9), image, mask=mask, pose=self.camera.world_to_camera)
 
@@ -177,7 +177,7 @@ class ObservationWindow:
         """Replace the observation of the frame with the same number.
 
         Raises:
-            InvalidInput: if there is none.
+            InvalidInput: if the window has no frame with that number.
         """
         for index in reversed(range(len(self._frames))):
             if self._frames[index].seq == observation.seq:
@@ -226,7 +226,7 @@ class PreparedPicture(NamedTuple):
     image: NDArray[np.uint8]
     """Right picture in the left picture's colours, RGB [H, W, 3]."""
     mask: NDArray[np.uint8]
-    """Mask [H, W]; 1 = tissue."""
+    """Tissue mask of the right picture [H, W]; 1 = tissue."""
 
 
 class BothEyes:
@@ -237,11 +237,11 @@ class BothEyes:
     def __init__(self, eyes: Eyes, device: torch.device | str = "cpu") -> None:
         self._with_right, self._device = eyes == "both", device
         self._preparer: ThreadPoolExecutor | None = None
-        """Thread that prepares right pictures in order, for GPU training only."""
+        """Single-thread pool that prepares right pictures in frame order; None unless both eyes are trained on a GPU."""
         if self._with_right and torch.device(device).type == "cuda":
             self._preparer = ThreadPoolExecutor(1, thread_name_prefix="right eye")
         self.trained: Eyes = "left"
-        """Eyes with trained pictures so far."""
+        """`both` once an observation with a right eye was created, else `left`."""
         self.forget()
 
     def forget(self) -> None:
@@ -304,31 +304,37 @@ def for_eyes(gaussians: Gaussians, observation: Observation) -> Gaussians:
 
 
 LOOKED_AT_PX = 80
-"""Width in pixels of the reduced pictures that are compared."""
+"""Width in pixels of the reduced left and right pictures whose colours are compared."""
 LOOK_EVERY = 10
 """Number of frames between two comparisons of the eyes' colours."""
 FOLLOWS = 0.2
 """Weight of a new comparison of the eyes' colours in the moving average."""
 SHIFT_STAYS = 4
-"""Search range around the last shift, in pixels of the compared pictures."""
+"""Largest change of the shift between the eyes' pictures that is searched first, in pixels of the reduced pictures."""
 LEAST_OVERLAP = 0.4
 """Smallest overlap of the two eyes' views at which a shift is considered, as a share of the width."""
 QUANTILES = (10, 50, 90)
-"""Compared quantiles in per cent. Highlights and shadows, which differ between the eyes, are outside their range."""
+"""Quantiles of the eyes' colours that are matched, in per cent. Highlights and shadows, which differ between the eyes, lie
+outside of their range.
+"""
 FLAT_LEVELS = 8.0
-"""Difference of the outer quantiles in levels below which no gain is estimated for a channel."""
+"""Difference of the outer colour quantiles, in levels of 255, below which only an offset and no gain is estimated for a
+channel.
+"""
 MOST_GAIN = 2.0
 NOISE_LEVELS = 1.5
 """Largest change of a quantile in levels that counts as estimation noise; such a correction is not applied."""
 
 
 class EyeColours:
-    """Conversion of one stream's right pictures to the colours of its left ones."""
+    """Gain and offset per channel that convert a stream's right pictures to the colours of its left ones."""
 
     def __init__(self) -> None:
         self._gain, self._offset = np.ones(3), np.zeros(3)
         self._line: NDArray[np.float32] | None = None
-        """Gains and offsets as a matrix [3, 4], or None for no correction."""
+        """Colour transform [3, 4] of the right picture: gains on the diagonal, offsets in the last column. None if no
+        correction is needed.
+        """
         self._frames = 0
         self.shift: float | None = None
         """Shift of the right picture to the left, as a share of its width, at the last comparison; None before the
@@ -382,7 +388,8 @@ def _small(picture: NDArray[np.uint8]) -> NDArray[np.float32]:
 def best_shift(left: NDArray[np.float32], right: NDArray[np.float32], before: int | None = None) -> int:
     """Return the shift of the right picture [h, w] to the left in pixels that maximises the correlation.
 
-    With `before`, a recent shift, only its neighbourhood is searched unless the maximum is at its end.
+    Given an earlier shift `before`, only shifts within `SHIFT_STAYS` of it are searched. If the best of them is at the end
+    of that range, all shifts are searched.
     """
     most = int((1 - LEAST_OVERLAP) * left.shape[1])
     matches = _correlations(left, right, most)
@@ -415,7 +422,7 @@ def _correlations(left: NDArray[np.float32], right: NDArray[np.float32], most: i
 
 
 def _sums(picture: NDArray[np.float64], begins: NDArray, widths: NDArray) -> NDArray[np.float64]:
-    """Return sums over `widths` columns of a picture, starting at `begins`."""
+    """Return the sum of a picture over each of several column ranges, given by first column and width."""
     upto = np.concatenate([[0.0], picture.sum(0).cumsum()])
     return np.asarray(upto[begins + widths] - upto[begins])
 
@@ -501,7 +508,9 @@ def _seen_by_right(pixels: NDArray[np.float64], z: NDArray, camera: Camera, righ
 
 
 def _smeared(cells: NDArray[np.bool_], shifts: list[float]) -> NDArray[np.uint8]:
-    """Return the cells marked in `cells` [rows, columns], moved to the left by each of the shifts between two limits."""
+    """Return the cells that a cell marked in `cells` [rows, columns] covers while it moves to the left from the smallest to
+    the largest of the shifts.
+    """
     found = np.zeros(cells.shape, np.uint8)
     if not cells.any():
         return found

@@ -46,7 +46,7 @@ from gsplat_core.training.strategies.strategy import Plan
 from gsplat_core.transfers import tensor_of
 
 EDGE_PX = 1
-"""Margin in pixels around tools and holes where depth is not read, since tracked positions are inaccurate."""
+"""Width in pixels of the margin around tools and depth holes where depth is not read, since tracked points may be off."""
 POSITIONS_AT_ONCE = 1 << 22
 """Number of positions of trajectories that are computed at once, to limit memory."""
 FEWEST_ROWS = 64
@@ -91,7 +91,7 @@ class SurfaceTracks:
 
     def trajectories(self, points: Tensor, number: int) -> Tensor:
         """Return the positions in every frame [N, T, 3] of points [N, 3] on the surface shown by frame `number`. Without
-        depth, or with the scope at rest, points only move across the picture.
+        depth, or with depth estimated for static tissue, points only move across the picture.
         """
         if self._at_rest or not self._have_depth:
             return self._across(points, number)
@@ -331,7 +331,7 @@ def rate_at(share: float) -> float:
 
 
 SPACING_INTERVALS = 1.5
-"""Smallest temporal resolution of motion, in intervals between frames."""
+"""Finest useful temporal resolution of motion, in multiples of the median interval between frames (`least_spacing_s`)."""
 
 
 def least_spacing_s(times_s: Sequence[float]) -> float:
@@ -487,9 +487,9 @@ class OfflineTraining:
 
 
 VALIDATE_EVERY = 9
-"""Interval of validation frames among the training frames."""
+"""Every n-th training frame is kept from training as a validation frame."""
 LEAST_FRAMES = 1
-"""Smallest number of validation frames from which steps are chosen."""
+"""Smallest number of validation frames with which the number of training steps is chosen by trials."""
 FIRST_STEPS = 500
 """Training steps of the first trial. Each further trial has twice as many."""
 MOST_STEPS = 64_000
@@ -565,7 +565,7 @@ class ChosenSteps:
 
 
 def validating(count: int) -> list[int]:
-    """Return the indices of the frames that validate among `count` training frames; never the first or last one."""
+    """Return the indices of the validation frames among `count` training frames; never the first or last one."""
     return list(range(VALIDATE_EVERY // 2, count - 1, VALIDATE_EVERY))
 
 

@@ -88,7 +88,7 @@ class LateDepth:
 
 
 LARGEST_STEP = 1.4
-"""Largest change of a Gaussian's depth by one frame, as a factor."""
+"""Largest factor by which the depth map of one frame may change a Gaussian's depth, up or down."""
 SHARE = 0.5
 """Share of a correction (of log depth) that one frame applies. Several frames are thus averaged."""
 CORRECTED_PX = 16
@@ -352,11 +352,11 @@ def _has_depth(frame: Frame | None) -> bool:
 
 
 MOST_TIMES = 8
-"""Largest number of frames that a model's depth is compared with."""
+"""Largest number of frames with whose depth maps a model's depth is compared to estimate its error."""
 STEP_PX = 4
-"""Distance between compared pixels."""
+"""Distance in pixels between neighbouring pixels whose depth is compared."""
 FEWEST_PIXELS = 50
-"""Smallest number of compared pixels of a frame."""
+"""Smallest number of compared pixels with which the depth error of a frame is estimated."""
 WITHIN_ONE = 0.683
 """Share of the values of a normal distribution within one standard deviation."""
 

@@ -102,7 +102,7 @@ class Reconstructor:
         self._slots, self._version = SnapshotSlots(self.device, rows=self._fixed_rows), 0
         self._first_time_s = self._last_time_s = self._learned_s = 0.0
         self._certain: tuple[Frame, Observation] | None = None
-        """Newest observation of the scene that is not doubtful."""
+        """Newest frame that surely shows the current scene (not observed as `doubtful`), and its observation; None before."""
         self._depth_source: DepthSource | None = None
         self.depth_doubts: Mapping[str, int] = {}
         """Reasons for frames without depth in the last `fit`, each with its number of frames; for moving cameras."""
@@ -110,7 +110,7 @@ class Reconstructor:
     @property
     def gaussians(self) -> int:
         """Current number of Gaussians; 0 before the first scene."""
-        # Read once: another thread than the training one may ask, between two models too.
+        # Read the attribute once, because another thread may call this while training replaces the scene.
         step = self._step
         return 0 if step is None else step.gaussians.count
 
@@ -137,7 +137,7 @@ class Reconstructor:
 
     @property
     def _fixed_rows(self) -> int:
-        """Number of Gaussians for which memory is allocated at the start; 0 for the current number."""
+        """Number of Gaussians for which memory is allocated at the start; 0 without the setting `preallocate`."""
         return self.config.max_gaussians if self.config.preallocate else 0
 
     @property
@@ -420,7 +420,7 @@ class Reconstructor:
         return self.snapshot() if isinstance(shown.field, NewestState) else shown
 
     def _facts(self) -> dict[str, Any]:
-        """Return the metadata of a model or snapshot."""
+        """Return the fields common to a model and a snapshot of the current state, such as version, camera and times."""
         unseen_s = None if self._growth is None else self._growth.unseen_s(self.gaussians)
         assert self._step is not None
         known = dict(

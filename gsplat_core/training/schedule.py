@@ -119,7 +119,7 @@ class Spending:
         """True if the step just allowed is the last one."""
         self._started_s = budget.clock() if budget.is_timed else 0.0
         self._first: tuple[int, float] | None = None
-        """Number of finished queued steps at the first observation, and its time."""
+        """Number of finished steps when the first one was found finished, and the clock's time then; None before."""
         self.made = 0
         """Number of steps made or queued so far."""
 
@@ -173,7 +173,7 @@ class Spending:
         self._look()
 
     def planned(self) -> int:
-        """Return the number of remaining steps, at least 1: exact for a step budget, estimated for a deadline."""
+        """Return the number of optimiser steps still to be made, at least 1; estimated if the budget is a deadline."""
         budget = self._budget
         if budget.steps is not None:
             return max(1, budget.steps - self.made)
@@ -430,7 +430,7 @@ class WindowSchedule(Schedule):
         return ObserveReport(observation.seq, made, HostCopy(loss), step.gaussians.count, spending.ending)
 
     def forget(self) -> None:
-        """Forget the usual loss of a new frame, for another scene."""
+        """Forget the moving average of the loss before the first step on a frame, for another scene."""
         self._usual_first_loss = math.inf
 
     def _is_jump(self, first_loss: HostCopy | None, first: bool) -> bool:

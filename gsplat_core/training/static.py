@@ -30,9 +30,11 @@ from gsplat_core.training.strategies.mcmc import MCMCStrategy
 LEAST_POINTS = 4
 """Minimum number of points, so that each has three neighbours, from whose distance its scale follows."""
 MOST_LOCATED = 10_000
-"""Largest number of points that are projected to check that an image shows one; of more, every k-th is."""
+"""Largest number of points that are projected to check that some image shows a point. Of a larger set, only every k-th point
+is projected.
+"""
 SCENE_MARGIN = 1.1
-"""Factor from the largest distance of a camera from their mean to the extent of a scene (gsplat's `scene_scale`)."""
+"""Ratio of a scene's extent (gsplat's `scene_scale`) to the largest distance of a camera from the cameras' mean position."""
 
 
 @dataclass(frozen=True)
@@ -224,13 +226,13 @@ EPSILON = 1e-15
 NEIGHBOURS = 3
 """Number of neighbours whose root mean squared distance, times `Start.scale`, is the initial scale of a Gaussian."""
 LEAST_SCALE = 1e-7
-"""Minimum initial scale, for points that coincide."""
+"""Minimum initial scale of a Gaussian in training coordinates, for points that coincide."""
 NEAR_PLANE = 0.01
 
 
 @dataclass(frozen=True)
 class Start:
-    """Initial values and regularisation that suit a strategy."""
+    """Initial scale and opacity of the Gaussians, and weights of the regularisers, that suit a densification strategy."""
 
     opacity: float = 0.1
     scale: float = 1.0
@@ -301,7 +303,7 @@ class StaticConfig:
         if self.strategy == "adc":
             stop, reset = self.shortened(15_000), max(self.shortened(3000), RESETS_AT_LEAST * every)
             if 2 * reset > stop:
-                reset = self.steps  # too short a training to recover from a reset
+                reset = self.steps  # no reset within the training, which is too short to recover from one
             if self.absgrad:
                 schedule["grow_grad2d"] = ABSGRAD_THRESHOLD
             return DefaultStrategy(

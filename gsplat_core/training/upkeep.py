@@ -52,7 +52,7 @@ THINNEST_PX = 0.2
 WIDEST = 8.0
 """Largest size, in multiples of the default size."""
 MOST_SPLIT = 0.02
-"""Share of the Gaussians split in one round."""
+"""Largest share of the Gaussians that are split in one round."""
 SURFACE_STEPS = 100_000
 """Time constant in steps with which depths relax to those of the Gaussians around. It is long, because training also
 learns the order along a line of sight.
@@ -62,8 +62,8 @@ SURFACE_CELL = 2.0
 SURFACE_REACH = 2
 """Number of neighbouring cells on each side whose Gaussians count in the mean depth around a cell."""
 IDLE = 1e-3
-"""Ratio of a Gaussian's mean squared gradient to the scene's mean below which it counts as idle. It
-is reached after about 7,000 steps without visibility.
+"""Ratio of a Gaussian's mean squared opacity gradient to the mean over all Gaussians, below which the Gaussian counts as idle.
+The ratio falls below it after about 7,000 steps without visibility.
 """
 
 
@@ -76,9 +76,9 @@ class Seen:
     pixels: Tensor
     """Pixel positions of the Gaussians' centres, [N, 2]."""
     inside: Tensor
-    """Marks of centres in the picture, bool [N]."""
+    """True for Gaussians whose centre is in the picture, bool [N]."""
     shown: Tensor
-    """Marks of centres in the picture and on tissue, bool [N]."""
+    """True for Gaussians whose centre is in the picture and on tissue, bool [N]."""
 
 
 class Upkeep:
@@ -266,7 +266,7 @@ class PostponedGrowth:
 
 
 def _repeated(cells: Tensor, counted: Tensor) -> Tensor:
-    """Mark the `counted` elements whose integer cell [N, 2] occurs earlier, bool [N]."""
+    """Mark elements whose integer cell [N, 2] an earlier element has, too, bool [N]. Only `counted` elements take part."""
     count = len(cells)
     number = cells[:, 1].double() * 2**20 + cells[:, 0].double()
     # Give every element that is not counted a cell of its own, so that it repeats none.
@@ -284,7 +284,7 @@ RENDERED_PX = 160
 COMPARED_PX = 64
 """Width at which pictures are compared, in pixels; small enough to tolerate motion of a few pixels."""
 SAMPLES = 4
-"""Number of rows and columns of a frame that are averaged for a row and a column of a compared picture."""
+"""Number of samples of a frame, along each axis, that are averaged for one pixel of a compared picture."""
 FINE_PX, COARSE_PX = 1.0, 16.0
 """Standard deviations, in pixels of the compared pictures, of the band-pass filter that removes noise and illumination.
 """
@@ -425,7 +425,9 @@ def _shown(frame: Frame) -> Structure:
     for mask in (frame.mask, frame.loss_mask):
         if mask is not None:
             some = cv2.resize(mask, samples, interpolation=cv2.INTER_NEAREST) > 0
-            known &= averaged(some.view(np.uint8) * np.uint8(255), size, SAMPLES) >= 128  # half of the samples
+            known &= (
+                averaged(some.view(np.uint8) * np.uint8(255), size, SAMPLES) >= 128
+            )  # set in half of the samples or more
     return Structure.of(averaged(frame.image, size, SAMPLES).astype(np.float32) / np.float32(255), known)
 
 
@@ -443,7 +445,7 @@ class LeftScenes:
         """
         self._kept: TrainingStep | None = None
         self._kept_size: tuple[int, int] | None = None
-        """Picture size (height, width) of the newest scene."""
+        """Picture size (height, width) of the scene whose memory is kept for the next scene."""
 
     def forget(self) -> None:
         """Discard all earlier scenes."""

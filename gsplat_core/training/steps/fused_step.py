@@ -157,7 +157,7 @@ class FusedStep:
         self._totals = torch.zeros(4, dtype=torch.int32, device=device)
         """Accumulated frame status since the last `settle` (see `accumulate_status_`)."""
         self._unread: tuple[Tensor, Tensor] | None = None
-        """Scratch moments of positions that are updated after the backward pass."""
+        """Dummy Adam moments of the positions for the fused backward pass, if the positions are updated after it."""
         self._status = FrameStatusCopy()
         self._memory = GraphMemory(device)
         self._capacity = capacity_for(4 * gaussians.count)
@@ -209,7 +209,7 @@ class FusedStep:
             self._warm.add(kind)
             return self._sequence()
         if self._was_replaced():
-            self._captured.clear()  # frees their memory for the next captures
+            self._captured.clear()  # frees the graphs' memory for the next captures
         if kind not in self._captured:
             self._captured[kind] = CapturedSequence(self._sequence, self._step.device, self._memory, warm_up=False)
         return self._captured[kind].replay().clone()

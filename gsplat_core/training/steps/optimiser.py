@@ -62,7 +62,7 @@ class FusedAdam:
 
     @property
     def skipped(self) -> int:
-        """Number of rows (or elements) skipped so far because of non-finite gradients. Synchronises on CUDA."""
+        """Number of tensor rows (or elements) not updated so far because of non-finite gradients. Synchronises on CUDA."""
         return int(self._skipped)
 
     def _checked_rates(self, learning_rates: Mapping[str, float]) -> dict[str, float]:
@@ -226,7 +226,7 @@ def _zeros(tensor: Tensor) -> Tensor:
 
 
 NO_BIAS_CORRECTION = 1 << 40
-"""Step number at which Adam's corrections of the first steps have ended."""
+"""Step number so large that Adam's bias correction has no effect."""
 
 
 class SelectiveAdam(torch.optim.Adam):

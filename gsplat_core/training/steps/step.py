@@ -131,7 +131,7 @@ class PictureTraining:
 
 
 APART = 0.5
-"""Distance of the halves from their parent's centre, in its standard deviations along its longest axis."""
+"""Distance of the two halves of a split Gaussian from its centre, in its standard deviations along its longest axis."""
 
 
 def halves(parents: Gaussians) -> tuple[Gaussians, Gaussians]:
@@ -190,7 +190,7 @@ class TrainingStep:
         strategy = STRATEGIES[config.strategy]
         self._losses = WeightedLosses({**strategy.losses, **loss_weights(config.losses)})
         self._pictures: PictureTraining | None = None
-        """Training by another renderer than alpha blending."""
+        """Training by another renderer than alpha blending; None if alpha blending trains the scene."""
         if config.renderer != "alpha" and RENDERERS[config.renderer].capabilities.differentiable:
             self._pictures = PictureTraining(config.renderer, self.distance(camera), gaussians.device)
         gaussians = self._extended(gaussians)
@@ -374,7 +374,7 @@ class TrainingStep:
                 self._captured_step(self._captured, observation, rate_scale)
 
     def at(self, time_s: float) -> Gaussians:
-        """Return the current scene at a time."""
+        """Return the Gaussians deformed to a time in seconds, without gradients."""
         with torch.no_grad():
             deformed: Gaussians = self.field(self.gaussians, time_s)
         return deformed
@@ -384,7 +384,7 @@ class TrainingStep:
         return _seen_by(self.at(observation.time_s), observation)
 
     def copy(self) -> tuple[Gaussians, DeformationField]:
-        """Return copies of Gaussians and field without training state."""
+        """Return copies of the Gaussians and the deformation field, without Adam's moments."""
         return self.gaussians.detach().clone(), self.field.detached_copy()
 
     def append(self, added: Gaussians, parents: Tensor | None = None) -> None:
@@ -522,7 +522,7 @@ class TrainingStep:
 
     def _captured_step(self, captured: FusedStep, observation: Observation, rate_scale: float) -> Tensor:
         if rate_scale != self._scaled_for:
-            # Online the scale is always 1, so it is computed once.
+            # In a stream the factor of the learning rates stays 1, so the scaled rates are computed once.
             self._scaled_for = rate_scale
             self._scaled_rates = (
                 self._gaussian_rates(rate_scale),

@@ -217,7 +217,7 @@ def birth_death(step: TrainingStep, shares: Shares, count: int) -> None:
 
 
 def _first(waiting: Tensor, most: int) -> Tensor:
-    """Mark the `most` smallest of the values [N]; returns bool [N]."""
+    """Mark the `most` smallest of the waiting times [N], bool [N]."""
     marks = torch.zeros(len(waiting), dtype=torch.bool)
     marks[waiting.argsort(stable=True)[:most]] = True
     return marks

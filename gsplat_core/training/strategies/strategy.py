@@ -63,7 +63,7 @@ class InvalidParameters(InvalidInput, AssertionError):
 
 @dataclass
 class Strategy:
-    """Callbacks around the backward pass; this base changes nothing."""
+    """Base class of strategies: callbacks before and after the backward pass, which do nothing unless overridden."""
 
     REQUIRED: ClassVar[tuple[str, ...]] = ()
     """Names that `params` must have."""
@@ -163,9 +163,9 @@ def compute_relocation(opacities: Tensor, scales: Tensor, ratios: Tensor, binoms
 State = MutableMapping[str, Any]
 """Statistics of a strategy by name."""
 SHRINK = 1.6
-"""Factor by which the samples of a split Gaussian shrink (Kerbl et al. 2023, section 5.2)."""
+"""Factor by which the scales of the two Gaussians that replace a split one are divided (Kerbl et al. 2023, section 5.2)."""
 LARGEST_MULTINOMIAL = 1 << 24
-"""Largest number of categories of `torch.multinomial`."""
+"""Largest number of weights from which `torch.multinomial` can draw."""
 
 
 @torch.no_grad()
@@ -417,7 +417,9 @@ def draw(weights: Tensor, count: int, generator: torch.Generator | None = None) 
 
 
 def _append(params: Params, optimizers: Optimizers, parents: Tensor, copies: Callable[[str, Tensor], Tensor]) -> None:
-    """Append a row for each of `parents`, made by `copies` of a name and its tensor, with zero moments."""
+    """Append a row for each of `parents` to every tensor, with zero moments. `copies` returns the new rows of a tensor from
+    its name and present values.
+    """
 
     def moments(_: str, values: Tensor) -> Tensor:
         return torch.cat([values, values.new_zeros(len(parents), *values.shape[1:])])
@@ -431,7 +433,10 @@ def _append(params: Params, optimizers: Optimizers, parents: Tensor, copies: Cal
 
 
 def _shared(params: Params, places: Tensor, binoms: Tensor, min_opacity: float) -> dict[str, Tensor]:
-    """Return logits and log-scales at `places` after each has been copied as often as it was drawn, by parameter name."""
+    """Return the opacity logits and log-scales that the Gaussians at `places` share with their copies, by parameter name.
+
+    A Gaussian is copied as often as its index occurs in `places`.
+    """
     opacities, scales = compute_relocation(
         params["opacities"][places].sigmoid(),
         params["scales"][places].exp(),
@@ -443,7 +448,7 @@ def _shared(params: Params, places: Tensor, binoms: Tensor, min_opacity: float) 
 
 
 def _divided(params: Params, mask: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the rows in `mask` and the others.
+    """Return the indices of the Gaussians in `mask`, and those of all other Gaussians, int64 each.
 
     Raises:
         InvalidParameters: if `mask` is not a bool with one value per Gaussian.
@@ -467,7 +472,7 @@ def _rows_of(state: State) -> list[tuple[str, Tensor]]:
 
 @dataclass(frozen=True)
 class Plan:
-    """An offline training that is about to begin."""
+    """Scene, data and limits of an offline training, from which a strategy is created before the first step."""
 
     step: TrainingStep
     """Scene that the strategy changes, with its optimiser."""
@@ -518,9 +523,11 @@ def every_of(steps: int) -> int:
 
 
 NAMES = {"log_scales": "scales", "logit_opacities": "opacities"}
-"""gsplat's names of tensors that `Gaussians` names otherwise."""
+"""Names of tensors in gsplat by their names in `Gaussians`, where the two differ."""
 SOURCE = "source row"
-"""Name of the parameter from which the adapter reads where each row comes from."""
+"""Name of an auxiliary parameter of former row numbers. After a strategy's changes it tells from which Gaussian each row was
+copied.
+"""
 
 
 def views_of(step: TrainingStep) -> dict[str, Parameter]:
