@@ -219,11 +219,11 @@ class Pairs(NamedTuple):
     gaussians: int
 
     def ids_of(self, rows: PackedProjection) -> Tensor:
-        """Return the ids of the rows, int64 [rows], ascending."""
+        """Return the id of the pair of camera and Gaussian in each packed row, int64 [rows], ascending."""
         return (rows.batch_ids * self.cameras + rows.camera_ids) * self.gaussians + rows.gaussian_ids
 
     def gaussians_of(self, ids: Tensor) -> Tensor:
-        """Return the index of each row into the Gaussians of all batches, int64 [rows]."""
+        """Return for each pair id the index of its Gaussian among the Gaussians of all batches, int64 [rows]."""
         if self.cameras == 1:
             return ids
         gaussian = ids % self.gaussians
@@ -375,7 +375,7 @@ def check_surfel_arguments(
 
 
 def pack_surfels(dense: DenseSurfels) -> PackedSurfels:
-    """Keep only the rows that are not culled."""
+    """Return the packed projection: one row for each pair of camera and surfel that is not culled."""
     n_cameras, n_surfels = dense.radii.shape[-3:-1]
     rows = dense.radii.detach().reshape(-1, 2)[:, 0].nonzero().squeeze(-1)
     images = torch.div(rows, max(n_surfels, 1), rounding_mode="floor")

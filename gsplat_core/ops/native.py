@@ -90,7 +90,10 @@ CUDA_MISSING = load_cuda()
 
 
 class _Unfollowed(Function):
-    """Gradients that are part of a graph, so that differentiating them fails instead of giving zero."""
+    """Identity on the gradients of a compiled operation, whose own derivative raises NotImplementedError.
+
+    Without it, torch would take second derivatives of compiled operations for zero.
+    """
 
     @staticmethod
     def forward(ctx: Any, anchor: Tensor, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:

@@ -17,12 +17,14 @@ from gsplat_core.ops.arguments import FOV_MARGIN, require_same_kind, require_sha
 from gsplat_core.scene.gaussians import COLOUR, LOG_SCALE, OPACITY, POSITION, RAW_COLUMNS, ROTATION, width_of
 
 BASIS_GROUPS = (POSITION, ROTATION, LOG_SCALE, COLOUR)
-"""Deformed parameters: the first `BASIS_CHANNELS` columns of the raw row."""
+"""Columns, by parameter, of the raw parameters [N, 16] that a basis field changes: the first `BASIS_CHANNELS` ones."""
 BASIS_CHANNELS = width_of(*BASIS_GROUPS)
 BUMP_REACH = 4.0
 """Truncation radius of a bump in widths; its height there is exp(-16) = 1e-7."""
 LEAST_SQUARED_HEIGHTS = 1e-2
-"""Minimum sum of squared bump heights at a time. Below it, weights would become huge."""
+"""Sum of a Gaussian's squared bump heights at a time, below which its deltas at that time are not changed, because the change
+of weights would be huge.
+"""
 
 
 def basis_field(
@@ -160,9 +162,9 @@ def basis_field_add_colours_(
 
 
 HEAD_GROUPS = (POSITION, LOG_SCALE, ROTATION, OPACITY)
-"""Output order of the field's network, with log-scales before rotation as in G-SHARP."""
+"""Parameters in the output order of the HexPlane network, with log-scales before rotation as in G-SHARP."""
 HEAD_COLUMNS = tuple(column for group in HEAD_GROUPS for column in range(group.start, group.stop))
-"""Raw column of each output of the network."""
+"""Column of the raw parameters [N, 16] to which each output of the HexPlane network is added."""
 
 
 def sample_plane(plane: Tensor, u: Tensor, v: Tensor) -> Tensor:

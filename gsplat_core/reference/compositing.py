@@ -187,7 +187,7 @@ def _part_sizes(length: int) -> list[int]:
 
 
 NEAREST = 1e-6
-"""Depth z in the second camera up to which a moved point is left out."""
+"""Depth z in the second camera's axes up to which a moved point counts as behind that camera and is left out."""
 
 
 def blend_flow(

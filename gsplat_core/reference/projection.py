@@ -189,9 +189,9 @@ def _blurred(covars2d: Tensor, eps2d: float, compensation_floor: float) -> _Elli
 
 @torch.no_grad()
 def _half_sizes(ellipses: _Ellipses, opacities: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Return half width and height in pixels [..., C, N, 2] of the box where alpha reaches 1/255.
+    """Return half width and height in pixels [..., C, N, 2] of the bounding box of the pixels where alpha is at least 1/255.
 
-    Also returns a mask of Gaussians that reach it at all.
+    Also returns a mask [..., C, N] of the Gaussians whose alpha reaches 1/255 anywhere.
     """
     extent = torch.full_like(ellipses.compensations, MAX_EXTENT_SIGMAS)
     visible = torch.ones_like(ellipses.positive)
@@ -203,7 +203,7 @@ def _half_sizes(ellipses: _Ellipses, opacities: Tensor | None) -> tuple[Tensor, 
 
 
 def pack(dense: DenseProjection) -> PackedProjection:
-    """Keep only the rows that are not culled."""
+    """Return the packed projection: one row for each pair of camera and Gaussian that is not culled."""
     n_cameras, n_gaussians = dense.radii.shape[-3:-1]
     rows = dense.radii.detach().reshape(-1, 2)[:, 0].nonzero().squeeze(-1)
     images = torch.div(rows, max(n_gaussians, 1), rounding_mode="floor")

@@ -259,7 +259,7 @@ class _Tiles:
 
 
 class _State(NamedTuple):
-    """Sums of the blended surfels over a tile's pixels, [P, 1] unless stated."""
+    """State of front-to-back blending at each of a tile's P pixels, after some of the surfels; [P, 1] unless stated."""
 
     product: Tensor
     """Transmittance ignoring early termination."""
@@ -273,7 +273,7 @@ class _State(NamedTuple):
 
 
 def _parts(count: int) -> list[int]:
-    """Return the sizes of the parts of a list: few surfels first, because those behind opaque ones are skipped."""
+    """Return the sizes of the parts in which a tile's list is blended: few surfels first, because blending may end early."""
     starts = [start for start in (0, 64, 192) if start < count] + list(range(448, count, SURFELS_AT_A_TIME))
     return [end - start for start, end in itertools.pairwise([*starts, count])]
 

@@ -155,7 +155,7 @@ def ssim_map(image: Tensor, target: Tensor) -> Tensor:
 
 
 STEEP_AS_L1 = 0.01
-"""Difference at which the squared error has the slope of L1."""
+"""Colour difference, for values in 0..1, at which the scaled squared error has the same slope as L1."""
 
 
 def _mean_where(values: Tensor, keep: Tensor) -> Tensor:

@@ -1,1 +1,3 @@
-"""Rendering of Gaussians to pictures."""
+"""Renderers of Gaussians, by alpha blending and by other methods: pictures, depth, normals and optical flow. Also the
+rendering functions with gsplat's arguments.
+"""

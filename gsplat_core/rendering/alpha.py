@@ -107,7 +107,9 @@ class AlphaRenderer:
         self._frames: FrameRenderer | None = None
         """CUDA-graph renderer of the prepared model; None if the model is rendered by separate kernel launches."""
         self._by_slot: dict[int, tuple[tuple[int, int], FrameRenderer]] = {}
-        """Graph renderer by slot number, with the slot and layout for which it was captured."""
+        """CUDA-graph renderers by slot number, each with the slot's id and the generation of its tensors for which it was
+        captured.
+        """
 
     def prepare(self, model: Model | Snapshot) -> None:
         """Set the model of the following frames; see `Renderer.prepare`. Raises InvalidInput for a model on another
@@ -179,7 +181,7 @@ class AlphaRenderer:
 
 @dataclass(frozen=True)
 class _FrameInFlight:
-    """Launched frame; keeps the model alive so that its slot is not reused before completion."""
+    """Frame that was launched on a GPU. It keeps the model alive, so that its slot is not reused before the frame is complete."""
 
     _model: Model | Snapshot
     _launched: LaunchedFrame
@@ -199,7 +201,7 @@ class _FrameInFlight:
 def _with_further(
     model: Model, camera: Camera, time_s: float, background: Tensor | None, asked: tuple[str, ...]
 ) -> dict[str, Tensor]:
-    """Render outputs by separate kernel launches, also on a GPU. Too slow for live frames."""
+    """Render a frame with outputs beyond picture, opacity and depth by separate kernel launches; too slow for live frames."""
     outputs: dict[str, Tensor] = model.render(time_s, camera, background)._asdict()
     if {*asked} & {*SURFACE_OUTPUTS}:
         outputs = {**model.surface(time_s, camera)._asdict(), **outputs}
@@ -303,9 +305,9 @@ def _capture(
 
 
 CAPACITY_STEP = 1 << 16
-"""Granularity of the capacity of a buffer shared by all tiles, in instances (pairs of splat and tile)."""
+"""Number of instances (pairs of splat and tile) to a multiple of which the capacity of a buffer for all tiles is rounded up."""
 TILE_STEP = 32
-"""Granularity of the capacity of each tile's own buffer, in instances (pairs of splat and tile)."""
+"""Number of instances (pairs of splat and tile) to a multiple of which the capacity of each tile's own segment is rounded up."""
 HEADROOM = 1.25
 """Capacity relative to a frame's need, so that a moving scene seldom exceeds it."""
 

@@ -74,7 +74,8 @@ def render_flow(
         gaussians_2: the same Gaussians at the second time, in the same order.
         camera_1: pinhole camera of the result.
         camera_2: pinhole camera at the second time.
-        mode: map by which a splat carries its surroundings.
+        mode: map from the surface around a splat at the first time to the second: affine motion of the neighbouring splats,
+            or `gaussianflow` between screen ellipses.
         neighbours: indices int64 [N, K] of the splats around each splat; None to search them (`nearest_splats`), which
             synchronises with the device.
 
@@ -183,7 +184,7 @@ def sampled(planes: Tensor, pixels: Tensor) -> Tensor:
 
 
 def projected(gaussians: Gaussians, camera: Camera) -> DenseProjection:
-    """Project Gaussians to one camera: columns [N, ...]."""
+    """Return the projection of Gaussians to one camera, with tensors [N, ...] that have no camera dimension."""
     viewmat, intrinsics = camera.matrices(gaussians.device, gaussians.dtype)
     dense = fully_fused_projection(
         gaussians.means, None, gaussians.quats, gaussians.scales, viewmat[None], intrinsics[None], camera.width_px,
@@ -262,7 +263,7 @@ def _screen_planes(first: DenseProjection, second: DenseProjection, camera_1: Ca
 
 
 def _square_root(triangles: Tensor) -> Tensor:
-    """Return the symmetric roots [N, 2, 2] of positive definite matrices given as upper triangles [N, 3]."""
+    """Return the symmetric square roots [N, 2, 2] of positive definite matrices given as upper triangles [N, 3]."""
     xx, xy, yy = triangles.unbind(1)
     root = (xx * yy - xy * xy).clamp(min=1e-20).sqrt()
     scale = (xx + yy + 2 * root).sqrt()

@@ -104,13 +104,14 @@ class RenderedSplats(NamedTuple):
     nearness: Tensor
     """Values [rows] by which the splats of a tile are sorted: z, or distance from the camera."""
     rest: tuple[Tensor, ...]
-    """Values returned by `rasterize_to_pixels` after image and alphas."""
+    """Further results of `StepOperations.rasterize_to_pixels`, after image and alphas."""
 
 
 Projection = DenseProjection | PackedProjection
 Coloring = Callable[[Any], tuple[Tensor, Projection]]
-"""Function that returns the colours of a projection, [..., C, N, D] or [rows, D], and the projection without Gaussians
-it culls."""
+"""Function from a projection to the colours [..., C, N, D] or [rows, D] of its splats, and to the projection without the
+splats whose colours are not finite.
+"""
 
 
 class ColoredSplats(NamedTuple):
@@ -123,7 +124,9 @@ class ColoredSplats(NamedTuple):
 
 
 Recoloring = Callable[[ColoredSplats, Tensor, Tensor], Tensor]
-"""Function that returns other channels of splats, given their `isect_offsets` and `flatten_ids`."""
+"""Function that returns the channels to blend in place of those of the given splats, whose tile lists are `isect_offsets` and
+`flatten_ids`.
+"""
 
 
 def render_splats(
@@ -380,15 +383,15 @@ def camera_centers(viewmats: Tensor) -> Tensor:
 
 
 Meta = dict[str, Any]
-"""Intermediate results under gsplat's names."""
+"""Third result of `rasterization`: intermediate results under gsplat's names."""
 
 
 MOST_CHECKED_CALLS = 256
-"""Number of signatures whose checks are remembered. While Gaussians are added or removed, their number changes."""
+"""Largest number of call signatures whose checks are remembered. Each number of Gaussians has another signature."""
 
 
 class CheckedCall(NamedTuple):
-    """Result of the checks of a call."""
+    """Result of checking the arguments of a call of `rasterization`; reused for later calls of the same signature."""
 
     settings: RenderSettings
     native: SingleCall | None
@@ -402,7 +405,7 @@ class Operations(StepOperations):
     single_call: Callable[[Arguments, RenderSettings], SingleCall | None] | None = None
     """Function that returns a native call for the whole pipeline, or None for unsupported arguments."""
     checked: dict[Hashable, CheckedCall] = field(init=False, default_factory=dict, compare=False, repr=False)
-    """Calls that passed the checks, by `signature_of`."""
+    """Results of the checks of earlier calls of `rasterization`, by the key that `signature_of` returns."""
 
     def rasterization(
         self,
@@ -599,7 +602,7 @@ def _named_as_in_gsplat(out: Rasterized, arguments: Arguments, settings: RenderS
 
 
 class Stepped(NamedTuple):
-    """Pictures of one call, and the splats blended in them."""
+    """Pictures of one call by the chain of operations, and the splats blended in them."""
 
     image: Tensor
     """Colours and depth [..., C, H, W, X]."""

@@ -298,7 +298,9 @@ def _wrong_names(positional: int, named: Collection[str]) -> str | None:
 INSTANCES_PER_GAUSSIAN = 8
 """Initial capacity of the tile lists per Gaussian; larger frames are rendered again."""
 SMALLEST_SCENE = 1 << 14
-"""Minimum number of Gaussians for the capacity, because few large ones may touch every tile."""
+"""Number of Gaussians assumed for the initial tile-list capacity of smaller scenes, whose few large Gaussians may touch every
+tile.
+"""
 
 
 class RenderOutput(NamedTuple):

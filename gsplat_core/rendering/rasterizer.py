@@ -107,7 +107,7 @@ class Rasterizer:
 
     @property
     def capacity(self) -> TileListCapacity | None:
-        """Workspace of the CUDA graph; None before the first picture from a graph."""
+        """Capacity of the CUDA graph's tile lists; the initial one, or None for an estimate, before the first graph."""
         return self._capacity if self._captured is None else self._captured[1].capacity
 
     def __call__(self, gaussians: Gaussians, camera: Camera) -> RasterizedPicture:

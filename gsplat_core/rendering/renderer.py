@@ -170,7 +170,9 @@ class TrainableRenderer(RendererKind, Protocol):
 
     @property
     def rates(self) -> Mapping[str, float]:
-        """Learning rates of the renderer's tensors in `Gaussians.extra`, and of the logarithms of the scene's values."""
+        """Learning rates, by name, of the renderer's tensors in `Gaussians.extra` and of the logarithms of its scene-wide
+        scalars (`first_values`).
+        """
 
     def extended(self, gaussians: Gaussians) -> Gaussians:
         """Return the Gaussians with the renderer's tensors in `extra`; present ones are unchanged."""
@@ -274,7 +276,7 @@ def check_camera(wanted: Camera, camera: Camera) -> None:
 
 
 def check_background(background: Tensor | None) -> None:
-    """Raise InvalidInput unless the background is one colour."""
+    """Raise InvalidInput unless the background is None or one colour [3]."""
     if background is not None:
         require_shape("background", background, (3,), "[3]")
 

@@ -254,7 +254,7 @@ REFUSED: dict[str, str] = {
         " fisheye"
     ),
 }
-"""Advice for each unsupported argument of gsplat."""
+"""Advice that ends the error message about an unsupported argument of gsplat, by argument; "leave it out" for others."""
 
 
 def refuse_unsupported(**arguments: Any) -> None:

@@ -44,7 +44,7 @@ from gsplat_core.scene.gaussians import Gaussians
 
 ALPHA_CUTOFF = 1.0 / 255.0
 ROWS_AT_ONCE = 1 << 20
-"""Rows per step, which limits temporary memory."""
+"""Number of Gaussians processed at once, which limits temporary memory."""
 
 
 def raw_splats(gaussians: Gaussians) -> SplatScene:
@@ -147,7 +147,9 @@ def _steps(count: int) -> list[slice]:
 
 
 def _steps_of(values: Tensor, most: Tensor | int, ranges: Tensor, offset: int) -> Tensor:
-    """Quantise columns [n, 3] to 0..most; write their minima and steps to `ranges`."""
+    """Quantise each column of `values` [n, 3] to whole numbers 0..most, returned as int64. Write the columns' minima and step
+    sizes to `ranges` from `offset` on.
+    """
     low, high = values.amin(0), values.amax(0)
     step = (high - low).clamp_min(1e-12) / most
     ranges[offset : offset + 3], ranges[offset + 3 : offset + 6] = low, step
@@ -155,7 +157,7 @@ def _steps_of(values: Tensor, most: Tensor | int, ranges: Tensor, offset: int) -
 
 
 def _rotation_words(quats: Tensor) -> Tensor:
-    """Return the index of the largest component and the other three in 10 bits each, int64 [n]."""
+    """Pack each quaternion into 32 bits: 2 for the index of its largest component, 10 for each other one, int64 [n]."""
     unit = torch.nn.functional.normalize(quats, dim=-1)
     largest = unit.abs().argmax(-1, keepdim=True)
     unit = unit * unit.gather(-1, largest).sign()
@@ -166,13 +168,13 @@ def _rotation_words(quats: Tensor) -> Tensor:
 
 
 def _to_brightness(colours: Tensor) -> Tensor:
-    """Return (green - red) / 2, the mean, and blue / 2 - (red + green) / 4 of colours [n, 3]."""
+    """Return (green - red) / 2, (red + green + blue) / 3, and blue / 2 - (red + green) / 4 of colours [n, 3]."""
     red, green, blue = colours.unbind(-1)
     return torch.stack([(green - red) / 2, colours.mean(-1), blue / 2 - (red + green) / 4], -1)
 
 
 def _from_brightness(values: Tensor) -> Tensor:
-    """Invert `_to_brightness`."""
+    """Return the RGB colours [n, 3] from which `_to_brightness` computed `values`."""
     grey = values[:, 1] - values[:, 2] * (2 / 3)
     return torch.stack([grey - values[:, 0], grey + values[:, 0], values[:, 1] + values[:, 2] * (4 / 3)], -1)
 
@@ -249,9 +251,9 @@ class SampledRenderer:
         self._scene: SplatScene | None = None
         """Splats of a model that does not move, in the chosen storage."""
         self._sums: Tensor | None = None
-        """Sums of the samples so far, for progressive frames."""
+        """Sums [H, W, 5] of the samples of the picture so far; see `sample_splats`. Progressive frames continue them."""
         self._drawn = 0
-        """Number of samples in the sums."""
+        """Number of samples per sub-pixel in `_sums`."""
         self._shown: tuple[Model, Camera, float] | None = None
 
     @property

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from gsplat_core.ops.ray_blending import BlendedRays
 
 COVERED = 0.1
-"""Minimum opacity of an observed pixel."""
+"""Minimum accumulated opacity at which a pixel counts as observed."""
 HALVED_AFTER_S = 5.0
 """Time in seconds after which the confidence in unseen tissue is 1/2; it is 1/3 after twice that."""
 SEMANTICS = "semantics"

@@ -46,7 +46,7 @@ ROWS_AT_ONCE = 1 << 22
 LEAST_TOTAL = 1e-2
 """Lower limit of the sum of all weights at a pixel. Opacities may be negative, and so may their sum."""
 LEAST_SHARE = 1e-4
-"""Smallest sum of the splats' weights at a pixel with a depth."""
+"""Smallest sum of the splats' weights at which a pixel has a depth; below it the depth is unknown (0)."""
 
 
 class WeightedSumRenderer:
@@ -65,7 +65,9 @@ class WeightedSumRenderer:
         deterministic=True,
     )
     rates: ClassVar[Mapping[str, float]] = {OPACITY: 1e-2, FACTOR: 1e-2, "sigma": 5e-3, "background": 1e-2}
-    """Learning rates of the tensors in `Gaussians.extra`, and of the logarithms of the scene's values; 0 for others."""
+    """Learning rates, by name, of the tensors in `Gaussians.extra` and of the logarithms of the scene-wide scalars; values
+    without an entry are not trained.
+    """
 
     def __init__(
         self, camera: Camera, device: torch.device, *, precision: Precision = "fp32", background: Tensor | None = None

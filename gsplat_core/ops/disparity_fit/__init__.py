@@ -1,4 +1,4 @@
-"""Sub-pixel refinement of matched disparities along the row (Lucas and Kanade 1981), as one op."""
+"""Sub-pixel refinement of stereo disparities along the image row (Lucas and Kanade 1981), as one op."""
 
 from __future__ import annotations
 

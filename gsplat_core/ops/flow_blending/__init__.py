@@ -1,4 +1,6 @@
-"""Blended optical flow of splats that carry the surface from one camera to another, with gradients."""
+"""Optical flow blended from splats that carry surface points from one camera to another by affine maps, with gradients of the
+maps.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,7 @@ from gsplat_core.ops.splat_rays import RAY_NUMBERS
 from gsplat_core.scene.cameras import Camera
 
 PLANE_NUMBERS = 12
-"""Values of a splat that move a point on a ray: the vector a, then the rows of the matrix B."""
+"""Number of values of a splat's map p -> a + B p from the first camera's axes to those of the second: a, then the rows of B."""
 
 
 def blend_flow(

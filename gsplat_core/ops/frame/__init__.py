@@ -67,7 +67,7 @@ class Frame(NamedTuple):
     alphas: Tensor
     """Accumulated opacity [H, W]."""
     last: Tensor
-    """Index in `sorted` of the last blended instance, int32 [H, W]; -1 for none. Empty unless training."""
+    """Index in `sorted` of the last instance blended in each pixel, int32 [H, W]; -1 for none. Empty unless training."""
     records: Tensor
     """Projected splats [N, 12] in the kernels' format; rows of culled Gaussians are undefined.
 
@@ -81,9 +81,9 @@ class Frame(NamedTuple):
     overflowed.
     """
     splat_starts: Tensor
-    """First instance of each splat, int32 [N + 1]. Empty unless training."""
+    """Number of each splat's first instance (pair of splat and tile), int32 [N + 1]. Empty unless training."""
     instance_splats: Tensor
-    """Splat of each instance, int32 [capacity]. Empty unless training."""
+    """Index of the splat of each instance (pair of splat and tile), int32 [capacity]. Empty unless training."""
     status: Tensor
     """Frame status, int32 [4], indexed by `STATUS_NEEDED` and the following constants. Reading it synchronises with the
     host.

@@ -54,7 +54,7 @@ class FieldGradient(NamedTuple):
     """Gradient of a field, factored for its planes."""
 
     network: Tensor
-    """Weight and bias of every layer, concatenated."""
+    """Gradients of the weight and bias of every network layer, concatenated."""
     rows: Tensor
     """Gradients of samples [2, 3 * levels * N, C], sorted by the cell of the plane.
 
@@ -69,7 +69,7 @@ class FieldGradient(NamedTuple):
     [3 * levels * N / 32, 5, 4, C].
     """
     v_lines: Tensor
-    """Gradient of the interpolated time lines."""
+    """Gradient of the time planes' features interpolated at the step's time (`TrainingState.lines`)."""
     starts: Tensor
     """Start of each cell's rows, int32 [cells + 1]."""
 

@@ -28,7 +28,7 @@ _INPUTS_BACKWARD = torch.ops.gsplat_core.rasterize_inputs_backward.default
 
 
 class Options(NamedTuple):
-    """Integer options in the op's argument order."""
+    """Integer options of a rendering, in the argument order of the native op."""
 
     width: int
     height: int
@@ -50,7 +50,7 @@ class Options(NamedTuple):
 
 
 class Ranges(NamedTuple):
-    """Numeric options in the op's argument order.
+    """Floating-point options of a rendering, in the argument order of the native op.
 
     They are the blur in pixels², clipping planes in the scene's unit, and smallest radius in pixels.
     """
@@ -101,7 +101,7 @@ class Saved(NamedTuple):
     sorted: Tensor
     """Index of each list entry among the (splat, tile) pairs in splat order, int32 [M]."""
     splat_starts: Tensor
-    """Start of each splat's pairs, int32 [images * N + 1]."""
+    """Index of each splat's first (splat, tile) pair in splat order, int32 [images * N + 1]."""
     row_of: Tensor | None
     """Packed row of each splat or -1, int32 [images * N]; None unless packed."""
     backgrounds: Tensor | None
@@ -109,7 +109,7 @@ class Saved(NamedTuple):
     expected: Tensor
     """Expected depth [..., C, H, W] if it is part of the picture."""
     last: Tensor
-    """Last list entry blended by each pixel or -1, int32 [..., C, H, W]."""
+    """Index of the last tile-list entry that is blended in each pixel, or -1 for none, int32 [..., C, H, W]."""
 
 
 class Rasterized(NamedTuple):

@@ -1,6 +1,7 @@
 """Losses of the surface rendered along rays, each with its gradients in one op.
 
-The differences of inverse depths, and the consistency of normals (Huang et al. 2024, "2D Gaussian Splatting", equation 14).
+The first compares inverse depths with those of known depths. The second compares blended normals with the normals of the
+depths (Huang et al. 2024, "2D Gaussian Splatting", equation 14).
 No call synchronises with the host, so a CUDA graph can capture both.
 """
 

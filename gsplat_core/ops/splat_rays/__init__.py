@@ -21,19 +21,23 @@ from gsplat_core.ops.native import register_gradient
 from gsplat_core.scene.cameras import CameraModel
 
 RAY_NUMBERS = 10
-"""Columns of a splat's ray coefficients: z, n (2), l (2), M (xx, twice xy, yy), reach and variance."""
+"""Number of ray coefficients of a splat: z, n (2), l (2) and M (xx, twice xy, yy) of the depth t(x) in this module's docstring,
+the largest deviation of t from z, and the variance of the depth along the ray.
+"""
 REACH_SIGMAS = 3.0
-"""Limit of the ray depth around the depth of the splat's centre, in its largest standard deviations."""
+"""Largest difference between a splat's depth along a ray and the depth of its centre, in units of the splat's largest
+standard deviation.
+"""
 
 
 class SplatRays(NamedTuple):
     """Ray coefficients and normals of Gaussians seen by one camera.
 
-    Those of Gaussians behind the camera plane, or with values that are not finite, are arbitrary and have no gradient.
+    Coefficients and normals of Gaussians behind the camera plane, or with non-finite values, are arbitrary and have no gradient.
     """
 
     rays: Tensor
-    """Coefficients of each Gaussian's depth and falloff along rays, [N, 10]; see `RAY_NUMBERS`."""
+    """Coefficients of each Gaussian's depth along rays as a function of the pixel, [N, 10]; see `RAY_NUMBERS`."""
     normals: Tensor
     """Shortest principal axes [N, 3] in camera axes, towards the camera; constant with respect to scales and means."""
 

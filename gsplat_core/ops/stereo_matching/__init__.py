@@ -14,11 +14,11 @@ from gsplat_core.errors import InvalidInput
 from gsplat_core.ops import native  # noqa: F401  registers the compiled op
 
 COUNT_STEP, MOST_DISPARITIES = 16, 256
-"""Granularity and maximum of the number of disparities."""
+"""Number of which the count of searched disparities must be a multiple, and its maximum."""
 SIXTEENTHS = 16
-"""Disparity units per pixel."""
+"""Number of units of an integer disparity (`Matches.sixteenths`) per pixel."""
 UNKNOWN = torch.iinfo(torch.int32).min
-"""Value of pixels without a match."""
+"""Disparity value of pixels without a match."""
 
 
 class Matches(NamedTuple):

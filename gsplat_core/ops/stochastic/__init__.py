@@ -76,7 +76,7 @@ class SplatScene(NamedTuple):
 
 
 class SampleOptions(NamedTuple):
-    """Integer options in the op's argument order."""
+    """Integer options of `sample_splats`, in the argument order of the compiled op."""
 
     width: int
     height: int

@@ -18,7 +18,7 @@ from gsplat_core.ops.compositing import MAX_ALPHA, MIN_ALPHA, blend_pairs, blend
 from gsplat_core.ops.native import register_gradient
 
 MAX_CHANNELS = 16
-"""Colour channels of one call of the compiled op; more of them are blended in several calls."""
+"""Largest number of colour channels of one call of the compiled op; more channels are blended in several calls."""
 
 SurfelImages = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 
@@ -357,7 +357,7 @@ def accumulate_2dgs(
 
 
 def _checked(means2d: Tensor, ray_transforms: Tensor, opacities: Tensor) -> tuple[tuple[int, ...], Tensor]:
-    """Check the surfels; return their dimensions [..., N] and numbers [surfels, 12]."""
+    """Check shapes; return the surfels' dimensions [..., N], and rows [surfels, 12] of centre, ray transform and opacity."""
     dims = require_trailing("means2d", means2d, (2,), "[..., N, 2]")
     if not dims:
         raise InvalidInput("means2d must be [..., N, 2], got [2]")

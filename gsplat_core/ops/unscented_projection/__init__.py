@@ -86,7 +86,7 @@ motion in pixels per row.
 
 
 class Limits(NamedTuple):
-    """Numbers that decide which Gaussians are projected, and how much they are blurred."""
+    """Picture size, blur, clipping planes and lower limits of a projection, as in `fully_fused_projection`."""
 
     width: int
     height: int
@@ -109,7 +109,7 @@ def project_unscented(
     limits: Limits,
     calc_compensations: bool,
 ) -> DenseProjection:
-    """Project Gaussians by the unscented transform; see `fully_fused_projection_with_ut`."""
+    """Project Gaussians by the unscented transform in plain torch; see `fully_fused_projection_with_ut`."""
     with torch.no_grad():
         usable = means.isfinite().all(-1) & quats.isfinite().all(-1) & scales.isfinite().all(-1)
         usable &= (quats != 0).any(-1)
@@ -315,7 +315,9 @@ def checked_camera(
 
 
 CAMERA_COLUMNS = 35
-"""Numbers of a camera: intrinsics, coefficients, fold-over limit, pose and motion (`unscented_projection.h`)."""
+"""Number of values that describe a camera to the kernels: intrinsics, lens coefficients, fold-over limit of the lens, pose and
+motion during the read-out (`unscented_projection.h`).
+"""
 
 
 def compiled_applies(means: Tensor, quats: Tensor, scales: Tensor, shutter: Shutter, Ks: Tensor, lens: Lens) -> bool:
@@ -328,7 +330,7 @@ def compiled_applies(means: Tensor, quats: Tensor, scales: Tensor, shutter: Shut
 
 @torch.no_grad()
 def camera_rows(shutter: Shutter, Ks: Tensor, lens: Lens) -> Tensor:
-    """Return the numbers of the cameras, [..., C, 35]."""
+    """Return the values that describe each camera to the kernels, [..., C, 35]; see `CAMERA_COLUMNS`."""
     dims = Ks.shape[:-2]
     row = lambda value, columns: (
         Ks.new_zeros(*dims, columns)
@@ -365,7 +367,10 @@ def project_compiled(
     limits: Limits,
     calc_compensations: bool,
 ) -> DenseProjection:
-    """Project Gaussians as `project_unscented` in plain torch, if `compiled_applies`."""
+    """Project Gaussians by the compiled kernels, with the result of `project_unscented` in plain torch.
+
+    The caller has checked that `compiled_applies`.
+    """
     require_kernels("fully_fused_projection_with_ut", "means", means)
     batch_dims, n, c = means.shape[:-2], means.shape[-2], Ks.shape[-3]
     batches = math.prod(batch_dims)

@@ -16,9 +16,9 @@ from gsplat_core.ops.native import register_gradient
 MOST_CHANNELS = 32
 """Largest number of channels; `kMostChannels` of `weighted_sum.h`."""
 MOST_CHANNEL = 2048.0
-"""Channels are limited to this absolute value; `kMostChannel`."""
+"""Absolute value to which the channels of a splat are clamped (`kMostChannel` of `weighted_sum.h`)."""
 MOST_TERM = 128.0
-"""A splat's weight times alpha is limited to this absolute value; `kMostTerm`."""
+"""Absolute value to which a splat's weight times alpha at a pixel is clamped (`kMostTerm` of `weighted_sum.h`)."""
 
 
 def weighted_sums(

@@ -33,7 +33,10 @@ def blend_compiled(
     masks: Tensor | None,
     max_alpha: float,
 ) -> tuple[Tensor, Tensor]:
-    """Blend Gaussians as `blend_world` in plain torch; on the CPU, lists out of range are refused."""
+    """Blend Gaussians by the compiled kernels, with the result of `blend_world` in plain torch.
+
+    On the CPU, tile lists with indices out of range raise an error.
+    """
     require_kernels("rasterize_to_pixels_eval3d", "means", means)
     gaussians = torch.cat([means, whitening.flatten(-2)], -1)
     # A weight of 0 times a colour that is not finite would not be 0.
