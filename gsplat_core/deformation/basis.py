@@ -121,7 +121,7 @@ class BasisSlot:
         self._in_use = [to[:count, :bumps] for to in mine]
 
     def exact_copy(self) -> DeformationField:
-        """Return a field with only the Gaussians and bumps in use."""
+        """Return a copy of the field without unused Gaussian rows and bump columns."""
         copied = self.field._copy_of(self._used[0])
         if self.field.continuation is not None:
             copied.continuation = self.field.continuation.of_first(self._used[0])

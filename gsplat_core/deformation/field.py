@@ -27,7 +27,7 @@ from gsplat_core.transfers import copy_each
 
 
 class FieldRows(Protocol):
-    """State of each Gaussian, in rows in the order of the Gaussians."""
+    """State of a field for each Gaussian: tensor rows in the order of the Gaussians, selected and appended with them."""
 
     @property
     def count(self) -> int:
@@ -41,7 +41,7 @@ class FieldRows(Protocol):
 
 
 class FixedRows(Protocol):
-    """Preallocated rows, which Gaussians join and leave without moving a tensor."""
+    """Preallocated tensor rows of a field, in which Gaussians are added and removed while tensors keep their addresses."""
 
     def reserve(self, rows: int) -> None:
         """Allocate memory for `rows` Gaussians in total."""
@@ -76,7 +76,7 @@ class EditableMotion(Protocol):
 
 
 class Continuable(Protocol):
-    """Extrapolation after the newest frame; see `gsplat_core.deformation.field`."""
+    """Capability of a field to extrapolate after the newest frame with a given velocity, for a short time."""
 
     def continue_with(self, velocity: Tensor, from_s: float, horizon_s: float) -> None:
         """Extrapolate with `velocity` [n, 16] per second for `horizon_s` after `from_s`."""
@@ -107,7 +107,7 @@ class FrameDeltas(Protocol):
 
 
 class CapturedMotion(FrameDeltas, Protocol):
-    """Counterpart of `EditableMotion` for CUDA graphs."""
+    """Direct changes of a deformation, as in `EditableMotion`, by operations that a CUDA graph can capture."""
 
     def motion_tensors(self) -> Sequence[Tensor]:
         """Return the tensors that `frame_deltas` and `move_to_at` access. Captured graphs are valid while these
@@ -133,7 +133,7 @@ class FieldSlot(Protocol):
 
     @property
     def parameter_count(self) -> int:
-        """Number of parameters of the field last written."""
+        """Number of parameters of the field that was last copied into the slot."""
 
     def overwrite(self, source: DeformationField) -> bool:
         """Enqueue a copy of `source` on the current stream.
@@ -143,7 +143,7 @@ class FieldSlot(Protocol):
         """
 
     def exact_copy(self) -> DeformationField:
-        """Return the field last written, at its own size and in separate memory."""
+        """Return a copy of the field that was last copied into the slot, without spare rows and in separate memory."""
 
 
 @dataclass(frozen=True)
@@ -153,7 +153,7 @@ class Capabilities:
     rows: FieldRows | None = None
     """State of each Gaussian. None if all parameters are independent of the Gaussians' number."""
     fixed_rows: FixedRows | None = None
-    """Preallocation of `rows`."""
+    """Preallocated memory for `rows`, so that Gaussians are added and removed while tensors keep their addresses."""
     motion: EditableMotion | None = None
     """Direct changes of the deformation, for corrections by depth and optical flow."""
     captured_motion: CapturedMotion | None = None
@@ -344,7 +344,7 @@ def ops_for(tensor: Tensor, compiled: ModuleType, plain: ModuleType) -> ModuleTy
 
 
 ROWS_AT_ONCE = 1 << 14
-"""Number of rows processed at once, to bound memory."""
+"""Number of Gaussians whose values are smoothed at once, to bound memory."""
 
 
 def towards_neighbours_(values: Tensor, amount: float) -> None:

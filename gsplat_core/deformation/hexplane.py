@@ -146,7 +146,7 @@ class HexPlaneField(DeformationField):
         return 2 * (self.clamp_time(time_s) - start) / (end - start) - 1 if end > start else 0.0
 
     def features(self, coordinates: Tensor) -> list[Tensor]:
-        """Return the product over the planes of each level [N, channels]."""
+        """Return the features [N, channels] of each level: the product of its six planes, sampled at `coordinates` [N, 4]."""
         return [self._ops.hexplane_features(coordinates, *level) for level in self._levels(PLANE_NAMES)]
 
     def forward(self, gaussians: Gaussians, time_s: float) -> Gaussians:
@@ -292,7 +292,7 @@ class HexPlaneField(DeformationField):
         return [plane for level in self._levels(names) for plane in level]
 
     def _levels(self, names: Sequence[str]) -> list[list[Tensor]]:
-        """Return the planes of these names, grouped by level."""
+        """Return the feature planes with these names, such as `xy` and `xt`, as one list per resolution level."""
         return [[cast(torch.nn.ParameterDict, planes)[name] for name in names] for planes in self.planes]
 
     def _lines(self, planes: Sequence[Tensor], time_s: float) -> list[Tensor]:
@@ -344,7 +344,7 @@ class HexPlaneTraining:
     reads_positions = True
     """The deltas depend on the Gaussians' positions; `update` adds that part of their gradient."""
     add_colours = None
-    """Colours do not change over time."""
+    """No function that changes colours over time, because the field does not deform colours."""
 
     def __init__(
         self,

@@ -52,7 +52,7 @@ class FieldRates:
 
 @dataclass(frozen=True)
 class OneRate(FieldRates):
-    """Common learning rate of all parameters of a field."""
+    """One learning rate for all parameters of a deformation field."""
 
     parameters: float = 5e-3
 
@@ -208,7 +208,7 @@ class FieldKind(Generic[Field]):
         return {"kind": self.name, "time_window_s": checked_window((start, end)), **config}
 
     def made_for(self, wanted: NewField) -> Field:
-        """Create an untrained field for a reconstruction."""
+        """Create an untrained field of this kind with the wanted size, time window and temporal resolution."""
         if self.new is not None:
             return self.new(wanted)
         return self.field.for_gaussians(wanted.gaussians, wanted.time_window_s)

@@ -307,7 +307,9 @@ def correct_colours(
             flatten_ids, max_alpha=max_alpha,
         )  # fmt: skip
         summed = torch.cat([(target - picture[0, ..., :3].detach()) * tissue, tissue], -1)
-        total = (picture[0] * summed).sum() + 0 * leaf.sum()  # the second term is for a scene without splats
+        total = (
+            picture[0] * summed
+        ).sum() + 0 * leaf.sum()  # the second term, 0, connects the gradient if there are no splats
         (sums,) = torch.autograd.grad(total, leaf)
         wanted = relaxation * sums[:, :3] / (sums[:, 3:] + least_weight)
         colors = colors + torch.maximum(wanted, -colors.clamp(min=0)) * (sums[:, 3:] > 0)

@@ -173,7 +173,7 @@ def render_frame(
 
 
 class SampleMoments(NamedTuple):
-    """Moments of one sample of each pixel: red, green, blue, hit and z."""
+    """Mean and variance of one random sample of each pixel, in which a sample is red, green, blue, hit (0 or 1) and z."""
 
     mean: Tensor
     """Mean of red, green, blue, hit and z of each pixel, [H, W, 5]."""
@@ -182,7 +182,7 @@ class SampleMoments(NamedTuple):
 
 
 class ProjectedSplats(NamedTuple):
-    """Visible splats in order of depth, then row."""
+    """Visible splats sorted by depth; splats of equal depth by their row."""
 
     means2d: Tensor
     """Projected centres [M, 2] in pixels."""
@@ -225,7 +225,7 @@ def project_splats(gaussians: Gaussians, camera: Camera) -> ProjectedSplats:
 
 
 def densities(splats: ProjectedSplats, points: Tensor) -> Tensor:
-    """Return o G at points [P, 2] for each splat, [M, P]; 0 where it is below 1/255."""
+    """Return each splat's opacity times its 2D Gaussian at points [P, 2], [M, P]; 0 where it is below 1/255."""
     d = points[None] - splats.means2d[:, None]
     a, b, c = (splats.conics[:, None, k] for k in range(3))
     power = 0.5 * (a * d[..., 0] ** 2 + c * d[..., 1] ** 2) + b * d[..., 0] * d[..., 1]

@@ -88,7 +88,9 @@ def _range(values: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _messages_down(costs: Tensor) -> Tensor:
-    """Return the path costs aggregated down the first dimension of costs [H, W, count]."""
+    """Return the costs that semi-global matching passes along the first dimension of `costs` [H, W, count] to each pixel from
+    the pixels before it, without the pixel's own cost.
+    """
     kept = torch.zeros_like(costs[0])
     messages = torch.zeros_like(costs)
     beyond = torch.full_like(kept[:, :1], LARGE_STEP)

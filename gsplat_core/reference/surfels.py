@@ -262,7 +262,7 @@ class _State(NamedTuple):
     """State of front-to-back blending at each of a tile's P pixels, after some of the surfels; [P, 1] unless stated."""
 
     product: Tensor
-    """Transmittance ignoring early termination."""
+    """Product of 1 - alpha of all surfels so far, also of those after early termination."""
     weight: Tensor
     depth: Tensor
     """Sum of weight times depth."""

@@ -118,14 +118,14 @@ C2 = 0.03**2
 
 
 def gaussian_window() -> Tensor:
-    """Return the 11 taps of the separable window, float64, with sum 1."""
+    """Return the 11 taps of SSIM's separable Gaussian window, float64, with sum 1."""
     offsets = torch.arange(-WINDOW_RADIUS_PX, WINDOW_RADIUS_PX + 1, dtype=torch.float64)
     taps = torch.exp(-0.5 * (offsets / WINDOW_SIGMA_PX) ** 2)
     return taps / taps.sum()
 
 
 def _blur(planes: Tensor) -> Tensor:
-    """Filter planes [P, H, W] with the window and zero padding."""
+    """Filter planes [P, H, W] with the Gaussian window of SSIM and zero padding."""
     height, width = planes.shape[1:]
     taps = gaussian_window().tolist()
     padded = torch.nn.functional.pad(planes, (WINDOW_RADIUS_PX,) * 4)

@@ -235,7 +235,7 @@ class GraphMemory:
 
     @property
     def pool(self) -> Any:
-        """Return torch's handle of the pool."""
+        """Return torch's handle of the memory pool, for `CUDAGraph.capture_begin`."""
         return self._keeper.pool()
 
 
@@ -309,7 +309,7 @@ CAPACITY_STEP = 1 << 16
 TILE_STEP = 32
 """Number of instances (pairs of splat and tile) to a multiple of which the capacity of each tile's own segment is rounded up."""
 HEADROOM = 1.25
-"""Capacity relative to a frame's need, so that a moving scene seldom exceeds it."""
+"""Ratio of allocated tile-list capacity to the need of a frame, so that a moving scene seldom exceeds the capacity."""
 
 
 def capacity_for(needed: int) -> int:
@@ -356,7 +356,7 @@ class FrameNeeds(NamedTuple):
     """Tile-list entries (instances) needed by rendered frames, and the number of overflows."""
 
     instances: int
-    """Largest number of instances in all tiles of a frame."""
+    """Total number of instances (pairs of splat and tile) of a frame, the largest one over several frames."""
     most_in_tile: int
     overflowed: int
     """Number of frames that dropped instances because their lists were full."""

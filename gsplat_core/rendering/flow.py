@@ -45,13 +45,13 @@ class RenderedFlow(NamedTuple):
     flow: Tensor
     """Displacement in pixels to the right and down, [H, W, 2]."""
     depth: Tensor
-    """z in the second camera at which the surface arrives, [H, W]."""
+    """Depth z in the second camera's axes to which the surface of each first-camera pixel moves, [H, W]."""
     alpha: Tensor
     """Accumulated opacity [H, W] of the splats that arrive in front of the second camera."""
 
     @property
     def observed(self) -> Tensor:
-        """Mask [H, W] of the pixels with known flow."""
+        """Mask [H, W], True for pixels whose opacity is high enough for a flow."""
         return self.alpha >= COVERED
 
 

@@ -95,7 +95,7 @@ class RenderedSplats(NamedTuple):
     alphas: Tensor
     rows: DenseProjection | PackedProjection
     channels: Tensor
-    """Blended values, [rows, channels]."""
+    """Values of each splat that were blended, such as colours and depth, [rows, channels]."""
     opacities: Tensor
     """Opacities [rows] including the antialiasing compensation."""
     tiles_per_gauss: Tensor
@@ -400,7 +400,7 @@ class CheckedCall(NamedTuple):
 
 @dataclass(frozen=True)
 class Operations(StepOperations):
-    """`rasterization` on top of one implementation of the pipeline's operations."""
+    """Implementation of the pipeline's operations, with `rasterization` built on top of them."""
 
     single_call: Callable[[Arguments, RenderSettings], SingleCall | None] | None = None
     """Function that returns a native call for the whole pipeline, or None for unsupported arguments."""

@@ -32,7 +32,7 @@ TILE_SIZE = 16
 
 
 class Constants(NamedTuple):
-    """Constants that differ between gsplat versions."""
+    """Rendering constants of one version of gsplat, in which versions 1.5.3 and 1.6 differ."""
 
     max_alpha: float
     """Upper limit of a splat's alpha at a pixel."""
@@ -201,7 +201,7 @@ def signature_of(arguments: Arguments, options: tuple[Any, ...]) -> Hashable | N
         arguments: tensors of the call, not yet checked.
         options: all other arguments.
     """
-    if is_transformed():  # first, because a compiler cannot follow the rest
+    if is_transformed():  # tested first, because torch.compile cannot trace the tests below
         return None
     types = tuple(map(type, options))
     if not _PLAIN_OPTIONS.issuperset(types) or not PLAIN_TENSORS.issuperset(map(type, arguments)):

@@ -249,7 +249,7 @@ class SampledRenderer:
         self._camera, self._device, self._background = camera, device, background
         self._model: Model | None = None
         self._scene: SplatScene | None = None
-        """Splats of a model that does not move, in the chosen storage."""
+        """Splats of the prepared model in the chosen storage format; None for a moving model, converted in each frame."""
         self._sums: Tensor | None = None
         """Sums [H, W, 5] of the samples of the picture so far; see `sample_splats`. Progressive frames continue them."""
         self._drawn = 0

@@ -284,8 +284,8 @@ ROOM_SHARE = 0.1
 UNSEEN_S = 0.5
 """Seconds out of view after which a Gaussian may be archived."""
 MARGIN_SHARE = 0.1
-"""Distance from the picture, as a share of its width, within which Gaussians stay because their
-extent may reach into it.
+"""Width of a margin around the picture, as a share of its width, in which Gaussians are not archived because their extent may
+reach into the picture.
 """
 ARCHIVED_SCENES = 8
 """Capacity of the archive, in multiples of the scene's capacity."""
@@ -640,7 +640,7 @@ def fill_new_tissue(
 
 
 DEPTH_STEPS = 2**24
-"""Quantisation steps of the largest depth, as fine as float32."""
+"""Number of quantisation steps from 0 to the largest depth in integer sums of depths; as fine as float32."""
 
 
 def around_cells(

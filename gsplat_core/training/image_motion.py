@@ -163,9 +163,9 @@ def revealed_px(flow: Flow) -> float:
 
 
 NEAREST = 1e-6
-"""Smallest depth in world units of a point in front of a camera."""
+"""Depth in world units above which a point counts as in front of a camera."""
 INVERSE_STEPS = 2
-"""Fixed-point iterations for inverting a flow."""
+"""Number of fixed-point iterations that find where a point of the second picture was in the first one."""
 
 
 @dataclass(frozen=True)

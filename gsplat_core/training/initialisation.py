@@ -236,7 +236,7 @@ def filled(picture: Tensor, known: Tensor, coarse: int = COARSE) -> Tensor:
 
 
 def _shrunk(total: Tensor, weight: Tensor, factor: int) -> tuple[Tensor, Tensor]:
-    """Return values and weights averaged over cells of `factor` squared pixels."""
+    """Return weighted sums and their weights, both averaged over cells of `factor` x `factor` pixels."""
     height, width = weight.shape[2:]
     beyond = (0, -width % factor, 0, -height % factor)
     return avg_pool2d(pad(total, beyond), factor), avg_pool2d(pad(weight, beyond), factor)

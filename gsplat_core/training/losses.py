@@ -32,7 +32,7 @@ EVERY = 8
 
 @dataclass(frozen=True)
 class LossContext:
-    """Data other than the observation that a loss may read."""
+    """Other frames, and the scene at other times, which a loss may use besides the compared observation."""
 
     frames: Sequence[Observation]
     """Observations available for training in temporal order, including the current one."""
@@ -159,7 +159,7 @@ class WeightedLosses:
     """Weighted sum of the chosen losses for one scene."""
 
     def __init__(self, weights: dict[str, float]) -> None:
-        """Create the losses with these weights by name, the result of `loss_weights`."""
+        """Create the losses named in `weights` (result of `loss_weights`), each with its weight."""
         made = [(LOSSES[name](), weight) for name, weight in weights.items()]
         self._of_rays = [(loss, weight) for loss, weight in made if isinstance(loss, RayLoss)]
         self._terms: list[tuple[Loss, float]] = [
@@ -361,7 +361,7 @@ SMALL_PIXELS = 24_000
 
 
 class RenderedRays(NamedTuple):
-    """Values of the rays of an observation at the compared size [h, w]."""
+    """Values rendered along the rays of an observation, and observed values, at the size [h, w] of the comparison."""
 
     view: View
     """Camera of the compared pixels."""
@@ -374,7 +374,7 @@ class RenderedRays(NamedTuple):
     values: Tensor
     """Further values of the splats, such as class logits, summed with their blending weights [h, w, K]."""
     tissue: Tensor
-    """Mask bool [h, w] of observed pixels that are tissue."""
+    """Mask bool [h, w] of compared pixels that show tissue and where a surface is rendered."""
     known_depth: Tensor | None
     """Depth [h, w] of the observation, 0 where unknown; None for an observation without depth."""
 

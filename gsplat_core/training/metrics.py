@@ -193,7 +193,7 @@ class ScoredMean:
 
     def __init__(self) -> None:
         self.count = 0
-        """Number of finite values."""
+        """Number of finite values in the mean."""
         self._parts: list[float] = []
 
     def add(self, value: float) -> None:

@@ -35,7 +35,9 @@ from gsplat_core.training.steps.step import TrainingStep
 from gsplat_core.transfers import tensor_of
 
 AT_FIRST = 0.6
-"""Assumed share of a motion that continues, before any observation. See benchmarks/results/constants.md."""
+"""Assumed share of a motion that continues in the next frame interval, before such a share was observed. See
+benchmarks/results/constants.md.
+"""
 FOLLOWS = 0.15
 """Weight of the newest frame in the moving average of the share of motion that continues."""
 ONE_FRAME = (-0.5, 1.5)

@@ -453,7 +453,7 @@ CELL_PX = 4
 TYPICAL_OF = 500
 """Number of disparities (up to twice as many) whose median is the typical disparity."""
 NEAREST, FARTHEST = 2.0, 0.75
-"""Range of a tool's disparity without depth, as multiples of the typical one; tools are nearer than tissue."""
+"""Assumed largest and smallest disparity of a tool whose depth is unknown, as multiples of the typical disparity of the scene."""
 
 
 def right_tissue(frame: Frame, camera: Camera, right: Camera, shift_px: float) -> NDArray[np.uint8]:

@@ -125,7 +125,7 @@ class SurfaceTracks:
 
     @cached_property
     def _have_depth(self) -> bool:
-        """True if at least half of the frames have depth that shows motion."""
+        """True if at least half of the frames have depth that the depth loss compares."""
         return 2 * sum(depth is not None for depth in self._depths) >= len(self._frames)
 
     @cached_property
@@ -163,7 +163,7 @@ class SurfaceTracks:
 
 @dataclass(frozen=True)
 class SurfaceDepth:
-    """Depth of one frame, prepared for sampling at tracked points."""
+    """Depth map of one frame as planes that can be sampled at tracked points, also where a tool hides the depth."""
 
     planes: Tensor
     """Planes [3, H, W]: depth away from edges, 0 elsewhere; validity of it; surface extrapolated everywhere."""
@@ -491,17 +491,17 @@ VALIDATE_EVERY = 9
 LEAST_FRAMES = 1
 """Smallest number of validation frames with which the number of training steps is chosen by trials."""
 FIRST_STEPS = 500
-"""Training steps of the first trial. Each further trial has twice as many."""
+"""Training steps of the first trial in the search for the best number of steps. Each further trial has twice as many."""
 MOST_STEPS = 64_000
-"""Largest number of training steps that is tried."""
+"""Largest number of training steps that `choose_steps` tries."""
 LEAST_GAIN_DB = 0.05
-"""Smallest gain of a trial, in dB, for which longer trainings are tried."""
+"""Smallest gain in validation PSNR from doubling the training steps, in dB, after which a doubling is tried again."""
 INPUT_GAIN_DB = 0.3
 """Smallest gain, in dB, for which other inputs than the given ones are used. Depth is not left out for less, because it
 also gives the scale and the shape.
 """
 USUAL_STEPS = 2000
-"""Number of training steps for recordings with too few frames to validate."""
+"""Number of training steps for recordings that have too few frames for validation frames."""
 
 Clock = Callable[[], float]
 """Function that returns the time in seconds, for measuring durations."""

@@ -225,7 +225,7 @@ class Placement:
         """Start another scene from the frame `first`; None counts as a frame without depth."""
         self._first = first
         self.is_placed = _has_depth(first)
-        """True once the scene was placed by a depth."""
+        """True once the scene started with, or was moved to, the distance of a frame's depth."""
         self._postponed: tuple[Frame, Observation] | None = None
 
     def catch_up(self, step: TrainingStep) -> None:

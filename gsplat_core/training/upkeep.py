@@ -50,7 +50,7 @@ training does not hold them.
 THINNEST_PX = 0.2
 """Smallest standard deviation in pixels; smaller ones give equal pictures because of the renderer's blur of 0.55 px."""
 WIDEST = 8.0
-"""Largest size, in multiples of the default size."""
+"""Largest standard deviation of a Gaussian, in multiples of the default size of new Gaussians."""
 MOST_SPLIT = 0.02
 """Largest share of the Gaussians that are split in one round."""
 SURFACE_STEPS = 100_000

@@ -219,7 +219,7 @@ MIN_ALPHA = 1.0 / 255.0
 LEAST_TRANSMITTANCE = 1e-4
 """Blending of a pixel ends before the splat that would reduce the transmittance to this value or less."""
 PAIRS_AT_A_TIME = 1 << 22
-"""Bound of the memory for pairs of pixel and list entry."""
+"""Largest number of pairs of pixel and tile-list entry that are evaluated at once, which bounds memory."""
 
 
 @torch.no_grad()

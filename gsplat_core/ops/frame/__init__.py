@@ -33,7 +33,7 @@ __all__ = [
 ]
 
 MAX_SEGMENT = 1024
-"""Largest capacity of a tile's own segment, in instances."""
+"""Largest capacity of the buffer segment of one tile in `FrameMode.SEGMENTS`, in instances (pairs of splat and tile)."""
 STATUS_NEEDED, STATUS_LONGEST, STATUS_OVERFLOW = range(3)
 """Indices into `Frame.status`: number of instances of the frame, largest number in a tile, and 1 if instances were
 dropped.
@@ -75,7 +75,7 @@ class Frame(NamedTuple):
     infinity, red, green, blue, z, 0.
     """
     tile_offsets: Tensor
-    """Start of each tile's instances in `sorted`, int32 [tiles + 1]. Empty with segments."""
+    """Index in `sorted` of the first instance of each tile, int32 [tiles + 1]. Empty in `FrameMode.SEGMENTS`."""
     sorted: Tensor
     """Instances sorted by tile and depth, int32 [capacity]. Empty unless training; may contain -1 if the lists
     overflowed.

@@ -45,7 +45,7 @@ class GaussianAdam(NamedTuple):
     """
     second_moments: Sequence[Tensor]
     rates: Tensor
-    """Learning rates in the order of the tensors, float32 [5]."""
+    """Learning rates in the order of `GAUSSIAN_TENSORS`, float32 [5]."""
     step: Tensor
     """Number of the optimiser step, counted from 1, int64 or int32 [1]; smaller values count as 1."""
     skipped: Tensor

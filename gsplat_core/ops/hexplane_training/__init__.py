@@ -47,11 +47,11 @@ class TrainingState(NamedTuple):
     of the sorted items. The highest bit of a cell is set if the cell has 8 items or more (dense).
     """
     starts: Tensor
-    """Start of each cell's items, int32 [cells + 1]."""
+    """Index of the first sorted item of each plane cell, int32 [cells + 1]; an item is a pair of space plane and Gaussian."""
 
 
 class FieldGradient(NamedTuple):
-    """Gradient of a field, factored for its planes."""
+    """Gradient of a HexPlane field. The gradient of the planes is kept factored: rows per sample instead of plane tensors."""
 
     network: Tensor
     """Gradients of the weight and bias of every network layer, concatenated."""
@@ -71,7 +71,7 @@ class FieldGradient(NamedTuple):
     v_lines: Tensor
     """Gradient of the time planes' features interpolated at the step's time (`TrainingState.lines`)."""
     starts: Tensor
-    """Start of each cell's rows, int32 [cells + 1]."""
+    """Index in `rows` of the first row of each plane cell, int32 [cells + 1]."""
 
     @property
     def of_planes(self) -> list[Tensor]:
@@ -98,7 +98,7 @@ class AdamOnDevice(NamedTuple):
 
 
 class Penalties(NamedTuple):
-    """Weights of the penalties of `gsplat_core.reference.training` in the loss."""
+    """Weights in the loss of the penalties on the feature planes (`gsplat_core.reference.training`)."""
 
     plane_smoothness: float = 0.0
     time_smoothness: float = 0.0

@@ -17,7 +17,7 @@ MOST_BINS = 65536
 
 
 class Bins(NamedTuple):
-    """Bins of equal width."""
+    """Depth bins of equal width in which a range sensor's histogram counts."""
 
     nearest: float
     """Depth at the first edge, in the scene's unit."""

@@ -62,7 +62,7 @@ class Ranges(NamedTuple):
 
 
 class View(NamedTuple):
-    """Non-tensor arguments of a rendering."""
+    """Arguments of a rendering that are not tensors: batch dimensions, picture size, options and ranges."""
 
     image_dims: tuple[int, ...]
     """Batch dimensions and number of cameras."""
@@ -103,11 +103,11 @@ class Saved(NamedTuple):
     splat_starts: Tensor
     """Index of each splat's first (splat, tile) pair in splat order, int32 [images * N + 1]."""
     row_of: Tensor | None
-    """Packed row of each splat or -1, int32 [images * N]; None unless packed."""
+    """Row of each splat in the packed results, or -1 for culled splats, int32 [images * N]; None unless packed."""
     backgrounds: Tensor | None
     alphas: Tensor
     expected: Tensor
-    """Expected depth [..., C, H, W] if it is part of the picture."""
+    """Expected depth [..., C, H, W]; empty unless the picture has a depth channel that is divided by alpha."""
     last: Tensor
     """Index of the last tile-list entry that is blended in each pixel, or -1 for none, int32 [..., C, H, W]."""
 

@@ -13,7 +13,7 @@ from gsplat_core.ops.native import register_gradient
 from gsplat_core.ops.splat_rays import RAY_NUMBERS
 
 MAX_CHANNELS = 15
-"""Maximum number of channels of one call."""
+"""Largest number of further channels that one call of `blend_rays` blends."""
 
 
 class BlendedRays(NamedTuple):

@@ -10,7 +10,7 @@ from gsplat_core.ops.native import register_gradient
 
 MAX_CHANNELS = 32
 WINDOW_RADIUS_PX = 5
-"""Pixels at each border whose window contains padding."""
+"""Radius of the SSIM window in pixels: width of the picture's border where the window reaches into the zero padding."""
 
 
 def ssim_map(image: Tensor, target: Tensor) -> Tensor:

@@ -22,9 +22,9 @@ METHODS: tuple[str, ...] = get_args(Method)
 QUEUE_BYTES = 64 << 20
 """Default memory of the queue of large splats, which limits the memory of a frame."""
 CHUNK = 4096
-"""Number of splats that share the ranges of quantised values."""
+"""Number of consecutive splats whose positions, log-scales and harmonics are quantised relative to common ranges."""
 COLOUR_CHUNK = 256
-"""Number of splats that share the range of quantised colours."""
+"""Number of consecutive splats whose colours are quantised relative to a common range."""
 CHUNK_FLOATS = 20 + 6 * (CHUNK // COLOUR_CHUNK)
 """Number of float32 values of a chunk's ranges: minima and steps of positions and log-scales [3 each], of the four
 bands, and of each colour chunk.
@@ -71,7 +71,7 @@ class SplatScene(NamedTuple):
         return 0 if first is None else int(first.shape[0])
 
     def tensors(self) -> tuple[Tensor, ...]:
-        """Return the tensors that are given."""
+        """Return the tensors of the scene's format, which are those that are not None."""
         return tuple(tensor for tensor in self if tensor is not None)
 
 
@@ -174,9 +174,9 @@ class SampledPicture(NamedTuple):
     image: Tensor
     """Mean colours [H, W, 3]."""
     alpha: Tensor
-    """Share of samples with a splat [H, W]."""
+    """Share of samples that hit a splat [H, W]."""
     depth: Tensor
-    """Mean z [H, W] of the samples with a splat, in the scene's unit; 0 without one."""
+    """Mean z [H, W] of the samples that hit a splat, in the scene's unit; 0 in pixels without such a sample."""
 
 
 def picture_of(sums: Tensor, samples: int, background: Tensor | None = None) -> SampledPicture:

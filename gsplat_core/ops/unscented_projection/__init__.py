@@ -44,7 +44,7 @@ class UnscentedTransformParameters:
     beta: float = 2.0
     """Summand of the central sigma point's weight in the covariance (`center_weight`); 2 is optimal for Gaussians."""
     kappa: float = 0.0
-    """Summand in the spread of the sigma points, see `alpha`."""
+    """Constant κ in the distance α √(3 + κ) of the sigma points from the mean, in standard deviations."""
     in_image_margin_factor: float = 0.1
     """Margin around the picture in which sigma points are valid, as a share of its size."""
     require_all_sigma_points_valid: bool = True

@@ -95,7 +95,7 @@ register_gradient("gsplat_core::blend_world", _backward, setup_context=_setup_co
 ALPHA_MIN = 1.0 / 255.0
 TRANSMITTANCE_STOP = 1e-4
 PAIRS_AT_A_TIME = 1 << 21
-"""Pixels times splats that are evaluated together; bounds the memory."""
+"""Largest number of pairs of pixel and splat that are evaluated at once, which bounds memory."""
 
 
 def blend_world(

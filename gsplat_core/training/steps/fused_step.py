@@ -52,7 +52,7 @@ GEOMETRY: Mapping[str, slice | int] = {
 
 
 class StepKind(NamedTuple):
-    """Properties that distinguish the graphs of a step."""
+    """Properties of a training step for each combination of which a separate CUDA graph is captured."""
 
     corrects: bool
     """Colours are corrected instead of trained."""
@@ -337,7 +337,7 @@ class FusedStep:
         return first, second
 
     def _move(self, means: Tensor, gradient: Tensor, rate: Tensor, fits: Tensor) -> None:
-        """Apply Adam to the positions with the complete gradient."""
+        """Apply Adam to the positions with the sum of the gradients of the picture and of the deformation field."""
         # The quotient is NaN if the frame overflowed its tile lists. Adam then skips all rows and their moments.
         complete = gradient[:, :3] / fits
         first, second = self._adam.first_moments["means"], self._adam.second_moments["means"]

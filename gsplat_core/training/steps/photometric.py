@@ -158,15 +158,15 @@ class LossWeights:
 
     @property
     def show_residuals(self) -> bool:
-        """True if the gradient at the picture's colours is proportional to the residual."""
+        """True if the loss gradient by a pixel's colour is proportional to its residual (squared error without SSIM)."""
         return self.squared and self.ssim == 0
 
 
 class ScreenGradients(NamedTuple):
-    """Gradients of a loss by the projected Gaussians."""
+    """Gradients of a loss by the projected centres of the Gaussians, with their radii and the picture's size."""
 
     means2d: Tensor
-    """Gradients [N, 2] by the centres in pixels."""
+    """Gradients [N, 2] of the loss by the Gaussians' projected centres in pixels."""
     radii: Tensor
     """Radii in pixels, int32 [N, 2]; 0 for Gaussians that are not in the picture."""
     width: int

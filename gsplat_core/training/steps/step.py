@@ -219,7 +219,7 @@ class TrainingStep:
         self._unsettled_steps = 0
         self._has_settled = False
         self._relaxation = 0.0
-        """Colour relaxation of the newest captured step."""
+        """Share of the colour correction (`colour_relaxation`) of the newest captured step; 0 for a step without correction."""
         self._scaled_for: float | None = None
         self._scaled_rates: tuple[dict[str, float], Sequence[float]] = {}, ()
         frame_deltas = self.capabilities.frame_deltas

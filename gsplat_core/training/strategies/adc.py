@@ -48,7 +48,7 @@ class DefaultStrategy(Strategy):
     prune_scale2d: float = 0.15
     """Radius above which a Gaussian is removed, in the unit of `grow_scale2d`, until `refine_scale2d_stop_iter`."""
     refine_scale2d_stop_iter: int = 0
-    """Step at which tests of the radius end; 0 for no tests."""
+    """Step at which splitting and removal of Gaussians by their radius in the picture end; 0 never uses the radius."""
     refine_start_iter: int = 500
     """Step after which refinement begins."""
     refine_stop_iter: int = 15_000
@@ -58,7 +58,7 @@ class DefaultStrategy(Strategy):
     refine_every: int = 100
     """Steps between two refinements."""
     pause_refine_after_reset: int = 0
-    """Steps after a reset without refinement."""
+    """Number of training steps after a reset of the opacities in which no refinement is made."""
     absgrad: bool = False
     """Use sums of absolute gradients (Ye et al. 2024); `rasterization` needs `absgrad=True`, too."""
     revised_opacity: bool = False

@@ -36,11 +36,11 @@ from gsplat_core.training.strategies.strategy import (
 from gsplat_core.training.strategies.streaming import UNSEEN_PX, Rounds, Shares
 
 GROWTH = 1.05
-"""Factor of the number of Gaussians per refinement."""
+"""Factor by which the number of Gaussians grows in each refinement, up to the cap."""
 
 
 class NoLiveGaussians(RuntimeError):
-    """All Gaussians are too transparent to be copied: the training has failed."""
+    """Error: all Gaussians are too transparent to be copied, so the training has failed."""
 
 
 @dataclass
@@ -116,7 +116,7 @@ class MCMCStrategy(Strategy):
     @torch.no_grad()
     def _relocate_gs(self, params: Params, optimizers: Optimizers, binoms: Tensor) -> int:
         """Move dead Gaussians to visible places. Returns their number; synchronises."""
-        # A NaN is dead, too.
+        # A Gaussian whose opacity is NaN counts as dead, too.
         dead = ~(params["opacities"].flatten().sigmoid() > self.min_opacity)
         count = int(torch.count_nonzero(dead))
         self._check_alive(len(dead) - count)

@@ -151,7 +151,7 @@ def compute_relocation(opacities: Tensor, scales: Tensor, ratios: Tensor, binoms
     copies = ratios.long().clamp(1, len(binoms))
     after = -torch.expm1(torch.log1p(-before) / copies)
     factors = _factors(len(binoms), before.device)
-    # In parts, because a part has a value per row and coefficient.
+    # Computed in parts, because the sums need temporary values for each Gaussian and coefficient.
     parts = zip(after.split(ROWS_AT_ONCE), copies.split(ROWS_AT_ONCE), strict=True)
     sums = [(factors[n - 1] * a[:, None].expand(-1, len(binoms)).cumprod(1)).sum(1) for a, n in parts]
     total = torch.cat(sums)
@@ -483,13 +483,13 @@ class Plan:
     most_gaussians: int
     """Largest number of Gaussians."""
     random: np.random.Generator
-    """Source of random numbers, shared with the order of the observations."""
+    """Random generator of the training, which also determines the order of the observations."""
     seed: int
     """Seed of a strategy's own generators."""
 
 
 class SceneStrategy(Protocol):
-    """Changes of the Gaussians of one offline training."""
+    """Densification strategy of one offline training, called before each step to change the Gaussians."""
 
     def before_step(self, number: int, rate_scale: float) -> bool:
         """Change the Gaussians before a step.
@@ -505,10 +505,10 @@ class SceneStrategy(Protocol):
 
 @dataclass(frozen=True)
 class StrategyKind:
-    """Registry entry of a strategy."""
+    """Registry entry of a densification strategy."""
 
     training: Callable[[Plan], SceneStrategy]
-    """Creates the strategy of an offline training."""
+    """Function that creates the strategy object for a planned offline training."""
     library: type[Strategy] | None = None
     """Class for a user's own training loop, in gsplat's calling convention; None if there is none."""
     losses: Mapping[str, float] = field(default_factory=dict)

@@ -74,7 +74,7 @@ def on_tissue(step: TrainingStep, observations: Sequence[Observation]) -> Tensor
 DENSIFY_ROUNDS = 6
 """Number of rounds of densification, spread evenly over the training."""
 DENSIFY_UNTIL = 0.7
-"""Share of the steps after which the last round takes place."""
+"""Share of the training steps after which the last densification round takes place."""
 DENSIFY_FRAMES = 12
 """Number of random frames in which each round measures the error."""
 
