@@ -63,7 +63,7 @@ CAPACITY_STEP = 16
 """Number of bump columns to a multiple of which the allocated capacity is rounded up."""
 HEADROOM = 1.25
 COLUMNS_AHEAD = 1
-"""Number of columns kept ahead of the newest frame in a live session."""
+"""Number of bump columns beyond the newest frame's time that are kept ready in a live session."""
 
 
 @dataclass(frozen=True)
@@ -78,9 +78,9 @@ class Columns:
     """Time in seconds of the oldest column's initial bump centre. Normalised times are counted in spacings from it."""
     spacing_s: float
     count: int
-    """Number of columns in use."""
+    """Number of bump columns in use."""
     places: int
-    """Number of columns allocated in the tensors."""
+    """Number of bump columns allocated in the tensors."""
     oldest: int = 0
     """Tensor index of column 0, the oldest column."""
     is_ring: bool = False
@@ -92,8 +92,8 @@ class Columns:
         return self.places - self.count
 
     def moved_on(self, added: int) -> tuple[Columns, int]:
-        """Return the column layout after adding `added` columns at the head, and the number of oldest columns that they
-        replace.
+        """Return the column layout after appending `added` columns for later times, and the number of oldest columns that
+        they replace.
         """
         passed = max(0, self.count + added - self.places)
         origin_s = self.origin_s + passed * self.spacing_s
@@ -149,7 +149,7 @@ def with_columns(tensor: Tensor, added: int, value: float = 0.0) -> Tensor:
 
 
 def columns_to_change(window_s: tuple[float, float], columns: Columns) -> tuple[int, int]:
-    """Return the numbers of columns to add at the head and drop at the tail to cover the window."""
+    """Return the numbers of columns to add at the newest end and to drop at the oldest end, to cover a time window."""
     start, end = window_s
     spacing = columns.spacing_s
     last_s = columns.origin_s + (columns.count - 1) * spacing
@@ -206,7 +206,7 @@ class BumpTensors(ContinuedField):
         self._history_s: float | None = None
         self._fading_s = math.inf
         self._spare_rows = 0
-        """Number of inert rows at the end, which `append` uses without moving a tensor."""
+        """Number of inert Gaussian rows at the end of the tensors, which `append` uses without reallocation."""
         self.centers = torch.nn.Parameter(torch.arange(bumps, dtype=torch.float32).repeat(count, 1))
         self.log_widths = torch.nn.Parameter(torch.zeros(count, bumps))
         self.weights = torch.nn.Parameter(torch.zeros(count, bumps, BASIS_CHANNELS))
@@ -392,7 +392,7 @@ class BumpTensors(ContinuedField):
         return torch.where(trained[:, None], deltas * math.exp(-self.spacing_s / self._fading_s), deltas)
 
     def _append_columns(self, added: int, held: Tensor | None) -> int:
-        """Append columns at the head and return the number of tail columns that they replaced."""
+        """Append columns for later times and return the number of oldest columns that they replaced."""
         before = self._columns
         if added > before.spare and not before.is_ring:
             end = before.count + added

@@ -58,7 +58,10 @@ def bin_splats(
     n_images: int | None = None,
     **options: Any,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Run `isect_tiles` (sorted) and `isect_offset_encode`; `options` are those of `isect_tiles`."""
+    """Bin splats into tiles and sort each tile's list by depth. Return tiles_per_gauss, flatten_ids and isect_offsets.
+
+    `options` are those of `isect_tiles`.
+    """
     tiles_per_gauss, isect_ids, flatten_ids = isect_tiles(means2d, radii, depths, *grid, n_images=n_images, **options)
     images = math.prod(depths.shape[:-1]) if n_images is None else n_images
     offsets = isect_offset_encode(isect_ids, images, grid.tile_width, grid.tile_height)
@@ -75,7 +78,8 @@ def bin_splats_within(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Emulate the compiled `bin_splats` with a capacity, for unpacked splats.
 
-    Keeps the nearest splats that fit; unused entries come first.
+    Keeps the nearest splats that fit; unused entries come first. Returns tiles_per_gauss, flatten_ids, isect_offsets and the
+    needed capacity, int64 [1].
     """
     tiles_per_gauss, isect_ids, flatten_ids = isect_tiles(means2d, radii, depths, *grid, **options)
     counts = tiles_per_gauss.reshape(-1)

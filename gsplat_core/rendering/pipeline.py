@@ -261,7 +261,7 @@ class Signal(NamedTuple):
     def of_rows(
         self, ops: StepOperations, ids: Tensor, pairs: Pairs, directions: Tensor, batch_dims: int, sparse: bool
     ) -> Tensor:
-        """Return the values [rows, D] of packed rows, before shift and clamp."""
+        """Return the values [rows, D] of the packed rows (visible pairs of camera and Gaussian), before shift and clamp."""
         assert ops.values_of_rows is not None and ops.visible_harmonics is not None
         per_camera = self.values.dim() - (1 if self.degree is None else 2) == batch_dims + 2
         if per_camera:
@@ -289,7 +289,8 @@ Dense = TypeVar("Dense", DenseProjection, DenseSurfels)
 def view_colors(
     ops: StepOperations, means: Tensor, signals: Sequence[Signal], viewmats: Tensor, dense: Dense
 ) -> tuple[Tensor, Dense]:
-    """Return the channels [..., C, N, D] of all signals seen by each camera; cull Gaussians with non-finite ones.
+    """Return the channels [..., C, N, D] of all signals seen by each camera, and the projection in which Gaussians with
+    non-finite channels are culled.
 
     On CUDA the host does not synchronise, so colours of culled Gaussians are not replaced. They have no effect: culled
     Gaussians are in no tile list, compositing skips non-finite values, and a zero colour gradient adds nothing to the
@@ -325,7 +326,7 @@ def row_colors(
     rows: PackedProjection,
     sparse_grad: SparseGradients,
 ) -> tuple[Tensor, PackedProjection]:
-    """Return the channels [rows, D] of all signals, and the rows without those that have non-finite ones."""
+    """Return the channels [rows, D] of all signals, and the projection `rows`; rows with non-finite channels are left out."""
     batch_dims, n_cameras = means.dim() - 2, viewmats.shape[-3]
     pairs = Pairs(math.prod(means.shape[:-2]), n_cameras, means.shape[-2])
 

@@ -447,8 +447,8 @@ def continued(step: TrainingStep, prior: MotionPrior | None, learned_s: float) -
 
 
 def newest_state(step: TrainingStep, prior: MotionPrior, learned_s: float) -> tuple[Gaussians, NewestState]:
-    """Return the scene at `learned_s`, the time of the newest trained frame, with the prior's
-    continuation, without the past and in its own memory.
+    """Return a copy of the scene at `learned_s`, the time of the newest trained frame, and a field that continues it with the
+    prior's velocity. The field does not contain the past.
     """
     with torch.no_grad():
         deltas = motion_of(step).deltas(learned_s)

@@ -151,7 +151,9 @@ def _matrices(triangles: Tensor) -> Tensor:
 def _jacobian(
     local: Tensor, focal: Tensor, center: Tensor, size: tuple[int, int], camera_model: str
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return Jacobians [..., C, N, 2, 3], image points at unit focal length [..., C, N, 2], and masks of clamped rows."""
+    """Return Jacobians [..., C, N, 2, 3], image points at unit focal length [..., C, N, 2], and masks of the Jacobian's rows
+    (x, y) that are evaluated at the clamped position.
+    """
     x, y, z = local.unbind(-1)
     fx, fy = focal.unbind(-1)
     zero, never = torch.zeros_like(x), torch.zeros_like(local[..., :2], dtype=torch.bool)

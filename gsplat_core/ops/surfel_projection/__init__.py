@@ -83,7 +83,7 @@ def fully_fused_projection_2dgs(
 def sparse_gradients(
     means: Tensor, quats: Tensor, scales: Tensor, radii: list[Tensor]
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the tensors with gradients that are sparse COO tensors of the visible surfels.
+    """Return means, quats and scales, unchanged, such that their gradients become sparse COO tensors of the visible surfels.
 
     Args:
         means, quats, scales: of surfels without batch dimensions.

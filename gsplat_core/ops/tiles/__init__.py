@@ -189,7 +189,9 @@ def _check(
 def _flat(
     means2d: Tensor, radii: Tensor, depths: Tensor, conics: Tensor | None, opacities: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor | None]:
-    """Flatten all images into one dimension and detach, because binning has no gradient."""
+    """Return the tensors in the order of the arguments, with all images flattened into the first dimension and detached,
+    because binning has no gradient.
+    """
     return (
         means2d.detach().reshape(-1, 2),
         radii.reshape(-1, 2),

@@ -156,7 +156,10 @@ def sigma_offsets(quats: Tensor, scales: Tensor) -> Tensor:
 def _pixels(
     world: Tensor, shutter: Shutter, Ks: Tensor, lens: Lens, limits: Limits, margin: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return pixels [..., C, M, 2] of world points [..., 1, M, 3], and masks: seen by the lens, inside the picture and its margin."""
+    """Return pixels [..., C, M, 2] of world points [..., 1, M, 3], and two masks [..., C, M].
+
+    The first mask is True for points that the lens sees, the second for pixels in the picture or its margin.
+    """
     projected = lens.project(shutter.to_camera(world), Ks)
     if shutter.rolls:
         for _ in range(SHUTTER_STEPS):

@@ -302,7 +302,7 @@ class FusedStep:
         tensors = {name: tensor.detach() for name, tensor in scene.tensors().items() if name in GEOMETRY}
         if deltas is not None:
             tensors = {name: tensor + deltas[:, GEOMETRY[name]] for name, tensor in tensors.items()}
-        # In this thread, because a capture belongs to one thread.
+        # Run the backward pass in this thread, because a CUDA graph capture belongs to one thread.
         with torch.enable_grad(), torch.autograd.set_multithreading_enabled(False):
             leaves = {name: tensor.requires_grad_() for name, tensor in tensors.items()}
             seen = Gaussians.from_tensors({**leaves, LEFT: scene.sh})

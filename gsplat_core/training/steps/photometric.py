@@ -376,7 +376,7 @@ def _composite(
     means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, width: int, height: int, tile_size: int,
     isect_offsets: Tensor, flatten_ids: Tensor, **_: object,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-    """Composite one image and return also the last splat of every pixel, which the gradient needs."""
+    """Composite one image. Return colours, alphas and, for the gradient, the last blended splat of every pixel."""
     splats = (means2d[0], conics[0], colors[0], opacities[0])
     return torch.ops.gsplat_core.composite(
         *splats, isect_offsets, flatten_ids, None, None, None, width, height, tile_size

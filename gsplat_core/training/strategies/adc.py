@@ -193,7 +193,7 @@ class DefaultStrategy(Strategy):
 
     @torch.no_grad()
     def _grow_gs(self, params: Params, optimizers: Optimizers, state: dict[str, Any], step: int) -> tuple[int, int]:
-        """Duplicate and split Gaussians. Returns both numbers; synchronises."""
+        """Duplicate and split Gaussians. Returns the numbers of duplicated and of split ones; synchronises."""
         copied, divided = self._to_grow(params, state, step)
         copies, splits = int(torch.count_nonzero(copied)), int(torch.count_nonzero(divided))
         if copies:
@@ -269,8 +269,8 @@ class SceneAdc:
         self._state = self._strategy.initialize_state(plan.step.distance(plan.observations[0].camera))
 
     def before_step(self, number: int, rate_scale: float) -> bool:
-        """Multiply, remove and reset Gaussians before a step of an offline training if the schedule demands it; see
-        `SceneStrategy`.
+        """Multiply, remove and reset Gaussians before a step of an offline training if the schedule demands it. Return True if
+        their number may have changed; see `SceneStrategy`.
         """
         strategy, screen = self._strategy, self._step.screen
         if screen is None or number >= strategy.refine_stop_iter:

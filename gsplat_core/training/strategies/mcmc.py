@@ -163,8 +163,8 @@ class SceneMcmc:
         self._state = self._strategy.initialize_state()
 
     def before_step(self, number: int, rate_scale: float) -> bool:
-        """Jitter Gaussians before a step of an offline training other than the first, and relocate and add some every
-        `refine_every` steps; see `SceneStrategy`.
+        """Add noise to the positions before each step of an offline training except the first. Relocate and add Gaussians every
+        `refine_every` steps, and then return True; see `SceneStrategy`.
         """
         if number == 0:
             return False

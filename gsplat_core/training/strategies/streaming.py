@@ -99,7 +99,7 @@ class Rounds:
         self._rounds = densification_rounds(plan.steps)
 
     def before_step(self, number: int, rate_scale: float) -> bool:
-        """Run a round of changes if one is due before this step; see `SceneStrategy`."""
+        """Run each round of changes that is due before this step. Return True if one was run; see `SceneStrategy`."""
         changed = False
         while self._rounds and number >= self._rounds[0] > 0:
             self._round(1 - (len(self._rounds) - 1) / DENSIFY_ROUNDS, rate_scale)
