@@ -348,7 +348,7 @@ ROWS_AT_ONCE = 1 << 14
 
 
 def towards_neighbours_(values: Tensor, amount: float) -> None:
-    """Diffuse `values` [N, T, ...] along T in place: move each towards its neighbours' mean.
+    """Diffuse `values` [N, T, ...] along T in place: move each by the share `amount` towards the mean of its two neighbours.
 
     Both ends are fixed. For amounts up to 1 this is one explicit diffusion step, a descent step on
     the squared differences of neighbours.
@@ -360,7 +360,7 @@ def towards_neighbours_(values: Tensor, amount: float) -> None:
 
 
 def towards_others_(values: Tensor, others: Tensor, amount: float) -> None:
-    """Move each of `values` [N, ...] towards the mean of its `others` [N, K], in place.
+    """Move each row of `values` [N, ...] by the share `amount` towards the mean of the rows at `others`, int64 [N, K], in place.
 
     All rows are updated simultaneously.
     """

@@ -206,7 +206,7 @@ def _with_further(
     if {*asked} & {*SURFACE_OUTPUTS}:
         outputs = {**model.surface(time_s, camera)._asdict(), **outputs}
     if {*asked} & {*FLOW_OUTPUTS}:
-        # The compiled op is loaded when it is first needed, so that pictures alone do not depend on it.
+        # Imported here, so that rendering only pictures does not load the compiled op for flow.
         from gsplat_core.rendering.flow import render_motion
 
         outputs |= render_motion(model.at(time_s), model.at(time_s + FLOW_STEP_S), camera)

@@ -135,7 +135,7 @@ def _exchange(rows: Tensor, sent: list[int], received: list[int]) -> Tensor:
 
 
 class _Exchange(torch.autograd.Function):
-    """Autograd function that sends rows to each process and returns the received ones. Gradients are sent back."""
+    """Autograd function that sends tensor rows to each process and returns the received rows. Gradients are sent back."""
 
     @staticmethod
     def forward(ctx: Any, rows: Tensor, sent: list[int], received: list[int]) -> Tensor:

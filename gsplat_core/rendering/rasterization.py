@@ -228,7 +228,7 @@ def _has_fitting_colors(
 
 
 def _splat_rays(*arguments: Any) -> tuple[Tensor, Tensor]:
-    # The op is loaded when it is first needed, so that pictures alone do not depend on it.
+    # Imported here, so that rendering only pictures does not load the op for rays.
     from gsplat_core.ops.splat_rays import splat_rays
 
     return splat_rays(*arguments)

@@ -175,7 +175,7 @@ class TrainableRenderer(RendererKind, Protocol):
         """
 
     def extended(self, gaussians: Gaussians) -> Gaussians:
-        """Return the Gaussians with the renderer's tensors in `extra`; present ones are unchanged."""
+        """Return the Gaussians with the renderer's tensors in `extra`. Tensors that are already there stay unchanged."""
 
     def first_values(self, distance: float) -> Mapping[str, float]:
         """Return initial values, all positive, of the renderer's scalars for the whole scene, by name.

@@ -98,7 +98,7 @@ def blend_view_rays(
     Returns:
         The rays, and the required capacity, int64 [1]; None without `capacity`.
     """
-    # The compiled ops are loaded when they are first needed, so that pictures alone do not depend on them.
+    # Imported here, so that rendering only pictures does not load the compiled ops for rays.
     from gsplat_core.ops.ray_blending import MAX_CHANNELS, blend_rays
     from gsplat_core.ops.splat_rays import splat_rays
 

@@ -91,13 +91,13 @@ class RayLoss(Protocol):
 
 @runtime_checkable
 class ExtendingLoss(Protocol):
-    """Loss that trains tensors of its own in `Gaussians.extra`."""
+    """Loss that needs further trained tensors of the Gaussians, such as class logits, in `Gaussians.extra`."""
 
     rates: ClassVar[Mapping[str, float]]
     """Learning rates of the loss's tensors by name."""
 
     def extended(self, gaussians: Gaussians) -> Gaussians:
-        """Return the Gaussians with the loss's tensors; present ones are unchanged."""
+        """Return the Gaussians with the loss's tensors in `extra`. Tensors that are already there stay unchanged."""
 
 
 class LossKind(Protocol):
@@ -337,7 +337,7 @@ class Semantics:
     rates: ClassVar[Mapping[str, float]] = {SEMANTICS: 0.05}
 
     def extended(self, gaussians: Gaussians) -> Gaussians:
-        """Return the Gaussians with class logits in `extra`: present ones unchanged, new ones 0."""
+        """Return the Gaussians with class logits in `extra`. Logits that are already there stay unchanged, new ones are 0."""
         if SEMANTICS in gaussians.extra:
             return gaussians
         logits = gaussians.means.new_zeros(gaussians.count, CLASSES)

@@ -54,7 +54,7 @@ class FlowLoss:
 
     def __init__(self) -> None:
         self._flows: OrderedDict[tuple[int, int], Tensor] = OrderedDict()
-        """Flow [h, w, 2] by the numbers of both frames; NaN where unreliable."""
+        """Cache of observed flow [h, w, 2] from one frame to another, by both frame numbers; NaN where unreliable."""
         self._neighbours = torch.empty(0, 0, dtype=torch.int64)
         self._calls = 0
 

@@ -312,7 +312,7 @@ scaled by the learning rates' factor. It is reduced for fast motion by the root 
 """
 
 CORRECTION = 1.0
-"""Relaxation of the colour corrections at the end of training, if `steadiness` is 1; other frames are not corrected.
+"""Relaxation of the colour corrections at the end of training. Recordings with a `steadiness` below 1 get no corrections.
 
 A correction at the time of one frame also changes the colours of its neighbours in time.
 """
@@ -497,8 +497,8 @@ MOST_STEPS = 64_000
 LEAST_GAIN_DB = 0.05
 """Smallest gain in validation PSNR from doubling the training steps, in dB, after which a doubling is tried again."""
 INPUT_GAIN_DB = 0.3
-"""Smallest gain, in dB, for which other inputs than the given ones are used. Depth is not left out for less, because it
-also gives the scale and the shape.
+"""Smallest gain in validation PSNR, in dB, for which a reconstruction leaves out given inputs such as depth. Depth is not left
+out for less, because it also gives the scale and the shape.
 """
 USUAL_STEPS = 2000
 """Number of training steps for recordings that have too few frames for validation frames."""

@@ -46,7 +46,7 @@ from gsplat_core.training.steps.step import TrainingStep
 from gsplat_core.transfers import tensor_of
 
 MOST_LATE = 30
-"""Largest number of newer frames for which late depth is still used."""
+"""Largest number of frames that may have followed a frame when its depth arrives late; the depth of an older frame is ignored."""
 
 
 @dataclass(frozen=True)

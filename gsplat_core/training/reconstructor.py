@@ -1,4 +1,4 @@
-"""Learning of a deforming scene from frames, online as they arrive or offline from all of them."""
+"""Training of a deforming scene from frames: online as the frames arrive, or offline on all frames of a recording."""
 
 from __future__ import annotations
 
