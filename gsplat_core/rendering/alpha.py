@@ -157,7 +157,7 @@ class AlphaRenderer:
             frames = made
             self._by_slot[slot.number] = key, frames
         if self._frames is not None and self._frames.gaussians.count == frames.gaussians.count:
-            # An overflow in one slot raises the capacity for all slots.
+            # Tile lists that overflowed in one slot raise the capacity for all slots.
             frames.capacity = self._frames.capacity
         return frames
 

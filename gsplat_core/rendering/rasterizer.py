@@ -147,7 +147,7 @@ class Rasterizer:
         output = kept[1].render(camera).result()
         mode, depth = self._options["render_mode"], output.depth[..., None]
         parts = {"RGB": [output.image], "ED": [depth], "RGB+ED": [output.image, depth]}[mode]
-        # `cat` copies. The next picture overwrites the graph's memory.
+        # Return copies (`cat` makes one), because the next picture overwrites the CUDA graph's memory.
         return RasterizedPicture(torch.cat(parts, -1), output.alpha[..., None].clone(), None)
 
 

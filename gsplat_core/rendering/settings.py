@@ -207,7 +207,7 @@ def signature_of(arguments: Arguments, options: tuple[Any, ...]) -> Hashable | N
     if not _PLAIN_OPTIONS.issuperset(types) or not PLAIN_TENSORS.issuperset(map(type, arguments)):
         return None
     kinds = [None if t is None else (t.shape, t.dtype, t.device, t.layout, t.requires_grad) for t in arguments]
-    # The types are part of the key, because True == 1 == 1.0.
+    # The key includes the types of the options, because True, 1 and 1.0 are equal.
     return options, types, tuple(kinds), torch.is_grad_enabled()
 
 

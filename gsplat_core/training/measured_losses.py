@@ -128,7 +128,7 @@ def _compared_size(camera: Camera) -> Camera:
 LEAST_ANGLE_DEG = 1.5
 """Smallest angle between the rays of two camera views to a point at which the point is triangulated."""
 LARGEST_ANGLE_DEG = 15.0
-"""Largest angle between the viewing directions of two frames that are matched; beyond it optical flow finds few matches."""
+"""Largest angle between the directions from which two matched frames see the tissue; beyond it flow finds few matches."""
 MOST_VIEWS, LEAST_VIEWS = 8, 2
 """Largest and smallest number of other frames in which a frame's point is matched for triangulation."""
 SIGMA = 0.01

@@ -572,8 +572,8 @@ def unprojected(
         return np.concatenate([plane, z[:, None]], 1), np.full_like(z, 1 / camera.K[0, 0])
     pixel = z / camera.K[0, 0]
     if camera.model == "fisheye":
-        # The plane holds angles here. A pixel is stretched by 1 / cos² radially and tan / angle
-        # tangentially; use the geometric mean.
+        # For a fisheye camera, `plane` holds angles. A pixel is stretched by 1 / cos² radially and by tan / angle
+        # tangentially; the geometric mean is used.
         angle = np.clip(np.linalg.norm(plane, axis=1), 1e-9, MAX_ANGLE_RAD)
         stretch = np.tan(angle) / np.maximum(np.linalg.norm(plane, axis=1), 1e-9)
         plane = plane * stretch[:, None]

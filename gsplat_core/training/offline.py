@@ -497,8 +497,8 @@ MOST_STEPS = 64_000
 LEAST_GAIN_DB = 0.05
 """Smallest gain in validation PSNR from doubling the training steps, in dB, after which a doubling is tried again."""
 INPUT_GAIN_DB = 0.3
-"""Smallest gain in validation PSNR, in dB, for which a reconstruction leaves out given inputs such as depth. Depth is not left
-out for less, because it also gives the scale and the shape.
+"""Smallest gain in validation PSNR, in dB, for which depth or the right eye is left out, or estimated camera poses are used.
+Depth is not left out for less, because it also gives the scale and the shape.
 """
 USUAL_STEPS = 2000
 """Number of training steps for recordings that have too few frames for validation frames."""

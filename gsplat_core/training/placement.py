@@ -192,7 +192,7 @@ class CapturedCorrection:
         self._status.queue(frame.status)
         known = (self._depth > 0) & (self._mask > 0) & (frame.alphas >= UNCOVERED_ALPHA)
         known &= frame.status[STATUS_OVERFLOW] == 0
-        # `Seen` does the same but copies the camera from the host, which cannot be captured.
+        # Projected here instead of by `Seen`, which copies the camera from the host and cannot be captured in a CUDA graph.
         rotation, translation = controls.viewmat[:3, :3], controls.viewmat[:3, 3]
         local = ((scene.means + seen[:, POSITION])[:, None, :] * rotation).sum(2) + translation
         focal, middle = controls.intrinsics.diagonal()[:2], controls.intrinsics[:2, 2]

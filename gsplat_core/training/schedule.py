@@ -139,8 +139,8 @@ class Spending:
         wanted = 2 if by_turns and self.turn else 1
         if self._has_time_for(wanted):
             return True
-        # A replay receives only the number of steps. A first-eye step in place of a second-eye step must
-        # therefore be the last one, so that the replay can derive the eye of each step from the number.
+        # A replay of a recorded stream knows only the number of steps. A first-eye step in place of a second-eye step
+        # must therefore be the last one, so that the replay can derive the eye of each step from the number.
         needed = self.made < budget.at_least
         self._was_last = wanted == 2 and (self.made + 2 > budget.at_least if needed else self._has_time_for(1))
         return needed or self._was_last

@@ -279,7 +279,7 @@ def _update(parameter: Tensor, first: Tensor, second: Tensor, visible: Tensor, g
     rate, eps, betas = float(group["lr"]), group["eps"], group["betas"]
     row = parameter.numel() // visible.numel()
     hidden = ~visible.repeat_interleave(row).reshape(parameter.shape)
-    # The op leaves rows with a non-finite gradient as they are.
+    # Hidden rows get NaN gradients, because the op leaves rows with a non-finite gradient unchanged.
     gradient = parameter.grad.masked_fill(hidden, math.nan)  # type: ignore[union-attr]
     if parameter.dtype == torch.float32 and parameter.is_contiguous():
         adam_step_queued(

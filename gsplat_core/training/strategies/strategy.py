@@ -425,7 +425,7 @@ def _append(params: Params, optimizers: Optimizers, parents: Tensor, copies: Cal
         return torch.cat([values, values.new_zeros(len(parents), *values.shape[1:])])
 
     def appended(name: str, tensor: Tensor) -> Tensor:
-        # `copies` may change rows of the tensor, which the result contains.
+        # Called before the concatenation, because `copies` may also change existing rows of `tensor` in place.
         added = copies(name, tensor)
         return Parameter(torch.cat([tensor, added]), tensor.requires_grad)
 
