@@ -1,11 +1,12 @@
-"""Ops of training in plain torch, any floating dtype: losses of pictures, Adam, the statistics of strategies, and penalties of feature planes.
+"""Ops of training in plain torch, for any floating dtype: losses of pictures, Adam, the statistics of strategies, and
+penalties of feature planes.
 
 The penalties are the test reference of `hexplane_planes_adam_` (K-Planes, Fridovich-Keil et al. 2023, section 3.4). Planes
 are [V, U, C]. A plane too small for a difference along an axis has a penalty of 0 there, with zero gradient.
 
-The image loss and its terms are differentiable by autograd. A term without any pixel (no tissue, no valid depth) is 0 with zero gradient, never NaN.
-Structural similarity (Wang et al. 2004): 11x11 Gaussian window of sigma 1.5, zero padding, C1 = 0.01^2, C2 = 0.03^2,
-values in 0..1.
+The image loss and its terms are differentiable by autograd. A term without any pixel (no tissue, no valid depth) is 0 with
+zero gradient, never NaN. Structural similarity (Wang et al. 2004): 11x11 Gaussian window of sigma 1.5, zero padding,
+C1 = 0.01^2, C2 = 0.03^2, values in 0..1.
 """
 
 from __future__ import annotations

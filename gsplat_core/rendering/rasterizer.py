@@ -1,4 +1,6 @@
-"""Rasterizers with fixed options, for repeated pictures of Gaussians, and with the arguments of gsplat's wrapper of the INRIA trainer's renderer."""
+"""Rasterizer with fixed options, for repeated pictures of Gaussians, and a function with the arguments of gsplat's wrapper of
+the INRIA trainer's renderer.
+"""
 
 from __future__ import annotations
 

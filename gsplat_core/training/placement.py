@@ -8,8 +8,8 @@ times, since it assumes static tissue. Later measured or stereo depth corrects a
 Depth may become available after its frame was trained on (`LateDepth`). On a GPU the correction is a CUDA graph,
 because a live stream has no time for about a hundred launches.
 
-The error of a model's depth has two parts. The depth of a frame has a standard error of its own. The model differs from that depth, most
-of all where tissue moved along the line of sight faster than the model followed. Both are relative to the depth.
+The error of a model's depth has two parts. The depth of a frame has a standard error of its own. The model differs from that
+depth, most of all where tissue moved along the line of sight faster than the model followed. Both are relative to the depth.
 """
 
 from __future__ import annotations

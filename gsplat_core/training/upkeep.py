@@ -379,7 +379,7 @@ class Places:
         Args:
             gaussians: last state of the scene.
             camera: camera that last observed the scene.
-            time_s: time of the copy in seconds.
+            time_s: time in seconds at which the stream left the scene.
             seen: structure of a picture of the scene from that camera; None to render it when it is needed.
         """
         self.to_host()
@@ -445,7 +445,7 @@ class LeftScenes:
         """
         self._kept: TrainingStep | None = None
         self._kept_size: tuple[int, int] | None = None
-        """Picture size (height, width) of the scene whose memory is kept for the next scene."""
+        """Picture size (width, height) of the scene that was started last, whose memory the next scene may reuse."""
 
     def forget(self) -> None:
         """Discard all earlier scenes."""
@@ -458,8 +458,9 @@ class LeftScenes:
             step: training of the scene.
             camera: camera that last observed the scene.
             time_s: time of the last observation in seconds.
-            frame: frame of that observation, which stands for a rendering of the scene from its camera; None to render the scene when a frame is
-                compared with it, which delays that frame's picture by more than half a frame interval.
+            frame: frame of that observation, whose picture is compared with later frames in place of a rendering of the scene.
+                None to render the scene for the first comparison, which delays the picture of the later frame by more than
+                half a frame interval.
         """
         self.places.leave(step.at(time_s), camera, time_s, None if frame is None else structure_of(frame))
 
@@ -474,7 +475,7 @@ class LeftScenes:
         return self._recognised[1].gaussians if self._recognised and self._recognised[0] == seq else None
 
     def keep_memory(self, step: TrainingStep | None) -> None:
-        """Keep the tensors of a scene, to be reused by the next scene. With None, the tensors kept before stay."""
+        """Keep the tensors of a scene, to be reused by the next scene. None leaves the scene kept before unchanged."""
         self._kept = step or self._kept
 
     def restarted(self, gaussians: Gaussians, observation: Observation) -> TrainingStep | None:

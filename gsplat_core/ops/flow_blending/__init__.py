@@ -34,9 +34,10 @@ def blend_flow(
     """Blend the flow of N splats front to back over every pixel of the first camera.
 
     The ray of pixel x is t d with d = K1⁻¹ (x, 1). Splat i shows the point at t_i = (z + n·δ) / (1 + l·δ + δᵀ M δ) with δ
-    the offset of x from its mean, limited to z ± reach. It carries the point to p = a + t_i B d in the axes of the
-    second camera, so its flow is K2 p / p_z - x. Weights are those of `rasterize_to_pixels`. Only `planes` has a gradient. Splats with a non-finite
-    value are skipped, and so are points behind the second camera. The result does not depend on the number of threads.
+    the offset of x from the splat's mean, limited to z ± reach; z, n, l, M and reach are its ray coefficients `rays`. The
+    splat carries the point to p = a + t_i B d in the axes of the second camera, so its flow is K2 p / p_z - x. Weights are
+    those of `rasterize_to_pixels`. Only `planes` has a gradient. Splats with a non-finite value are skipped, and so are
+    points behind the second camera. The result does not depend on the number of threads.
 
     Args:
         means2d: float32 [N, 2] pixels of the first camera.

@@ -1,10 +1,12 @@
 """Projection, values and colours of visible pairs of camera and Gaussian only.
 
-A row is a visible pair. Its id is that of `Pairs`; ids ascend. Memory depends on the number of rows. Gradients of rows are added to those of their Gaussians camera by camera, in a fixed order. Sparse
-gradients hold one entry per row instead.
+Results have one row for each visible pair, in ascending order of the pairs' ids (`Pairs`), so memory depends on the number of
+visible pairs. Gradients of rows are added to those of their Gaussians camera by camera, in a fixed order. Sparse gradients
+hold one entry per row instead.
 
-The gradient with respect to the intrinsics consists of torch operations of any device. Focal lengths scale the rows of the projection's Jacobian J, and the principal point shifts the image. Where the pinhole
-Jacobian is clamped, its last column depends on the principal point instead of the focal length.
+The gradient with respect to the intrinsics is computed by torch operations on any device. Focal lengths scale the rows of the
+projection's Jacobian J, and the principal point shifts the image. Where the pinhole Jacobian is clamped, its last column
+depends on the principal point instead of the focal length.
 """
 
 from __future__ import annotations

@@ -4,11 +4,11 @@ Both eyes of a stereo scope train the geometry. Each eye's colours are trained b
 view-dependent differences such as highlights would otherwise pull every colour back and forth. Temporal colour changes
 are learned from the left eye and apply to both.
 
-Colours can also be corrected with fixed geometry. A picture is linear in the colours of its splats: I_p = sum_k w_kp c_k, with blending weights w. A live stream corrects
-colours from the residual of a picture by SIRT (Gilbert 1972), an iteration from tomography without a learning rate.
-Each colour moves by the weighted mean of the residual over the pixels that show it. The weights of a pixel sum to at
-most 1, so the squared error never grows for a relaxation up to 2. Low-frequency residuals vanish in the first step, and
-colours without residual do not move. `colour_change` repeats the iteration to fit a whole picture.
+Colours can also be corrected with fixed geometry. A picture is linear in the colours of its splats: I_p = sum_k w_kp c_k, with
+blending weights w. A live stream corrects colours from the residual of a picture by SIRT (Gilbert 1972), an iteration from
+tomography without a learning rate. Each colour moves by the weighted mean of the residual over the pixels that show it. The
+weights of a pixel sum to at most 1, so the squared error never grows for a relaxation up to 2. Low-frequency residuals vanish
+in the first step, and colours without residual do not move. `colour_change` repeats the iteration to fit a whole picture.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.observations import Observation
 
 MOST_RELAXATION = 2.0
-"""Upper bound of the relaxation. The iteration need not converge at or above it."""
+"""Upper bound of the relaxation of colour corrections, at which the repeated correction need no longer converge."""
 LEAST_WEIGHT_PX = 0.3
-"""Offset in pixels, added to a splat's sum of blending weights before the residual is divided by it. Barely visible splats
-are thus corrected less.
+"""Offset in pixels, added to a splat's sum of blending weights before the splat's summed residual is divided by that sum.
+Barely visible splats are thus corrected less.
 """
 
 

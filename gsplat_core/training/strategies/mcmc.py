@@ -1,9 +1,10 @@
-"""Training as a Markov chain (Kheradmand et al. 2024): transparent Gaussians move to visible places, and positions diffuse.
+"""Strategies that move Gaussians at random: `mcmc` (Kheradmand et al. 2024), in which transparent Gaussians move to visible
+places and positions diffuse, and `birth_death`.
 
-The strategy `birth_death` makes birth-death moves between offline training steps: Gaussians that raise the loss make place for copies of
-others. Births and deaths are drawn from φ = ∂L/∂ln o (`gsplat_core.regression`), which follows from the gradients that the
-optimiser has averaged. Copies take the opacities and scales that keep the picture (Kheradmand et al. 2024, "3D Gaussian
-Splatting as Markov Chain Monte Carlo", eq. 9, for two copies).
+`birth_death` removes Gaussians that raise the loss and copies others, between offline training steps. Births and deaths are
+drawn from φ = ∂L/∂ln o (`gsplat_core.regression`), which follows from the gradients that the optimiser has averaged. Copies
+take the opacities and scales that keep the picture (Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte
+Carlo", eq. 9, for two copies).
 """
 
 from __future__ import annotations
