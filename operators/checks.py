@@ -182,7 +182,8 @@ class PictureStagesOp(StageOp):
         self.pictures.reset()
         self._turns = Turns(len(self.stages) - 1, LOOK_EVERY_S)
         self._settled = False
-        """True if the previous frame allows the next to be ordinary: it was unchanged and did not begin a scene."""
+        """True if the previous frame allows the next to be ordinary: no stage changed its picture or withheld it, and it did not
+        begin a scene."""
         self._counts = [0, 0]
 
     def start(self) -> None:
@@ -213,7 +214,8 @@ class PictureStagesOp(StageOp):
 
 
 def _settled(frame: Frame, came: Frame) -> bool:
-    """Return True if the stages changed only the masks, and did not withhold the frame or begin a scene."""
+    """Return True if the stages kept picture and timestamp of the incoming frame `came`, and `frame` is usable and begins no
+    scene."""
     unchanged = frame.image is came.image and frame.pts_ns == came.pts_ns
     return unchanged and frame.new_scene is None and frame.unusable is None
 

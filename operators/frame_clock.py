@@ -28,7 +28,7 @@ DISPLAY_DECAY = 0.2
 """Weight of the newest picture in the moving averages of training time and display latency."""
 
 REHEARSAL_MARGIN_NS = 300_000
-"""Time before the next expected frame at which rehearsal ends, in nanoseconds."""
+"""Time before the next expected frame at which training on earlier frames (rehearsal) ends, in nanoseconds."""
 SHOWN_WITHIN_S = 0.005
 """Longest wait for a picture to be displayed before rehearsal, in seconds."""
 AUTO_SHARE, AUTO_MOST_MS, LEAST_SHARE = 0.6, 18.3, 0.34
@@ -74,7 +74,7 @@ class ClockSettings:
     first_at_least_steps: int | None = None
     """Minimum number of steps for the first frame of a scene. None: device default."""
     rehearse_at_most: int = 120
-    """Maximum number of rehearsal steps between two frames, also while no frame arrives."""
+    """Maximum number of optimiser steps on earlier frames (rehearsal) after each frame, however long the next one takes."""
 
     def __post_init__(self) -> None:
         check_option("budget_ms", self.budget_ms)
@@ -251,7 +251,7 @@ USEFUL_FRAMES = 16
 useless renewal the next one waits for twice as many pictures.
 """
 COMPARED_ROWS = 128
-"""Number of picture rows that are compared at least; rows between them are left out, to save time before the display."""
+"""Minimum number of evenly spaced picture rows that are compared. Other rows are skipped to save time before the display."""
 
 
 class BehindGuard:

@@ -184,11 +184,11 @@ CLASS_COLOURS = np.array(
 )  # fmt: skip
 """Colours of classes (ColorBrewer's Set1); they repeat after the last one."""
 UNDECIDED = (96, 96, 96)
-"""Colour of pixels on which no class was learned."""
+"""RGB colour of pixels for which no class is clearly the most probable."""
 LEAST_LOGIT = 0.05
-"""Smallest lead of the largest logit over the mean of a pixel with a class."""
+"""Difference between the largest and the mean logit of a pixel above which it is drawn in the colour of its class."""
 FULL = 0.98
-"""Quantile of the values that has the last colour, for values without a fixed range."""
+"""Quantile of a picture's values that is drawn in the last colour of the map, for outputs without a fixed range."""
 LEAST_FLOW_PX = 0.25
 """Smallest speed in pixels that is drawn in full saturation, so that noise of a still scene stays pale."""
 

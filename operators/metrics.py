@@ -131,7 +131,7 @@ SIMILARITY_EVERY = 8
 
 @dataclass(frozen=True)
 class OnScreenResult:
-    """Scores of a live stream that complement `QualityResult`; None if no frame was scored."""
+    """Scores of a live stream that complement `QualityResult`. Scores are None if no frame was scored."""
 
     settled_db: float | None
     """Mean tissue PSNR after the first second, in dB: training error of the displayed pictures,
@@ -140,7 +140,7 @@ class OnScreenResult:
     worst_db: float | None
     """Lowest tissue PSNR of a frame after the first second, in dB."""
     worst_seq: int | None
-    """Sequence number of the frame with the PSNR `worst_db`."""
+    """Sequence number of the frame with the lowest PSNR, `worst_db`."""
     previous_frame_db: float | None
     """Mean tissue PSNR in dB of the previous raw frame after the first second (trivial baseline)."""
     previous_frame_throughout_db: float | None

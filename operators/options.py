@@ -43,7 +43,7 @@ pictures of a finished model, by `intrasplat render` or through the REST API."""
 EVERYWHERE: tuple[Command, ...] = get_args(Command)
 _NUMBER = re.compile(r"[0-9]*\.?[0-9]+(?:e-?[0-9]{1,2})?")
 MAX_TEXT = 4096
-"""Maximum length of a text, in characters."""
+"""Maximum length of the value of a text option, in characters."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -56,7 +56,7 @@ _MOST_JSON_BYTES = 64 << 20
 
 
 def is_own_file(path: Path) -> bool:
-    """Return True if the file has the mark for its suffix. False for a missing or unreadable file."""
+    """Return True if this program wrote the file, by the mark for its suffix. False for a missing or unreadable file."""
     recognise = _KINDS.get(path.suffix.lower())
     if recognise is None:
         return False
@@ -210,7 +210,7 @@ class FolderLock:
 
 _UNSPECIFIC = frozenset({"images", "flow", "views"})
 SIDECARS = _UNSPECIFIC | {"images_right", "masks", "depth", "true_depth", "scene_flow"}
-"""Names of sub-folders that belong to a recording."""
+"""Names of sub-folders in which recordings store data next to their pictures; outputs must not replace them."""
 DESCRIPTIONS = ("recording.json", "cameras.json", "poses_bounds.npy", "valid_mask.png", "session.json")
 """Names of files that occur only in a recording's folder."""
 MAX_PATH_BYTES = 4096
@@ -392,7 +392,7 @@ _RESULT = re.compile(
 )
 """Names of results. With the marker of an old version, which lists no files, all of them count as results of a run."""
 _KNOWN = re.compile(rf"(?:{_RESULT.pattern})|model/(?:model(?:\.next)?\.safetensors|manifest(?:\.next)?\.json)")
-"""Paths of result files, for markers without fingerprints."""
+"""Paths of result files. They identify the results of an old version, which recorded no fingerprints."""
 
 
 class OutputFolder:
@@ -581,13 +581,20 @@ def _fingerprint(path: Path) -> str:
 
 
 def _contents(marker: dict[str, object], name: str) -> dict[str, str] | None:
-    """Return fingerprints by path; None for a marker of an old version without fingerprints."""
+    """Return the fingerprints by path that the marker's entry `name` holds; None for a marker of an old version without them."""
     found = marker.get(name)
     return {str(key): str(value) for key, value in found.items()} if isinstance(found, dict) else None
 
 
 def _foreign_files(folder: Path, results: Iterable[str], contents: dict[str, str] | None) -> list[Path]:
-    """Return the files among the results that the run of `contents` did not write, or that changed since."""
+    """Return the files among the results that an earlier run did not write, or that changed since.
+
+    Args:
+        folder: folder of the results.
+        results: names of files and folders in it.
+        contents: fingerprints by path that the run recorded. None for a run of an old version, whose files are recognised
+            by their paths only.
+    """
     found = []
     for name in results:
         top = folder / name
@@ -648,7 +655,7 @@ def _read_contents(complete: Path) -> dict[str, str]:
 
 
 def _remove_own(folder: Path, old: Path, contents: dict[str, str] | None) -> None:
-    """Remove the replaced results of an earlier run. Foreign files are moved to `kept-…`."""
+    """Remove the replaced results of an earlier run in `old`. Files that it did not write are moved to `kept-…` in `folder`."""
     if not old.is_dir():
         return
     foreign = _foreign_files(old, [entry.name for entry in old.iterdir()], contents)

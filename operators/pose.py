@@ -29,13 +29,13 @@ class EstimatedPoses:
     """Number of frames that got the pose of the previous frame, because they were withheld or had too few matched
     features."""
     begun: int
-    """Number of map initialisations; 1 if tracking was never lost."""
+    """Number of times that the map of visual odometry was initialised; 1 if tracking was never lost."""
     returned: int
     """Number of loop closures: recognitions of an earlier key frame, which correct the following poses."""
     explained: float
     """Share of the squared image motion that the poses explain, at most 1."""
     measured: bool
-    """True if translations have the unit of the frames' depth."""
+    """True if translations have the unit of the frames' depth; False if their scale is arbitrary."""
 
 
 class PoseOp(Operator):

@@ -62,7 +62,8 @@ class FoundMasks:
     tool_share: float
     """Share of tool pixels, 0..1; mean over frames with a detected mask."""
     disbelieved: int = 0
-    """Number of frames whose all-tool mask was rejected, so that all their pixels count as tissue."""
+    """Number of frames whose all-tool mask was rejected because none of the last `BELIEVED_FRAMES` frames showed tissue. All
+    their pixels count as tissue."""
 
 
 class RecordedToolMaskOp(Operator):

@@ -254,7 +254,7 @@ def _fill(places: Places, folder: Path) -> Backup:
             _copy_database(places.database, data / "registry" / DATABASE_FILE)
         _copy_files(places, data)
         missing = set(map(str, _missing(data))) if (data / "registry" / DATABASE_FILE).exists() else set()
-        if missing in (set(), known):  # files missing in two copies are missing in the service itself
+        if missing in (set(), known):  # files missing in two successive copies are missing in the service itself
             break
         known = missing
     _copy_audit(places.data, data)

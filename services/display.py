@@ -150,7 +150,7 @@ class Viewer(AsyncIterator[EncodedPicture]):
 log = logging.getLogger(__name__)
 PictureKind = Literal["raw", "shown", Layer]
 KINDS: tuple[PictureKind, ...] = ("raw", "shown", *LAYERS)
-"""Picture kinds; each has a socket of the same name."""
+"""Picture kinds. The hub receives each from the ZeroMQ socket of the same name."""
 QUALITY = 80
 STALE_S, FROZEN_S = 0.5, 1.0
 """Seconds without a picture from the stream process. After `STALE_S` the hub repeats the last picture dimmed; after

@@ -13,7 +13,7 @@ from gsplat_core.errors import UserError
 log = logging.getLogger(__name__)
 UMASK = 0o077
 OTHERS = 0o077
-"""Permission bits of group and others."""
+"""Mode bits that give access to the group and to other users."""
 KEPT = frozenset(
     {"admin.key", "registry", "recordings", "replays", "snapshots", "uploads", "exports", "cache", "cuda-cache"}
 )

@@ -140,7 +140,7 @@ FILE = "clock.json"
 JUMP_S = 86_400.0
 """Clock step or service pause in seconds, beyond which ages are not trusted."""
 CONFIRM_S = 86_400.0
-"""Seconds of running without another step after which ages are trusted again."""
+"""Seconds for which the service must run without another clock step before ages are trusted again."""
 WRITE_S = 600.0
 
 

@@ -80,11 +80,11 @@ class BenchResult:
     fps_p99: float
     """Frames per second at the frame time that 99 % of the frames do not exceed."""
     parameter_bytes: int
-    """Size of the model's tensors."""
+    """Total size of the model's tensors, in bytes."""
     device_peak_bytes: int | None
-    """Peak memory on the GPU with model and renderer; None on the CPU."""
+    """Peak memory on the GPU with model and renderer, in bytes; None on the CPU."""
     host_peak_bytes: int
-    """Peak resident size of the process, including loading."""
+    """Peak resident memory of the process, including loading, in bytes."""
 
 
 def bench_model(

@@ -238,7 +238,7 @@ class _Work:
         self.window_s = model.time_window_s[0] - tolerance_s, model.time_window_s[1] + tolerance_s
 
     def done(self) -> Evaluation:
-        """Measure the baselines and all selected protocols."""
+        """Measure the baselines and all selected protocols, and return the results."""
         started_at, started_s = datetime.now(UTC), perf_counter()
         wanted = [name for name in PROTOCOLS if self._is_wanted(name)]
         with self._log("baselines") as record:

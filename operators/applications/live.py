@@ -93,7 +93,7 @@ def new_recorder(
 def reconstructor_line(
     reconstructor: Reconstructor, settings: LiveSettings, source: SourceDescription
 ) -> ReconstructorMade:
-    """Return the line that records the settings of a new reconstructor."""
+    """Return the line of a recorded session's schedule that states the settings of a new reconstructor."""
     return ReconstructorMade(
         device=settings.device,
         seed=settings.seed,
@@ -136,7 +136,7 @@ def new_live_reconstructor(settings: LiveSettings, source: FrameSource) -> Recon
 
 @dataclass(frozen=True)
 class LiveParts:
-    """Components of a live session."""
+    """Reconstructor and rasterizer of a live session."""
 
     reconstructor: Reconstructor
     rasterizer: Rasterizer
@@ -148,7 +148,7 @@ def new_parts(settings: LiveSettings, source: FrameSource) -> LiveParts:
 
 
 def warm_up(settings: LiveSettings, source: FrameSource) -> LiveParts:
-    """Create the components and exercise them: capture graphs, allocate memory, measure the duration of a step."""
+    """Create reconstructor and rasterizer and exercise them: capture graphs, allocate memory, measure the duration of a step."""
     camera = source.description.camera
     parts = new_parts(settings, source)
 

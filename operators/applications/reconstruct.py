@@ -185,7 +185,7 @@ class Fitted(NamedTuple):
 
 
 class _Inputs:
-    """Settings of a training with the frames that it gets."""
+    """Settings and frames of one training, with its split into training and validation frames."""
 
     def __init__(self, source: FrameSource, settings: ReplaySettings, path: CameraPath | None = None) -> None:
         self.settings, self.source, self.path = settings, source, path
@@ -300,7 +300,7 @@ class _Fitting:
                     f"{reason}: validation frames score {trial.psnr_db:.2f} dB, otherwise {first.psnr_db:.2f} dB"
                 )
                 inputs, first, learned = other, trial, self._learning
-        self._posed_inputs = None  # frees its frames
+        self._posed_inputs = None  # frees the frames that these inputs hold
         spent_s = self._clock() - self._begin_s
         chosen = choose_steps(self._trial(inputs), limit_s, self._clock, spent_s, first)
         if len(chosen.trials) == 1 and not self._is_stopped:
@@ -318,14 +318,15 @@ class _Fitting:
         return self._posed_inputs
 
     def _with_poses_only(self, inputs: _Inputs) -> _Inputs | None:
-        """Return inputs with estimated poses and without the depth that they give; None if they were not tried with it."""
+        """Return inputs with estimated poses but without the depth that these poses provide. None if `_with_poses` was not tried
+        or was chosen, or if `inputs` have depth without estimated poses."""
         posed = self._posed_inputs
         if posed is None or inputs is posed or inputs.have_depth:
             return None
         return _without_depth(posed)
 
     def _trial(self, inputs: _Inputs) -> Train:
-        """Return a function that trains without the validation frames."""
+        """Return a function that trains for a number of steps without the validation frames and scores the model on them."""
         kept = inputs.validating
         path = inputs.path
         if path is not None:
@@ -334,7 +335,7 @@ class _Fitting:
 
         def train(steps: int) -> Trained:
             if self._is_stopped:
-                return Trained(-math.inf)  # ends the search
+                return Trained(-math.inf)  # a score of -inf ends the search for the number of steps
             learning = self._train(inputs, inputs.part, steps, "validate")
             return Trained(validation_psnr_db(learning, kept), self._setup_s)
 

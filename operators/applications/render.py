@@ -50,7 +50,8 @@ AZIMUTH_DEG, ELEVATION_DEG = 25.0, 15.0
 EYES_APART = 0.06
 """Default stereo baseline divided by the scene's distance: 4.4 mm at 74 mm."""
 MOST_PICTURED = 1_000_000
-"""Number of Gaussians of a static scene above which `typical_depth` renders no picture."""
+"""Number of Gaussians of a static scene above which `typical_depth` takes the depth from a sample of their centres instead of a
+rendered picture."""
 COVERED = 0.5
 """Minimum opacity of a pixel that counts for `typical_depth`."""
 

@@ -44,7 +44,7 @@ class SceneSettings:
     images: str = "images"
     """Folder of the images inside the scene, such as `images_4` for smaller ones."""
     every: int = HELD_OUT_EVERY
-    """The images 0, k, 2k, … in the order of their names are held out."""
+    """Interval k of held-out images: those numbered 0, k, 2k, … in the order of their names."""
     scale: float = 1.0
     """Factor on the size of the images."""
     device: str = "cpu"

@@ -90,17 +90,17 @@ def run_on_trial(settings: LiveSettings, new_graph: Callable[[LiveSettings], App
 
 
 SCALE_STEPS = 16
-"""Number of size steps: scales are multiples of its reciprocal."""
+"""Number of size steps up to the full size: the tried scales are multiples of 1 / `SCALE_STEPS`."""
 MIN_SIDE_PX = 64
 """Minimum side of a working size, in pixels."""
 FIRST_PIXELS = 320 * 256
-"""Number of pixels of the first measurement, for larger streams."""
+"""Number of pixels of the first measured picture size, for streams with more pixels."""
 SHARE_OF_INTERVAL = 0.65
 """Largest share of the frame interval that the latency of a synthetic frame may take. Recorded frames take longer: with 0.8,
 up to 108 of 150 frames were late on two idle cores (results/live.md)."""
 MOST_MEASUREMENTS = 6
 NEIGHBOURS = 2
-"""Largest distance in size steps of a further measurement from the chosen size."""
+"""Largest distance, in size steps, between the chosen size and a neighbouring size that is measured to confirm the choice."""
 ROUNDING = 1e-9
 """Relative tolerance of a latency, so that a size that just fits is not lost by rounding."""
 STARTING_FRAMES, TIMED_FRAMES = 3, 9
@@ -174,7 +174,7 @@ def choose_working_size(
 
 
 def lower_quartile(values: Iterable[float]) -> float:
-    """Return the value that a quarter of the values are below, and the smallest of fewer than four values.
+    """Return the lower quartile: the value that a quarter of the values are below; the smallest of fewer than four values.
 
     Other load only lengthens frames, so small values vary less from run to run than the median.
     """
@@ -188,7 +188,7 @@ class Latency:
 
     fixed_s: float
     each_s: float
-    """Time per square of the size step, to which the number of pixels is proportional."""
+    """Seconds per squared size step. The number of pixels is proportional to the square of the step."""
 
     @classmethod
     def of(cls, measured: Mapping[int, float]) -> Latency:

@@ -84,7 +84,7 @@ class Gate(_Condition):
         return True
 
     def begins(self) -> bool:
-        """Return True if the operator may compute. It cannot finish until `computing` is reset."""
+        """Return True, and set `computing`, if the operator may compute. Until `computing` is reset it is not marked as finished."""
         with self._turn:
             self.computing = not (self.task.finished or self.task.graph.stopping)
             return self.computing

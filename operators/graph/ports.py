@@ -602,7 +602,7 @@ class CarriedEdge(LockedEdge):
     """
 
     port = ""
-    """Name of the engine's port at both ends."""
+    """Name of the engine's ports that this edge connects, the same at producer and consumer."""
     sender: Any = None
     receiver: Any = None
 
@@ -616,8 +616,8 @@ class CarriedEdge(LockedEdge):
             self.sender.emit(message, self.port)
 
     def pop(self) -> Message | None:
-        """Receive from the engine and return the oldest message, None if there is none. Raises EngineError for wrong
-        order.
+        """Receive from the engine and return the oldest message; None if there is none. Raises EngineError if the engine
+        delivered another message than the oldest.
         """
         carried = self.receiver.receive(self.port)
         if carried is None:

@@ -82,7 +82,8 @@ def stated(recorded: Recorded) -> list[str]:
 QUEUE_BYTES = 256 * 2**20
 """Capacity of the queue in bytes of pictures: about three seconds of 640x512 at 30 frames/s."""
 SHOWN_SHARE = 0.5
-"""Fill level of the queue at which displayed pictures are dropped. They can be recomputed, input frames cannot."""
+"""Fill level of the queue, as a share of its capacity, above which displayed pictures are dropped. They can be recomputed, input
+frames cannot."""
 MOST_LINES = 100_000
 """Maximum number of queued items. If it is reached, the disk is considered unresponsive."""
 MOST_ARRIVED = 64
@@ -107,10 +108,10 @@ class _Part:
     bytes: int = 0
     """Size of the item's pictures in bytes."""
     share: float = 1.0
-    """Fill level of the queue above which the item is dropped."""
+    """Fill level of the queue, as a share of its capacity, above which the item is dropped."""
 
     def lost(self, why: str) -> LostLine | None:
-        """Return the schedule line that records the loss; None for a line without pictures or an invalid number."""
+        """Return the schedule line that records the loss; None for an item without pictures or with an invalid frame number."""
         if self.what is None or not 0 <= self.seq <= MOST_NS:
             return None
         return LostLine(seq=self.seq, what=self.what, why=why)

@@ -52,7 +52,7 @@ class NewFiles:
         return self._waiting[0] if self._waiting else None
 
     def taken(self) -> None:
-        """Remove the image returned by `next` from the queue."""
+        """Remove the image that `next` returned from the queue. The file stays in the folder."""
         self._last = self._waiting.popleft()
 
     def _scan(self) -> None:

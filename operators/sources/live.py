@@ -80,7 +80,8 @@ class FrameOrder:
         return self._counts
 
     def begin(self) -> None:
-        """Forget the previous stream. The next frame gets number 0 and time 0; a trusted sender's keeps its own."""
+        """Forget the previous stream. The next frame gets number 0 and time 0. If the sender is trusted, it keeps
+        its own number and timestamp."""
         self._counts.clear()
         self._out: Frame | None = None  # last frame, as passed on
         self._in: Frame | None = None  # last frame, as received
@@ -324,9 +325,10 @@ class LiveSource(ThreadedSource):
 
 
 PULL = 0.05
-"""Share of the lag behind the arrival clock that each frame's timestamp corrects."""
+"""Share of the lag of the even timestamps behind the arrival times by which each frame's timestamp is moved forward."""
 PAUSE_S = 1.0
-"""Lag in seconds that counts as a pause of the sender and is corrected at once."""
+"""Lag of the even timestamps behind the arrival times, in seconds, that counts as a pause of the sender and is corrected at
+once."""
 
 
 class SteadyClock:

@@ -558,7 +558,7 @@ class ProcessSource(LiveSource):
         child = self._child
         assert child is not None
         child.send("open")
-        # The process sends nothing between its description and this message, however long that takes.
+        # The child sends nothing between its description and the receipt of `open`, so this pause does not count as a hang.
         last_s = child.message_s = time.monotonic()
         while not self.wait(0):
             message = child.receive(LOOK_S)

@@ -38,12 +38,12 @@ class ConnectionFailed(Exception):
 
 @dataclass(frozen=True)
 class Place:
-    """Address and parameters of a stream."""
+    """Address of a stream, with the FFmpeg options and the timeouts for reading it."""
 
     url: str
     options: Mapping[str, str]
     format: str | None = None
-    """FFmpeg's name of the demuxer or device; None to detect it from the data."""
+    """FFmpeg's name of the demuxer or input device; None lets FFmpeg detect the format from the data."""
     open_s: float = 10.0
     read_s: float = 5.0
     """Timeout in seconds for the next packet; `open_s` limits opening the stream."""

@@ -321,7 +321,7 @@ class AuditLog:
         self._descriptor = self._owned = -1
         self._head = Head()
         self._untaken: int | None = None
-        """File length without the line of a failed append that could not be removed yet."""
+        """Length in bytes to which the file must be cut to remove the line of a failed append; None if there is no such line."""
         self._failure: str | None = None
         try:
             with self._unwritable():

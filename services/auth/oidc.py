@@ -26,7 +26,7 @@ from services.settings import OidcSettings
 log = logging.getLogger(__name__)
 FRESH_S = 600.0
 KEPT_S = 24 * 3600.0
-"""Seconds for which cached keys stay usable while the issuer does not answer."""
+"""Seconds for which cached signing keys stay usable while the issuer does not answer."""
 AGAIN_S = 10.0
 """Minimum seconds between requests to the issuer, so unknown key ids and failures do not cause a request each."""
 FETCH_S = 5.0

@@ -236,13 +236,13 @@ def _text(said: dict[str, Any]) -> str:
 
 
 INLIER_SHARE = 0.02
-"""Default inlier distance as a share of the surface's extent."""
+"""Default distance between model and mesh up to which a point is an inlier, as a share of the surface's extent."""
 MOST_SIZE_RATIO = 20.0
 """Largest size ratio of two surfaces aligned without point pairs."""
 MOST_SCALE = 1.25
 """Largest ratio of point pair distances between the mesh and a metric model."""
 LEAST_INLIERS = 0.05
-"""Smallest share of inliers at which two surfaces count as matching."""
+"""Smallest share of points within the inlier distance at which two aligned surfaces count as matching."""
 
 
 def compare_command(

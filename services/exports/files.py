@@ -91,7 +91,7 @@ def arguments_of(wish: Wish) -> list[str]:
 
 PROGRAM = (sys.executable, "-P", "-m", "services.exports.files")
 REFUSED = 2
-"""Exit code of the program after a refused export."""
+"""Exit code of the export program if the model cannot be exported to the format."""
 MOST_S = 300.0
 PASSED_ON = (
     "PATH", "PYTHONPATH", "LD_LIBRARY_PATH", "LANG", "LC_ALL", "TMPDIR", "HOME", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS",

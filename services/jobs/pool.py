@@ -33,7 +33,7 @@ STEP_S = 0.02
 DATABASE_S = 0.5
 """Seconds between database accesses: claims are renewed and new jobs are looked up."""
 AGAIN_S = 2.0
-"""Seconds from a database failure to the next round of the pool."""
+"""Seconds from a database failure to the pool's next attempt to work."""
 
 
 @dataclass(frozen=True)

@@ -180,7 +180,7 @@ class Workspace:
         shutil.rmtree(folder, ignore_errors=True)
 
     def close(self) -> None:
-        """Delete the folder and release the lock."""
+        """Delete the pool's working folder and release the lock. Published results are kept."""
         shutil.rmtree(self.folder, ignore_errors=True)
         os.close(self._lock)
 
@@ -189,7 +189,7 @@ class Workspace:
         return [path.name for path in self._running.iterdir() if not _is_locked(path / LOCK)]
 
     def remove_dead(self, pools: list[str]) -> None:
-        """Delete the folders of dead pools."""
+        """Delete the working folders of these dead pools. Published results are kept."""
         for pool in pools:
             shutil.rmtree(self._running / pool, ignore_errors=True)
 

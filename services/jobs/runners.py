@@ -201,7 +201,7 @@ def _end_with_the_pool(life: int) -> None:
 
 
 ATTEMPTS_OF_A_PROCESS = 20
-"""Attempts after which Ray starts a new worker process, which bounds memory leaks."""
+"""Number of attempts after which Ray replaces a worker process, which bounds memory leaks."""
 
 
 def _attempt(values: dict[str, Any]) -> None:

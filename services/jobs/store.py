@@ -87,7 +87,7 @@ class Claimed:
 
 @dataclass(frozen=True)
 class NewJob:
-    """Recording to replay in a new job. Without `folder`, the result folder has the job's id as its name."""
+    """Recording to replay in a new job. If `folder` is None, the result folder has the job's id as its name."""
 
     recording: str
     source: str | None = None

@@ -104,7 +104,7 @@ def at_age(report: EvaluationReport, age_frames: float) -> float | None:
 
 
 RELATIVE_FROM = 0.05
-"""Deviation of the length scale from 1 above which the model is reported as uncalibrated."""
+"""Deviation from 1 of the factor between model lengths and true lengths above which the model is reported as uncalibrated."""
 
 
 @dataclass(frozen=True)

@@ -53,7 +53,7 @@ class Restarts:
         self._most_worked_s = most_worked_s
         self.in_a_row = 0
         self.never_well = 0
-        """Number of consecutive ends without a good state (`WELL`) in between."""
+        """Number of process ends since one that had reached a good state (`WELL`)."""
         self.total = 0
 
     def ended(self, well_s: float) -> float:
@@ -78,7 +78,7 @@ log = logging.getLogger(__name__)
 LOOK_S = 0.25
 PING_S = 1.0
 PAUSED_S = 1.0
-"""Delay of a periodic check, in seconds, beyond which the supervisor itself must have been suspended."""
+"""Delay of a periodic check, in seconds, above which it is assumed that the supervisor itself was suspended."""
 MOST_LOG_BYTES = 1 << 20
 FRESH_AFTER = 3
 """Consecutive failed starts after which a new interpreter is used, because the launcher's forked

@@ -266,7 +266,7 @@ log = logging.getLogger(__name__)
 PERIOD_S = {"cpu": 0.1, "cuda": 1 / 30}
 """Minimum time between two pictures of a layer, in seconds, by device."""
 MOST_SHARE = {"cpu": 1 / 6, "cuda": 1 / 4}
-"""Largest share of time spent on drawing, by device. A slow picture is followed by a longer pause."""
+"""Largest share of time spent on drawing layers, by device. A slow picture is followed by a longer pause."""
 LOOK_S = 0.2
 Scene = Callable[[], LayerScene | None]
 """Factory of a scene, called by the drawing thread. It returns None if the scene cannot be drawn."""

@@ -146,9 +146,9 @@ REMEDIES = {
     "damaged": "check the connection of the source",
     **dict.fromkeys(("black", "one colour", "noise", "duplicate", "frozen", "torn", "out of order"), CHECK_SOURCE),
 }
-"""Remedy for each reason of withheld frames that does not pass by itself."""
+"""Remedy for the user by reason of withheld frames, for reasons that do not pass by themselves."""
 WITHHELD_FRAMES = 5
-"""Number of consecutive withheld frames from which a stale picture is explained by them."""
+"""Number of consecutive withheld frames from which they are stated as the reason for a stale picture."""
 
 
 def overall(capture: ProcessState, engine: ProcessState) -> tuple[str, str | None]:

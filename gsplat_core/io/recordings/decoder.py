@@ -29,7 +29,9 @@ from numpy.typing import NDArray
 from gsplat_core.io.recordings.plain_files import MAX_PIXELS, jpeg_damage
 
 PROBED = frozenset({"hevc", "vp8"})
-_BEHIND = bytes(random.Random(1).randrange(4, 256) for _ in range(256))  # bytes of at least 4 contain no start code
+_BEHIND = bytes(
+    random.Random(1).randrange(4, 256) for _ in range(256)
+)  # padding; values of 4 and more form no start code (0 0 1)
 
 
 class Ticket:

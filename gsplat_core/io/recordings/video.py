@@ -116,7 +116,11 @@ def _frame_duration(stream: av.VideoStream) -> Fraction | None:
 def _positions(
     times: list[int | None], shown: bytearray, lost: dict[int, str], duration: Fraction | None, reordered: bool
 ) -> tuple[array, int, bool]:
-    """Return the display order; after container damage, a time gap counts as missing frames."""
+    """Return the display position of each packet's picture, the number of positions, and True if the positions are reliable.
+
+    A picture that is not displayed has position -1. After container damage, a time gap counts as missing frames. Positions
+    of reordered pictures without distinct timestamps are unreliable.
+    """
     visible = [number for number in range(len(times)) if shown[number]]
     known = [times[number] for number in visible if times[number] is not None]
     timed = len(known) == len(visible) and len(set(known)) == len(known)

@@ -57,10 +57,10 @@ class Lamp:
 
     @classmethod
     def of_eye(cls, scope_x_mm: float, reference_mm: float = REFERENCE_MM, plan: LampPlan = USUAL_LAMP) -> Lamp:
-        """Return the light source for an eye that looks in the scope's direction.
+        """Return the light source in the coordinates of an eye that looks in the scope's direction.
 
         Args:
-            scope_x_mm: x coordinate of the centre of the scope's tip.
+            scope_x_mm: x coordinate of the centre of the scope's tip, in the eye's coordinates.
             reference_mm: distance at which a white surface has radiance 1.
             plan: positions and beam of the fibres.
         """
@@ -115,7 +115,7 @@ SMOKE_MM = 74.0
 SMOKE_COLOUR = (0.42, 0.41, 0.44)
 EXPOSURE_PERIODS_S = (1.9, 3.1)
 EXPOSURE_STOPS = (0.45, 0.25)
-"""Amplitudes of the exposure's oscillations in stops (factors of two), one per period."""
+"""Amplitudes of the exposure's oscillations in stops (factors of two), one for each period of `EXPOSURE_PERIODS_S`."""
 
 
 @dataclass(frozen=True)
@@ -216,8 +216,8 @@ class Particles:
         Args:
             random: generator.
             count: number of particles.
-            size_mm: median radius.
-            distance_mm: distance of the tissue.
+            size_mm: median radius in mm.
+            distance_mm: distance of the tissue in mm.
         """
         drift, own = random.normal(0, 3, 3), random.normal(0, 2, (count, 3))
         box = (1.6 * distance_mm, 1.6 * distance_mm, 0.9 * distance_mm)
@@ -357,7 +357,7 @@ class Exposure:
     """Amplitudes of the oscillations in stops (factors of two)."""
     periods_s: tuple[float, float] = (1.9, 3.1)
     gain: float = 0.0
-    """Share of a change of the light's irradiance that the automatic exposure compensates."""
+    """Share of a change of the lamp's irradiance on the tissue that the automatic exposure compensates."""
     delay_s: float = 0.0
     """Delay of the automatic exposure, in seconds."""
 

@@ -165,7 +165,7 @@ ORGANS: dict[str, tuple[Colour, Colour, Colour, Colour, float, float]] = {
 }
 """Linear RGB of base, pale, deep and fat areas, level from which there is fat, and strength of vessels."""
 FOCAL_RANGE = (0.5, 1.2)
-"""Range of the focal length per longer side of the picture."""
+"""Range of the focal length divided by the longer side of the picture."""
 STEEPEST = 0.75
 """Largest product of the tissue's slope and the tangent of the corner's viewing angle, so that nothing hides behind a hill."""
 USUAL_SLOPE = 0.33
@@ -182,7 +182,7 @@ class RandomScene:
     stereo: bool
     organ: str
     focal: float
-    """Focal length per longer side of the picture."""
+    """Focal length divided by the longer side of the picture."""
     lens: tuple[float, float]
     """Displacement of the picture's corners by the terms of k1 and k2, over their distance from the centre."""
     baseline_mm: float
@@ -194,12 +194,12 @@ class RandomScene:
     tools: tuple[ToolPlan, ...]
     lamp: LampPlan
     exposed_mm: float
-    """Distance in mm at which a white surface has radiance 1."""
+    """Distance from the lamp in mm at which a white surface facing the scope has radiance 1; sets the exposure."""
     sensor: Sensor
     smoke: float
     particles: int
     particle_mm: float
-    """Median radius of the particles."""
+    """Median radius of the particles in mm."""
 
     def described(self) -> dict[str, Any]:
         """Return all properties for `recording.json`."""

@@ -112,7 +112,7 @@ class TissueLook:
     grain: float = 0.10
     """Standard deviation of the fine texture, relative to the colour."""
     creases: float = 0.20
-    """Darkness of the tissue's creases."""
+    """Share by which the colour is darkened at the bottom of the tissue's creases."""
     roughness: float = 1.0
     """Factor on the slopes of the tissue's fine relief."""
     wetness: float = 0.12
@@ -259,8 +259,8 @@ class TissueShape:
     bowl: float = 1.0
     """Factor on the curvature of the sheet towards the scope."""
     tilt: float = 0.10
-    """Limit of the slope of the whole sheet along each axis, without hills and bowl. The slope is drawn at random from
-    -tilt to tilt.
+    """Largest slope (height per length) of the whole sheet along u and v, without hills and bowl. Each slope is drawn at random
+    from -tilt to tilt.
     """
     breath: float = 1.0
     """Factor on the amplitude of breathing."""
@@ -328,14 +328,15 @@ class Tissue:
         ]
         self._tilt = rng.uniform(-shape.tilt, shape.tilt, 2)
         self.breathing = Breathing(float(rng.uniform(0, 2 * np.pi)))
-        """Breathing of a tissue without extras; replaced if a recording requests other breathing."""
+        """Phase of breathing over time, regular by default; replaced if a recording requests other breathing."""
         self._breath_angle = float(rng.uniform(0, 2 * np.pi))
         self.texture = TissueTexture(rng, texel_mm, look)
 
     def first_guess(self, origin: Array, directions: Array) -> tuple[Array, Array]:
-        """Return start values of Newton's method for the ray intersections.
+        """Return u and v [H, W] in mm at which Newton's method for the ray intersections starts.
 
-        The rays from `origin` [3] along `directions` [H, W, 3] are intersected with the plane at the mean distance.
+        They are x and y of the points where the rays from `origin` [3] along `directions` [H, W, 3] meet the plane at the
+        mean distance.
         """
         s = (np.float32(self.shape.distance_mm) - origin[2]) / directions[..., 2]
         return origin[0] + s * directions[..., 0], origin[1] + s * directions[..., 1]
@@ -419,7 +420,7 @@ class Colon(Tissue):
     tools = False
 
     def first_guess(self, origin: Array, directions: Array) -> tuple[Array, Array]:
-        """Intersect the rays with the ellipsoid without folds; see `Tissue.first_guess`."""
+        """Return x and y [H, W] in mm of the rays' intersections with the ellipsoid without folds, to start Newton's method."""
         shape = np.array([1 / COLON_RADIUS_MM, 1 / COLON_RADIUS_MM, 1 / COLON_LENGTH_MM], np.float32)
         start, along = origin * shape, directions * shape
         a = np.einsum("hwi,hwi->hw", along, along)

@@ -16,7 +16,7 @@ from gsplat_core.io.recordings.synthetic.tissue import TUG_RADIUS_MM, Colour, Ti
 Array = NDArray[np.floating]
 
 PORT_MM = (58.0, 44.0, 8.0)
-"""Entry point of the shaft in mm: to the lower right of the scope."""
+"""Point in mm where the shaft enters the cavity, to the lower right of the scope."""
 CYCLE_S = 2.4
 HOVER_MM = 13.0
 TRACE_STEPS = 56
@@ -47,7 +47,7 @@ class ToolHits:
     distance_mm: Array
     """Distance in mm along the ray; infinity if the ray hits nothing before its limit."""
     cover: Array
-    """Coverage of the pixel, 0..1, by the ray's distance from the tool."""
+    """Share of the pixel that the tool covers, 0..1, estimated from the ray's distance to the tool."""
     normal: Array
     """Surface normal [..., 3] at hits."""
     material: NDArray[np.int8]
@@ -87,7 +87,7 @@ class ToolPlan:
     hover_mm: float = HOVER_MM
     """Distance of the tool's tip from the tissue between two tugs, in mm."""
     reach_mm: float = 15.0
-    """Largest distance of the grasp points from their centre."""
+    """Largest distance in mm of the grasp points from their centre, `centre_mm`."""
     centre_mm: tuple[float, float] = (-4.0, -3.0)
     pull: float = 1.0
     """Factor on the displacement of the grasped tissue; 0 if the tool does not touch it."""
@@ -116,7 +116,7 @@ class ToolMotion:
         self._pulls = plan.pull * np.concatenate([across, np.full((cycles + 1, 1), -6.0)], axis=1)
 
     def tug(self, time_s: float) -> Tug:
-        """Return the pull on the tissue; 0 outside the middle half of a cycle."""
+        """Return the tool's displacement of the tissue at a time; 0 outside the middle half of a cycle."""
         cycle, phase = self._phase(time_s)
         strength = np.sin(np.pi * np.clip((phase - 0.25) / 0.5, 0, 1)) ** 2
         pull = self._pulls[cycle] * strength
