@@ -30,7 +30,7 @@ class FoundDepth:
     """Origins and coverage of the depth maps of one run."""
 
     frames: Mapping[str, int]
-    """Frames with depth, by origin (a name in `DEPTH_ORIGINS`)."""
+    """Number of frames with depth, by its origin (a name in `DEPTH_ORIGINS`)."""
     known_share: float
     """Share of pixels with trusted depth, 0..1; mean over the frames that have depth."""
     metric: bool
@@ -38,7 +38,7 @@ class FoundDepth:
     doubts: Mapping[str, int]
     """Number of frames for which depth estimation was attempted and rejected, by reason (a sentence)."""
     passed_over: int = 0
-    """Frames dropped by live depth estimation because a newer frame arrived first."""
+    """Number of frames without depth estimation because a newer frame replaced them in the queue of the live estimator."""
 
 
 class DepthCounts:

@@ -109,7 +109,7 @@ class RememberedTissue:
         cv2.copyTo(colourless, marked, pixels)
 
     def _line(self, tissue: NDArray[np.uint8], rows: slice, columns: slice, width_px: int) -> NDArray[np.uint8]:
-        """Return a mask of tool pixels within `width_px` of tissue, 255 = outline."""
+        """Return a mask of the outline inside the tools: 255 at tool pixels within `width_px` of tissue, 0 elsewhere."""
         tools, inner = self._tools[rows, columns], self._scratch[rows, columns]
         cv2.threshold(np.asarray(tissue[rows, columns], np.uint8), 0, 255, cv2.THRESH_BINARY_INV, dst=tools)
         # Erosion treats pixels beyond the picture's border as tool, so no line is drawn along it.

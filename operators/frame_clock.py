@@ -38,7 +38,8 @@ FIRST_MS = 20.0
 FIRST_AT_MOST_STEPS = 60
 """Maximum number of optimiser steps for the first frame of a scene."""
 CATCH_UP_SHARE = 0.8
-"""Largest share of the frame interval that minimal processing may take for queued frames to be caught up with."""
+"""Share of the frame interval. Queued frames are caught up with, not dropped, only while training (with the minimum number of
+steps) and display each take less."""
 CATCH_UP_INTERVALS = 4.0
 """Default for `ClockSettings.catch_up_intervals`."""
 
@@ -236,7 +237,7 @@ class FrameClock:
 
 
 PREVIOUS_MARGIN_DB = 1.0
-"""Difference in dB from which a picture counts as worse than the previous frame shown again."""
+"""Difference in dB above which a picture counts as worse than the previous raw frame shown again."""
 FIRST_MARGIN_DB = 6.0
 """Difference in dB from which a picture counts as worse than the first one of its scene: four times its squared error. A
 new scene discards the past, which a smaller gain is not worth. While the scope rests for a few frames, the previous frame
@@ -247,8 +248,8 @@ RENEW_AFTER = 2
 picture of a single odd frame recovers by itself.
 """
 USEFUL_FRAMES = 16
-"""Length of a scene that makes a renewal of its model useful, in multiples of the bad pictures before it. After a
-useless renewal the next one waits for twice as many pictures.
+"""Number of pictures, per bad picture that caused it, after which a renewal of the model counts as useful. If the next
+renewal is due earlier, it counts as useless, and the one after it waits for twice as many bad pictures.
 """
 COMPARED_ROWS = 128
 """Minimum number of evenly spaced picture rows that are compared. Other rows are skipped to save time before the display."""

@@ -1,4 +1,7 @@
-"""On-disk log with one line of JSON per displayed frame, so that memory use does not grow with the stream, and its reader."""
+"""On-disk log with one line of JSON per displayed frame, so that memory use does not grow with the stream.
+
+The module also reads logs, averages their entries in bins, and computes the scores of live runs from them.
+"""
 
 from __future__ import annotations
 

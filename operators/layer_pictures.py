@@ -1,5 +1,5 @@
-"""False-colour pictures of a renderer's outputs: depth and confidence with legends, and marks for unobserved areas. Colours
-are shown as they are.
+"""Pictures of a renderer's outputs: depth and confidence in false colours with legends, normals, flow, classes and other values in
+false colours, and colours as they are; and marks for unobserved areas and virtual cameras.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from gsplat_core.errors import InvalidSetting
 from operators.display import COVERED
 
 STOPS = 9
-"""Number of evenly spaced colours in a legend."""
+"""Number of evenly spaced colours of the colour map that a legend lists."""
 QUANTILES = (0.02, 0.5, 0.98)
 """Quantiles of a picture's depths: lower end of the colour range, median, upper end."""
 RANGE_FOLLOWS = 0.3
-"""Weight of the newest picture in the moving average of a range, to avoid flicker."""
+"""Weight of the newest picture in the moving average of the value range that the colours span, which avoids flicker."""
 HATCH_PX = 12
 UNOBSERVED, UNOBSERVED_LINE = (24, 18, 32), (150, 60, 170)
 """RGB colours of unobserved pixels and of the hatch lines across them. Neither colour occurs in the colour maps."""

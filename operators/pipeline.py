@@ -117,7 +117,8 @@ class Pace:
     predict_every: int = 1
     """Predict one in this many frames before training on it; 0 for a finished model."""
     guard: BehindGuard = field(default_factory=BehindGuard)
-    """Judge of live pictures, shared by training and display."""
+    """Comparison of live pictures with trivial ones, which has the model started anew if it falls behind. Shared by training and
+    display."""
 
     def scheduler(self, device: str, graph: Application) -> GreedyScheduler | MultiThreadScheduler:
         """Return the scheduler: one thread per operator for a live stream, otherwise that of `scheduler_for`."""

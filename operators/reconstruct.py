@@ -1,4 +1,4 @@
-"""Operator for online reconstruction: owns the model, warms it up and trains it on arriving frames."""
+"""Operator for online reconstruction: owns the model, warms it up, trains it on arriving frames and hands out copies on request."""
 
 from __future__ import annotations
 

@@ -84,7 +84,7 @@ class Learner:
         self.learned: Frame | None = None
         """Newest frame that the model was trained on."""
         self._scene = 0
-        """Number of the scene that the model represents."""
+        """Scene number (`Frame.scene`) of the frames that the model represents."""
         self.reconstructor = make()
 
     def renew(self) -> None:

@@ -181,7 +181,7 @@ def with_poses_of_run(source: FrameSource, run: EvaluatedRun | None) -> FrameSou
     except (OSError, ValueError, TypeError) as error:
         raise RecordingInvalid(f"{path} has no poses: {error}; make the run again") from error
     poses = read_poses(path, count, Findings(strict=True))
-    assert poses is not None  # a strict reader raises
+    assert poses is not None  # with strict findings, the reader raises instead of returning None
     return PosedSource(source, lambda frame: poses[min(frame.seq, count - 1)])
 
 

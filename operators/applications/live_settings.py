@@ -21,44 +21,45 @@ LIVE_WINDOW_FRAMES = {"cpu": 60, "cuda": 150}
 LIVE_BUMP_SPACING_S = {"cpu": 0.2, "cuda": 0.1}
 LIVE_HISTORY_S = {"cpu": 3.0, "cuda": 6.0}
 """Duration of the past that stays deformable, in seconds, one more than the training window
-(`LIVE_WINDOW_FRAMES`) takes at 30 frames/s. Longer histories slow down every step on a CPU.
+(`LIVE_WINDOW_FRAMES`) takes at 30 frames/s. Longer histories slow down every optimiser step on a CPU.
 """
 LIVE_MOTION_DETAIL: Detail = "half"
 LIVE_GAUSSIANS = {"cpu": 12_000, "cuda": 45_000}
 LIVE_MOST_GAUSSIANS = 100_000
 """Maximum number of initial Gaussians of a scene, for large pictures. The capacity is twice the initial number."""
 LIVE_PIXELS_PER_GAUSSIAN = 13
-"""Pixels per initial Gaussian on a GPU, for pictures in which these are more than `LIVE_GAUSSIANS`."""
+"""Pixels per initial Gaussian on a GPU, for pictures large enough that this gives more than `LIVE_GAUSSIANS` Gaussians."""
 LIVE_TRAINING = {
     "cpu": LiveTraining(first_rate=2.0, last_rate=1.5, rate_steps=2, colour_relaxation=1.5, corrections_before=4),
     "cuda": LiveTraining(colour_relaxation=1.5),
 }
 LIVE_SQUARED_ERROR = {"cpu": True, "cuda": False}
-"""Use a squared colour loss. It suits few steps per frame; with many steps, L1 follows motion better."""
+"""True for a squared colour loss instead of L1. It suits few optimiser steps per frame; with many, L1 follows motion better."""
 LIVE_LEAST_STEPS = {"cpu": 1, "cuda": 3}
 """Minimum number of optimiser steps per frame, even past the display deadline."""
 LIVE_LEAST_SHARE = {"cpu": 0.34, "cuda": 0.2}
 """Share of the frame interval guaranteed for training, even past the display deadline."""
 LIVE_LEAST_MOST_MS = {"cpu": None, "cuda": 13.0}
-"""Upper limit in milliseconds of the time of `LIVE_LEAST_SHARE`; None for no limit. See benchmarks/results/live.md."""
+"""Upper limit in milliseconds of the training time that `LIVE_LEAST_SHARE` guarantees; None for no limit (results/live.md)."""
 LIVE_SHOW_AFTER = {"cpu": (0.85, 28.3), "cuda": (0.6, 17.0)}
-"""Display deadline: share of the frame interval, and upper limit in milliseconds. On a CPU another
-step improves the picture more than an earlier display, up to the next frame.
+"""Display deadline after a frame's arrival: share of the frame interval, and upper limit in milliseconds. On a CPU another
+optimiser step improves the picture more than an earlier display does.
 """
 LIVE_FIRST_STEPS = {"cpu": 4, "cuda": 5}
-"""Minimum number of steps on a scene's first frame. Its display and the following frames wait for them."""
+"""Minimum number of optimiser steps on a scene's first frame. Its display and the following frames wait for these steps."""
 LIVE_PREDICT_EVERY = {"cpu": 8, "cuda": 4}
-"""One in this many pictures is also predicted and scored, at about the cost of rendering and scoring a picture."""
+"""One in this many frames is also predicted before training on it and scored. This costs about one rendering and scoring."""
 LIVE_CATCH_UP_INTERVALS = {"cpu": 2.0, "cuda": 4.0}
 """Longest wait of a frame before it is dropped, in frame intervals. A GPU catches up within a few
 frames. A CPU with two cores would display all queued frames late.
 """
 LIVE_STARTS_FROM_MOTION = {"cpu": True, "cuda": False}
-"""Initialise motion by optical flow. With few steps, flow follows the tissue faster than training;
+"""Initialise motion by optical flow. With few optimiser steps, flow follows the tissue faster than training;
 on a GPU, flow is slower than training.
 """
 LIVE_SSIM_WEIGHT = {"cpu": 0.0, "cuda": 0.1}
-"""Weight of SSIM next to L1, which improves tracking of motion. On a CPU a step with SSIM takes 1.5 times as long."""
+"""Weight of SSIM next to L1, which improves tracking of motion. On a CPU an optimiser step with SSIM takes 1.5 times
+as long."""
 
 
 @dataclass(frozen=True)

@@ -62,7 +62,7 @@ from operators.storage import storage_errors
 MINUTES_ON_GPU, MINUTES_ON_CPU = 0.75, 10.0
 """Time limits of a training with an automatic number of steps, in minutes."""
 ALTERNATIVE_SHARE = 0.1
-"""Share of the time limit from which a first trial is too long to try other inputs."""
+"""Share of the time limit above which the first trial training was too slow to try other inputs (poses, depth, eyes)."""
 
 
 @dataclass(frozen=True)
@@ -240,7 +240,7 @@ class _Fitting:
         self._learning: Reconstructor | None = None
         self._is_stopped = False
         self._posed_inputs: _Inputs | None = None
-        """Inputs with estimated poses, if they were tried."""
+        """Inputs with estimated poses while alternatives are tried; None if none were estimated."""
         self._setup_s = 0.0
         """Time before the first step of the last training, in seconds."""
 
@@ -318,8 +318,8 @@ class _Fitting:
         return self._posed_inputs
 
     def _with_poses_only(self, inputs: _Inputs) -> _Inputs | None:
-        """Return inputs with estimated poses but without the depth that these poses provide. None if `_with_poses` was not tried
-        or was chosen, or if `inputs` have depth without estimated poses."""
+        """Return inputs with estimated poses but without the depth that these poses provide. None if no poses were estimated, if
+        `inputs` already have them, or if `inputs` have other depth."""
         posed = self._posed_inputs
         if posed is None or inputs is posed or inputs.have_depth:
             return None

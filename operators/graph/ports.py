@@ -38,7 +38,7 @@ class QueuePolicy(Enum):
     """The oldest message is dropped and counted."""
     DROP_NEW = "drop_new"
     """The new message is dropped and counted."""
-    # Names of these policies in the Holoscan SDK.
+    # Names in the Holoscan SDK of the three policies above.
     FAULT = "block"  # noqa: PIE796
     POP = "drop_oldest"  # noqa: PIE796
     REJECT = "drop_new"  # noqa: PIE796

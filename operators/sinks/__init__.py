@@ -1,1 +1,1 @@
-"""Sinks of frames: videos, images, recordings and callbacks."""
+"""Sinks of frames: videos, image files, key frames for the report, session recordings and callbacks."""

@@ -41,15 +41,16 @@ class SourceOptions:
     bounce: bool = False
     """Play every second round of a loop backwards, which avoids a jump between rounds."""
     speed: float = 1.0
-    """Playback speed of a recording. `math.inf`: each frame when the previous one is taken, without drops."""
+    """Playback speed of a recording relative to real time. With `math.inf` each frame follows as soon as the previous one is
+    consumed, and none is dropped."""
     fps: float | None = None
-    """Frame rate that replaces the recording's own, in frames/s; None keeps that."""
+    """Frame rate that replaces the recording's own, in frames/s; None keeps the recording's."""
     waiting: int = 2
     """Capacity of the queue for the reader, in frames; if it is full, the oldest is dropped."""
     stereo: StereoLayout | None = None
     """Arrangement of the two eyes in one picture; None for a single eye."""
     process: bool | None = None
-    """Read the source in a separate process; None: if sources of its kind can block."""
+    """True to read the source in a separate process; None does so if sources of its kind can block."""
 
     def __post_init__(self) -> None:
         if not self.speed > 0:

@@ -1,4 +1,4 @@
-"""Sources derived from other sources: resized, split into two eyes, or joined from two eyes."""
+"""Sources derived from other sources: resized, given other poses, split into two eyes, or joined from two eyes."""
 
 from __future__ import annotations
 

@@ -64,7 +64,7 @@ class FrameWriter:
         self._slot_bytes = 0
 
     def fits(self, pieces: Sequence[bytes | memoryview]) -> bool:
-        """Return True if the frame's pieces fit into a slot."""
+        """Return True if the frame's pieces (parts of its encoding) fit into a slot of the shared memory."""
         return _laid_out(map(len, pieces))[1] <= self._slot_bytes
 
     def grow(self, pieces: Sequence[bytes | memoryview]) -> None:
@@ -129,7 +129,7 @@ class FrameReader:
 
 
 def _laid_out(sizes: Iterable[int]) -> tuple[list[int], int]:
-    """Return the offset of each piece within a slot, and the total size in bytes."""
+    """Return the aligned offset in bytes of each piece of a frame within its slot, and the total size in bytes."""
     begins, end = [], 0
     for size in sizes:
         begins.append(end)

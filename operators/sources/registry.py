@@ -1,4 +1,5 @@
-"""Registry of sources by the scheme of an address: `scheme:place`, `scheme://place`, or a recording's path."""
+"""Registry of sources by the scheme of an address (`scheme:place`, `scheme://place`, or a recording's path), and the opening and
+checking of addresses."""
 
 from __future__ import annotations
 

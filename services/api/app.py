@@ -189,7 +189,7 @@ def _remove_unfinished(uploads: Path) -> None:
 
 @dataclass(frozen=True)
 class Archive:
-    """Components of a server for recordings and replay jobs."""
+    """Components of a server for recordings and replay jobs: stores, retention tasks, job pool, metrics and the check for missing files."""
 
     recordings: RecordingStore
     recording_retention: RecordingRetention

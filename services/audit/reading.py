@@ -220,7 +220,7 @@ class _Walk:
     findings: list[Finding] = field(default_factory=list)
     digests: dict[str, int] = field(default_factory=dict)
     retired: set[Head] = field(default_factory=set)
-    """Last entries of removed ranges, as named by the entries `audit.retired`."""
+    """Number and digest of the last entry of each range that retention removed, as stated by the entries `audit.retired`."""
 
     def read(self, path: Path, name: str) -> None:
         """Verify the lines of a file. `name` is the segment's name for findings, empty for the current file, whose last

@@ -196,8 +196,8 @@ def text_of(arguments: Mapping[str, Any], name: str) -> str:
 
 
 BOUNDS_S = (0.001, 0.0025, 0.005, 0.0083, 0.0167, 0.025, 0.0333, 0.05, 0.0667, 0.1, 0.15, 0.25, 0.5, 1.0, 5.0)
-"""Upper bounds in seconds: 8.3, 16.7, 33.3 and 66.7 ms are one and two frames at 120, 60 and 30 frames/s. Longer
-durations have their own bucket."""
+"""Upper bounds of the histogram buckets in seconds: 8.3, 16.7, 33.3 and 66.7 ms are one and two frames at 120, 60 and
+30 frames/s. Longer durations are counted in a further bucket."""
 
 
 class Durations:

@@ -39,7 +39,7 @@ MOST = 20
 
 @dataclass(frozen=True)
 class Snapshot:
-    """Record of a snapshot."""
+    """Record of a stored snapshot: the model of a live stream after training on the frame `seq`."""
 
     id: str
     stream: str

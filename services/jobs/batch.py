@@ -42,7 +42,7 @@ class Summary:
 
     counts: Counts
     already: int
-    """Number of recordings whose results exist from earlier runs."""
+    """Number of recordings whose results exist from earlier runs of the batch, so that they were not replayed again."""
     failed: Sequence[JobRecord]
     seconds: float
     unusable: Sequence[tuple[str, str]] = ()

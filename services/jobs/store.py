@@ -393,12 +393,12 @@ MOST_REASON = 1000
 
 @dataclass(frozen=True)
 class Heard:
-    """Running jobs that their owner must end, as found by `Claims.renew`."""
+    """Jobs whose running attempt the pool must kill, as found when it renewed its claims (`Claims.renew`)."""
 
     lost: frozenset[str]
-    """Jobs that this owner lost: taken over by another owner, or deleted."""
+    """Ids of jobs that this pool lost: another pool took them over, or they were deleted."""
     cancelled: Mapping[str, str]
-    """Jobs to cancel, with the caller that requested the cancellation."""
+    """Name of the caller that requested the cancellation, by id of the job to cancel."""
 
 
 class Claims:

@@ -113,11 +113,11 @@ class Recovery:
     """Result of `recover`. Only `removed` items were changed; the rest needs an administrator's decision."""
 
     removed: tuple[str, ...] = ()
-    """Incomplete files and files without a version."""
+    """Descriptions of the deleted incomplete files and files that belong to no version."""
     unchecked: tuple[tuple[str, int], ...] = ()
-    """Versions whose check did not finish; `check` repeats it."""
+    """Model name and number of each version whose check did not finish; `check` repeats it."""
     damaged: tuple[tuple[str, int, str], ...] = ()
-    """Versions whose stored file is missing or has another size, with a message."""
+    """Model name, number and a message for each version whose stored file is missing or has another size."""
     skipped: str | None = None
     """Reason why no leftovers were removed; None if the cleanup ran."""
 

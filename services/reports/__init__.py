@@ -1,4 +1,5 @@
-"""Reports of a run: `report.json` for programs and `report.html` for people."""
+"""Reports of runs (`report.json`, `report.html`) and of evaluations (`evaluation.json`, `evaluation.html`): JSON for programs, HTML
+for people."""
 
 from services.reports.schema import RunReport
 

@@ -40,7 +40,7 @@ NO_USE = 2
 """Exit code of a process with an invalid specification or configuration; a restart would fail in the same way."""
 _TAIL_BYTES = 4096
 _LOGGED = re.compile(r"[\d-]+ [\d:,]+ (?P<level>[A-Z]+) [\w.]+: ")
-"""Log line prefix of the stream processes."""
+"""Prefix of a line in the log of a stream process: time, level and logger."""
 
 
 def ended_how(status: int) -> str:

@@ -171,12 +171,12 @@ class ManagedProcess:
         self._heartbeat: dict[str, Any] | None = None
         self._heard_s = self._well_s = 0.0
         self._shown: tuple[int, float] = 0, 0.0
-        """Number of published pictures, and the time of its last change."""
+        """Number of pictures that the process has published, and the time at which this number last changed."""
         self._rate = Rate()
         self._gone_s: float | None = None
         """Time of the first heartbeat without frames from the source; None while frames arrive."""
         self._lost = False
-        """True after a reported loss of the source, until its recovery is reported."""
+        """True from the report that the source is lost until the report that it has recovered."""
         self._tasks: list[asyncio.Task[None]] = []
 
     @property

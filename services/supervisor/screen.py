@@ -1,6 +1,6 @@
 """Picture outputs of an engine: the main picture with its metadata, and layers such as depth, confidence and a virtual camera.
 
-A layer is drawn in its own thread, and only while it has viewers.
+All layers are drawn in one thread of low priority, each only while it has viewers.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Recordings of endoscopic video: open, validate, synthesize."""
+"""Recordings of endoscopic video: reading with calibration and ground truth, validation, and synthesis."""
 
 from gsplat_core.io.recordings.plain_files import Finding, ValidationReport
 from gsplat_core.io.recordings.recording import FileRecording, Recording, is_heldout, open_recording, validate_recording

@@ -36,8 +36,8 @@ from gsplat_core.io.recordings.plain_files import (
 from gsplat_core.scene.cameras import CAMERA_MODELS, MAX_INTRINSICS_PX, MIN_FOCAL_PX, Camera
 
 PIXEL_CENTRE = 0.5
-"""Offset between OpenCV calibrations, which count from the first pixel's centre, and `Camera`,
-which counts from its corner.
+"""Offset in pixels from OpenCV's coordinates, whose origin is the first pixel's centre, to those of `Camera`, whose origin is its
+corner.
 """
 
 

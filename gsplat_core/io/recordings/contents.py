@@ -126,11 +126,11 @@ class Contents:
     undistortion: Undistortion | None = None
     """Maps of a distorted lens; `calibration` is then that of the camera without distortion. None if no map is used."""
     other_files: tuple[Path, ...] = ()
-    """Further files of the recording, with its calibration and description."""
+    """Further files of the recording, including those with its calibration and description."""
 
     @property
     def fields(self) -> frozenset[str]:
-        """Optional fields that every frame has; of `labels` and `ranges`, that some frames have."""
+        """Names of the optional frame fields that are present: on every frame or, for `labels` and `ranges`, on some frames."""
         has = {
             "right_image": self.right is not None,
             "depth": self.depth is not None,
@@ -236,7 +236,7 @@ class Contents:
 def _mapped_labels(
     labels: NDArray[np.uint8], plane: Callable[[NDArray[np.uint8]], NDArray[np.uint8]]
 ) -> NDArray[np.uint8]:
-    """Return labels that were moved by a map whose pixels outside are 0; they become 255 (unknown)."""
+    """Return the labels undistorted or rectified by `plane`. Pixels outside of the original picture become 255 (unknown)."""
     return plane(labels + np.uint8(1)) - np.uint8(1)
 
 
@@ -279,7 +279,7 @@ class Beside:
         self._findings = findings
 
     def files(self) -> tuple[Path, ...]:
-        """Existing sidecars that consist of a single file."""
+        """Paths of the existing sidecars that consist of a single file."""
         found = (self._file(name) for name in _FILES)
         return tuple(path for path in found if path is not None)
 
@@ -511,7 +511,7 @@ class _Made(Generic[T]):
             self._changed.notify_all()
 
     def taken(self) -> Generator[T, None, None]:
-        """Yield the items in the consumer's thread."""
+        """Yield the items in the consumer's thread; at the end raise the exception of the producing thread, if any."""
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._items or self._done)

@@ -103,7 +103,8 @@ class LabelFiles:
 
 
 class ScanFiles:
-    """Reader of the scans of a range sensor: `.npy` [columns of the picture, bins], or [1, bins] for the form `image`."""
+    """Reader of a range sensor's scans, one `.npy` per frame: [columns of the picture, bins], or [1, bins] if the sensor's form is
+    `image`."""
 
     def __init__(self, of_frame: dict[int, Path], sensor: RangeSensor, columns: int, description: Path) -> None:
         self._of_frame, self.sensor = of_frame, sensor

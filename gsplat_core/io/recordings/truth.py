@@ -70,7 +70,7 @@ class RecordedView:
         """
         findings = Findings(strict=True)
         picture = next(ImageFiles(self.files[index : index + 1], 0, 0).frames(findings))
-        assert picture is not None  # strict findings have raised
+        assert picture is not None  # strict findings raise instead of returning None
         frame = Frame(
             seq=index,
             pts_ns=0,

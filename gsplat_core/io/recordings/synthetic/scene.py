@@ -119,7 +119,7 @@ class SyntheticScene:
     drawn: RandomScene | None = None
     """Random properties; None for the usual scene."""
     others: tuple[ToolMotion, ...] = ()
-    """Tools that do not pull the tissue."""
+    """Motions of further tools, which do not pull the tissue."""
     lens: RadialLens | None = None
     particles: Particles | None = None
 

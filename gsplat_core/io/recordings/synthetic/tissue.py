@@ -52,7 +52,8 @@ class Breathing:
         return float(uniform) if self.ratio == 1 else unequal(float(uniform), self.ratio)
 
     def _ahead_s(self, time_s: float) -> float:
-        """Return the time lead per unit of `wander`: the integral of a deviation between -1 and 1."""
+        """Return the lead of breathing in seconds over one of constant rate, per unit of `wander`: the integral over time of a rate
+        deviation between -1 and 1."""
         waves = (
             period / (2 * np.pi) * (np.sin(2 * np.pi * time_s / period + phase) - np.sin(phase))
             for period, phase in zip(WANDER_PERIODS_S, self.wander_phases, strict=True)

@@ -31,7 +31,7 @@ Includes the open jaws and a margin for rays that graze the tool within a pixel.
 
 @dataclass(frozen=True)
 class Part:
-    """Capsule from a to b with a linearly varying radius."""
+    """Part of a tool's shape: a capsule from a to b (in mm) with a linearly varying radius."""
 
     a: NDArray[np.float64]
     b: NDArray[np.float64]
