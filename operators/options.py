@@ -269,8 +269,8 @@ def _adapter(hint: Any) -> TypeAdapter[Any]:
 
 
 def options_of(kind: type[Section]) -> Mapping[str, Declared]:
-    """Return the declared options of a class by name: those of its sections in order, then those of combined
-    classes."""
+    """Return the declarations of a class's options by name: first those of the option sections that it inherits, in order, then
+    those of its other base classes."""
     return _options_of(cast(Any, kind))
 
 
@@ -289,7 +289,7 @@ def _options_of(kind: Any) -> Mapping[str, Declared]:
 
 
 def _without_option(hint: Any) -> Any:
-    """Return the type of an option without its `Option` and without None; a name keeps its `Names`."""
+    """Return the type of an option without the annotation `Option` and without None. An annotation `Names` is kept."""
     kind = get_args(hint)[0]
     if get_origin(kind) in (Union, UnionType):
         kinds = [each for each in get_args(kind) if each is not NoneType]

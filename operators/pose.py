@@ -122,7 +122,7 @@ class AutoPoseOp(PoseOp):
         self._test, self._is_moving = MotionTest(), False
         self._pose: NDArray[np.float64] | None = None
         self._earlier: list[EstimatedPoses] = []
-        """Statistics of earlier estimations."""
+        """Statistics of the estimations of this run that were replaced when the scope began to move again."""
 
     def compute(self, op_input: Any, op_output: Any, context: Any) -> None:
         frame = op_input.receive("frame")

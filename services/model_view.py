@@ -48,7 +48,7 @@ RANGES = {
     "width": (16.0, MOST_SIDE_PX),
     "height": (16.0, MOST_SIDE_PX),
 }
-"""Range of each parameter of a picture."""
+"""Smallest and largest value of each parameter in a browser's request for a picture."""
 
 
 @dataclass(frozen=True)

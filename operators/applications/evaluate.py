@@ -99,7 +99,7 @@ class EvaluationSettings:
 
 @dataclass(frozen=True)
 class CausalRun:
-    """Prediction score of the causal protocol, with its training settings."""
+    """Score of the causal protocol, which predicts each frame before training on it, with the settings of this training."""
 
     score: Score
     field: str

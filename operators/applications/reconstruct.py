@@ -393,7 +393,7 @@ def _left_eye(inputs: _Inputs) -> _Inputs | None:
 
 
 def _saves_poses(source: FrameSource, out: Path) -> Callable[[Session], None]:
-    """Return a step that saves the poses of all frames to `out/poses.npy`."""
+    """Return a function that saves the poses of all frames to `out/poses.npy` after a session, for `Session.finish`."""
 
     def save(session: Session) -> None:
         frames = FirstFrames(source, source.description.frame_count or 0)

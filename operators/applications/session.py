@@ -270,7 +270,7 @@ class Session:
             contributor.contribute(outcome)
 
     def _attempt(self, action: Callable[[], object]) -> None:
-        """Perform one step of the run. An error is kept in `failure`, so that later steps still run."""
+        """Call `action`, one part of the run. An expected error is kept in `failure`, so that the other parts still run."""
         try:
             action()
         except (CoreError, OperatorsError, OSError) as error:
@@ -279,7 +279,7 @@ class Session:
 
 
 def saves_model(out: Path, fitted: Model | None = None) -> Callable[[Session], None]:
-    """Return a step that saves the run's model to `out/model`.
+    """Return a function that saves the model of a finished session to `out/model`, for `Session.finish`.
 
     Args:
         out: output folder of the run.
@@ -300,7 +300,8 @@ def saves_model(out: Path, fitted: Model | None = None) -> Callable[[Session], N
 
 
 def measures_baselines(source: FrameSource) -> Callable[[Session], None]:
-    """Return a step that measures trivial baselines on the displayed frames, by reading the source twice more."""
+    """Return a function that measures trivial baselines on the frames of a finished session, for `Session.finish`. It reads the
+    source twice more."""
 
     def measure(session: Session) -> None:
         if session.stop_requested() or session.failure is not None:

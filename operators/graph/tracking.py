@@ -20,7 +20,7 @@ _MAX_TRAILS = 64
 
 @dataclass(frozen=True)
 class DurationSummary:
-    """Percentiles in milliseconds, at most 3.2 % above the true values; `max_ms` is exact."""
+    """Number and percentiles of durations in milliseconds, at most 3.2 % above the true values; `max_ms` is exact."""
 
     count: int
     p50_ms: float

@@ -48,7 +48,7 @@ class Recorded:
     shown: int = 0
     """Number of written displayed pictures."""
     lost: Mapping[str, int] | None = None
-    """Items that were not written, by kind and reason, for example `frame: the disk is too slow`; None for none."""
+    """Number of items that were not written, by kind and reason, such as `frame: writing is too slow`; None without losses."""
     bytes: int = 0
     """Size of the recording on disk, in bytes."""
     deleted_segments: int = 0

@@ -134,7 +134,7 @@ class FrameOrder:
         return self._accept(frame, pts_ns, arrived_ns)
 
     def _is_a_new_beginning(self, frame: Frame) -> bool:
-        """Return True if the recent late frames form a consecutive stream, so that the sender has restarted."""
+        """Record a late frame. Return True if the last `RESET_FRAMES` late frames are in order, so that the sender has restarted."""
         late = self._late
         goes_on = late is not None and frame.seq > late.seq and frame.pts_ns >= late.pts_ns
         self._late_count = self._late_count + 1 if goes_on else 1
@@ -142,7 +142,8 @@ class FrameOrder:
         return self._late_count >= RESET_FRAMES
 
     def _rebase(self, frame: Frame, arrived_ns: int, reason: str | None) -> Frame:
-        """Continue with the next number, and with the time elapsed on the local clock since the last frame."""
+        """Return the frame with the next number, and with a timestamp that continues the last one by the time elapsed on the local
+        clock. Later frames are shifted by the same offsets. `reason` is counted, if given."""
         assert self._out is not None
         if reason is not None:
             self._counts[reason] += 1

@@ -46,7 +46,8 @@ _BLOCKING = frozenset({*_URLS, "v4l2"})
 """
 
 _ON_DISK = frozenset({"recording", "realtime"})
-"""Schemes of files. Unlike a camera, a missing file does not become available again."""
+"""Schemes of sources that read files from disk. Opening is not retried, because a missing file, unlike a camera, does not
+return."""
 _BUILT_IN = frozenset(SOURCES)
 _SLOW_TO_OPEN_S = {"synthetic": 900.0}
 """Opening timeouts of slow sources in seconds; `synthetic` renders before it plays."""

@@ -25,11 +25,11 @@ from operators.sources.address import SourceOptions, UrlAddress, V4l2Address
 from operators.sources.live import Backoff, StreamSource
 
 KEPT_PACKETS = 256
-"""Maximum number of packets in flight in the decoder."""
+"""Number of newest packets whose arrival times and damage are kept, more than a decoder holds at a time."""
 WHOLE_PICTURES = frozenset({"rawvideo", "wrapped_avframe", "mjpeg"})
 """Codecs in which every packet is a complete picture, even if not marked as a key frame."""
 PACKETS_WITHOUT_KEY = 300
-"""Number of packets without a key frame after which decoding starts without one."""
+"""Number of packets without a key frame, at the start of a stream, after which decoding starts without one."""
 
 
 class ConnectionFailed(Exception):

@@ -208,7 +208,7 @@ class GraphFamilies:
                 self._dropped.add_metric([stream, f"{queue}: {reason}"], count)
 
     def families(self) -> Iterable[Metric]:
-        """Return all families."""
+        """Return the metric families with the values of all added streams."""
         return [value for value in vars(self).values() if isinstance(value, Metric)]
 
     def _add_counts(self, stream: str, capture: Mapping[str, Any], engine: Mapping[str, Any]) -> None:

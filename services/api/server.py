@@ -78,7 +78,7 @@ def _refusal(status: int, text: str) -> bytes:
 
 
 SAY_AGAIN_S = 10.0
-"""Seconds between log lines about refused connections."""
+"""Minimum seconds between two log lines about refused connections."""
 MOST_REFUSED = 64
 """Largest number of connections that one `accept` call closes before the event loop runs other work."""
 

@@ -239,7 +239,8 @@ def _write(path: Path, head: Head) -> None:
 
 @dataclass(frozen=True)
 class Keeping:
-    """Size limit of a file, and retention of closed files. By default all are kept."""
+    """Size from which the log's file is closed as a segment, and limits on number and age of the kept segments. By default all
+    are kept."""
 
     segment_bytes: int = 16 * 2**20
     segments: int | None = None
@@ -291,7 +292,7 @@ def segment_path(log: Path, first_seq: int) -> Path:
 
 
 def too_old(segments: list[Segment], keeping: Keeping) -> list[Segment]:
-    """Return the segments that exceed the retention limits, oldest first."""
+    """Return the segments beyond the limits on number and age, which are to be deleted, oldest first."""
     surplus = 0 if keeping.segments is None else max(0, len(segments) - keeping.segments)
     if keeping.days is not None and keeping.trusts_ages():
         until = datetime.now(UTC) - timedelta(days=keeping.days)

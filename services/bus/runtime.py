@@ -20,8 +20,8 @@ from services.bus.messages import packed_json, parsed_json
 from services.errors import AlreadyRunning, RuntimeFolderUnusable
 
 _STATE, _STARTED = 0, 19
-"""Field positions in /proc/PID/stat, counted after the process name. The name may contain anything, so the fields are
-located from its closing bracket.
+"""Positions of process state and start time in /proc/PID/stat, counted after the process name. The name may contain
+anything, so the fields are located from its closing bracket.
 """
 
 

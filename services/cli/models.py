@@ -238,9 +238,9 @@ def _text(said: dict[str, Any]) -> str:
 INLIER_SHARE = 0.02
 """Default distance between model and mesh up to which a point is an inlier, as a share of the surface's extent."""
 MOST_SIZE_RATIO = 20.0
-"""Largest size ratio of two surfaces aligned without point pairs."""
+"""Largest ratio, in either direction, of the extents of model and mesh if they are aligned without point pairs."""
 MOST_SCALE = 1.25
-"""Largest ratio of point pair distances between the mesh and a metric model."""
+"""Largest ratio, in either direction, between the distances of the given points in the mesh and in a model in millimetres."""
 LEAST_INLIERS = 0.05
 """Smallest share of points within the inlier distance at which two aligned surfaces count as matching."""
 
@@ -305,7 +305,7 @@ def compare_command(
 
 
 def _check_sizes(points: np.ndarray, surface: ClosestPoints) -> None:
-    """Check that two surfaces have similar sizes.
+    """Check that model and mesh have similar extents, within the factor `MOST_SIZE_RATIO`.
 
     Raises:
         InvalidSetting: if the sizes suggest different units.

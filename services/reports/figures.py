@@ -177,12 +177,12 @@ def _number(value: float) -> str:
 
 
 WIDTH_PX = 420
-"""Target width in pixels. Larger pictures are shrunk, smaller ones enlarged by whole factors only."""
+"""Target width of a report's pictures, in pixels. Larger pictures are shrunk, smaller ones enlarged by whole factors only."""
 _JPEG_QUALITY = 88
 ASIDE = Orbit(16.0, 8.0)
 """Side view: orbit angles in degrees about the camera's centre of view."""
 COVERED = 0.5
-"""Opacity from which a pixel counts as covered by the model."""
+"""Minimum opacity (0..1) of a rendered pixel that counts as covered by the model."""
 NOTHING_THERE = (70, 74, 80)
 
 

@@ -288,7 +288,7 @@ def reconstruct(
 
 
 class NotFinite(InvalidInput):
-    """A rendered picture contains non-finite values."""
+    """A rendered picture, or a Gaussian of its model, has non-finite values."""
 
 
 class FinishedModel:

@@ -338,7 +338,7 @@ class ManagedProcess:
         return killed or how or self._last_reason() or "it ended"
 
     def _hangs(self, now_s: float) -> str | None:
-        """Return the reason why the process counts as hung; None if it does not."""
+        """Return the reason why the process counts as hung (missing heartbeats or pictures); None if it does not."""
         limits = self._spec.limits
         silent_s = now_s - self._heard_s
         if self._heartbeat is None:

@@ -255,7 +255,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 LOOK_S = 0.25
 MEASURED_EVERY_S = 1.0
 ORPHAN_DRAIN_S = 1.25
-"""Seconds from the death of the supervisor to the end of a process that does not finish by itself."""
+"""Largest time in seconds that a process without supervisor may take to finish before it is terminated."""
 
 
 class Parent:

@@ -99,7 +99,7 @@ class _SidecarData(NamedTuple):
 
 @dataclass(frozen=True)
 class Contents:
-    """Recording that passed all checks except decoding."""
+    """Files and calibration of a recording that passed all checks except full decoding, and the reading of its frames."""
 
     root: Path
     layout: str

@@ -119,7 +119,7 @@ _OPTIONS = {
 }
 _STRICT = {"libdav1d": {"strict": "1"}}
 _WITHOUT_DELAY = frozenset({"vp8", "vp9", "av1", "mjpeg", "ffv1", "png", "huffyuv", "prores", "dnxhd"})
-"""Codecs whose decoders return a packet's picture immediately."""
+"""Codecs whose decoders return the picture of a packet before they need the next packet."""
 NO_PICTURE = "the decoder gave no picture for it"
 _QUARTER_TURNS = {90: 1, 180: 2, -180: 2, -90: 3, 270: 3}
 
@@ -254,7 +254,7 @@ _CRC32 = 0xBF
 _TIMESTAMP = 0xE7
 _BLOCK = 1 << 20
 _MOST_OTHERS = 10_000
-"""Maximum number of elements other than clusters; bounds the time to parse a file of empty elements."""
+"""Maximum number of Matroska elements other than clusters that are parsed; bounds the time for a file of empty elements."""
 _MAX_ID_BYTES, _MAX_LENGTH_BYTES = 4, 8
 
 
@@ -325,7 +325,7 @@ def whole_clusters(stream: BinaryIO, size: int, *, check_sums: bool) -> Iterator
 
 
 def _timestamp(stream: BinaryIO, body: int, end: int) -> int | None:
-    """Return the timestamp of a cluster with body [begin, end), or None if it has none.
+    """Return the timestamp of a Matroska cluster, whose body is the bytes [body, end); None if it has none.
 
     The timestamp is the first element, or the second one after a CRC-32.
     """
@@ -401,7 +401,7 @@ class UnusableContainer(Exception):
 
 @dataclass(frozen=True)
 class Container:
-    """Video container whose structure is complete."""
+    """Recognised format of a video file whose container structure is complete, and the ranges with a wrong checksum."""
 
     demuxer: str
     """Name of the only FFmpeg demuxer permitted to read the file."""
@@ -532,7 +532,9 @@ def is_shown(codec: str, data: bytes) -> bool:
         # A damaged packet counts as displayed. In a packet with several frames (superframe), the last one is displayed.
         if first >> 6 != 2 or data[-1] & 0xE0 == 0xC0:
             return True
-        rest = (first & 0x0F) << (1 if first & 0x30 == 0x30 else 0)  # profile 3 has one bit more
+        rest = (first & 0x0F) << (
+            1 if first & 0x30 == 0x30 else 0
+        )  # the header of profile 3 has a further bit before these flags
         return bool(rest & 0x08 or rest & 0x02)
     return True
 
@@ -559,8 +561,8 @@ def _h265_kind(unit: bytes) -> int | None:
 
 
 def _check_units(data: bytes, width: int, pictures: frozenset[int], kind: Callable[[bytes], int | None]) -> str | None:
-    """Return the reason if well-formed NAL units, among them a part of a picture, do not fill the packet exactly; None
-    if they do."""
+    """Return the damage of a packet as a phrase; None if well-formed NAL units, at least one of a picture, fill the packet
+    exactly."""
     found = False
     for unit in _units(data, width):
         if not unit:

@@ -411,7 +411,7 @@ def _with_sidecars(
 
 
 class _Calibrated(NamedTuple):
-    """Camera calibration assembled from all sources."""
+    """Camera calibration assembled from all files that state one, with the maps for pictures that must be corrected."""
 
     calibration: Calibration
     baseline_mm: float | None
@@ -461,7 +461,7 @@ def _calibrated(
 def _undistorted(
     root: Path, found: Calibration, baseline_mm: float | None, stereo: bool, findings: Findings
 ) -> _Calibrated:
-    """Return the calibration without distortion, and the maps to its pictures; the given one without maps after a problem."""
+    """Return the calibration of the undistorted pictures with the undistortion maps; after a problem `found` without maps."""
     if stereo:
         findings.problem(
             root,
@@ -478,7 +478,8 @@ def _undistorted(
 
 
 PLAUSIBLE_BASELINE_MM = (0.5, 100.0)
-"""Range of the distance of two eyes. A calibration in metres or centimetres is below it, one in micrometres above it."""
+"""Range of the distance between the two eyes of a stereo endoscope, in mm. A calibration in metres or centimetres is
+below it, one in micrometres above it."""
 
 
 def _fits_eyes(root: Path, eyes: _Calibrated, stereo: bool, has_depth: bool, findings: Findings) -> bool:

@@ -45,9 +45,9 @@ class Finding:
     message: str
     """Description of the defect with the observed value."""
     advice: str
-    """Remedy for the defect, addressed to the user."""
+    """Remedy for the defect, as an instruction to the user."""
     missing: bool = False
-    """True if the file does not exist (RecordingMissing), False if it is wrong (RecordingInvalid)."""
+    """True if the file does not exist, so that RecordingMissing is raised; False if it is wrong (RecordingInvalid)."""
 
     def __str__(self) -> str:
         return f"{self.file}: {self.message}. {self.advice}."
@@ -247,7 +247,7 @@ def _header(stream: BinaryIO) -> ArrayHeader:
 
 
 DEPENDS = "it may depend on a damaged frame"
-"""Prefix of the damage text of pictures decoded without error from damaged references."""
+"""Beginning of the damage text of pictures that were decoded without error but may be predicted from damaged pictures."""
 
 
 @dataclass(frozen=True)
@@ -263,7 +263,7 @@ class Picture:
 
 
 class DamagedFrames:
-    """Damaged frames of a recording: the first `MAX_RUNS` runs of frame numbers, and the count."""
+    """Damaged frames of a recording: their count, and the first `MAX_RUNS` ranges of consecutive frame numbers."""
 
     MAX_RUNS = 20
 

@@ -43,7 +43,7 @@ class VideoIndex:
     frame_count: int
     """Number of displayed pictures, including those lost to container damage."""
     times: tuple[int, ...] | None
-    """Display times of the pictures in units of the stream; None without distinct times, and after container damage."""
+    """Display times of the pictures in units of the stream's time base; None without distinct times, and after container damage."""
     ordered: bool
     """True if `positions` is reliable.
 
@@ -144,7 +144,7 @@ _REENCODE = "Copy the file again from its source, or re-encode it (ffmpeg -i IN 
 MAX_JITTER = 0.5
 """Largest deviation of a display time from even spacing, in frame durations, that is ignored as rounding or jitter."""
 _MOST_LATE = 64
-"""Maximum number of packets by which a decoder delays a picture."""
+"""Number of packets for which reasons to suspect damage are kept, more than a decoder can delay a picture."""
 
 
 class VideoFrames:
@@ -258,7 +258,7 @@ class DamageSpread:
     def follow(self, doubts: dict[int, str], last: int) -> None:
         """Merge the decoder's reasons for suspecting damage of packets, up to packet number `last`."""
         self._own = doubts | self._own  # the first reason is usually the most specific
-        begin = min([self._next, *doubts])  # reclassify pictures from a late doubt on
+        begin = min([self._next, *doubts])  # classify pictures again from the first newly suspected packet on
         doubts.clear()
         self._next = min(last + 1, len(self._index.positions))
         for number in range(begin, self._next):

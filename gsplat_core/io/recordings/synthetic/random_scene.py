@@ -52,7 +52,7 @@ class Sway:
         )
 
     def at(self, time_s: float, sway_mm: tuple[float, float, float]) -> tuple[NDArray[np.float64], float]:
-        """Return the centre [3] in mm and the roll in radians, for the usual amplitudes along x, y and z."""
+        """Return the scope's centre [3] in mm and roll in radians at a time; `sway_mm`: usual amplitudes along x, y and z."""
         turn = 2 * np.pi * time_s
         ways = [
             most * reach * (np.sin(turn / period + phase) - np.sin(phase))
@@ -82,7 +82,7 @@ class ScopePath:
     followed: float
     """Share of the translation's effect on the view that the scope's orientation compensates."""
     looked_at_mm: float
-    """Distance of the point that the orientation follows, in mm."""
+    """Distance in mm of the point that the scope's orientation keeps in view while it translates."""
     tremor: Six
     """Amplitudes of the tremor, in mm and radians."""
     tremor_hz: Six
@@ -184,7 +184,7 @@ class RandomScene:
     focal: float
     """Focal length divided by the longer side of the picture."""
     lens: tuple[float, float]
-    """Displacement of the picture's corners by the terms of k1 and k2, over their distance from the centre."""
+    """Displacements of the picture's corners by the distortion terms k1 and k2, as shares of their distance from the centre."""
     baseline_mm: float
     shape: TissueShape
     look: TissueLook

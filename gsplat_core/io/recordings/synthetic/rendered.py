@@ -47,7 +47,7 @@ class RenderSettings:
     camera: Literal["fixed", "moving"] = "fixed"
     stereo: bool = False
     extras: Extras = CLEAR
-    """Generator options; only breathing and scope path are used."""
+    """Generator options. Those that write further files or add depth noise have no effect."""
 
 
 class RenderedRecording:

@@ -52,12 +52,12 @@ class Extras:
     It grows with the squared distance. The noise-free depth is written as well.
     """
     exposure_changes: bool = False
-    """Let the exposure vary over time."""
+    """Let the camera's exposure oscillate over time."""
 
     breathing_ratio: float = 1.0
-    """Expiration to inspiration ratio of the durations."""
+    """Duration of expiration divided by that of inspiration."""
     rate_wander: float = 0.0
-    """Largest relative deviation of the breathing rate."""
+    """Largest relative deviation of the breathing rate from its mean."""
     scope_path: str = "usual"
     """Path of a moving scope: `usual` is identical for all seeds, `seeded` depends on the seed."""
 
@@ -291,7 +291,9 @@ class SyntheticScene:
     def track(self, time_s: float) -> NDArray[np.float32]:
         """Return the positions in the world, [63, 3] in mm, of a grid of tissue points at a time."""
         u, v = np.meshgrid(np.linspace(-32, 32, 9, dtype=np.float32), np.linspace(-24, 24, 7, dtype=np.float32))
-        if self.drawn is not None and self.drawn.scene == "open":  # same part of the picture for all lenses
+        if (
+            self.drawn is not None and self.drawn.scene == "open"
+        ):  # scaled so that the grid covers the same part of the picture for every focal length
             share = self.tissue.focal_factor / self.drawn.focal * self.drawn.shape.distance_mm / TISSUE_DISTANCE_MM
             u, v = np.float32(share) * u, np.float32(share) * v
         points = self.tissue.points(u.ravel(), v.ravel(), time_s, self.tug(time_s))

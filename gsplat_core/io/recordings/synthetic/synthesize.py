@@ -49,7 +49,7 @@ from gsplat_core.machine import available_bytes, in_gib
 from gsplat_core.scene.cameras import Camera
 
 HIDDEN_MM = 0.5
-"""Depth difference in mm from which a material point counts as hidden by a fold."""
+"""Depth in mm behind the visible surface from which a tracked point counts as hidden by a fold."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Motion:
     """Motion from one frame to the next; NaN at tool pixels."""
 
     flow: NDArray[np.float32]
-    """Optical flow of the left picture [H, W, 2] in pixels: pixel p moves to p + flow."""
+    """Optical flow of the left picture [H, W, 2] in pixels: the tissue at pixel p moves to p + flow."""
     scene_flow: NDArray[np.float32]
     """Displacement of the tissue in the world [H, W, 3] in mm."""
 
@@ -103,7 +103,7 @@ def seen_points(scene: SyntheticScene, eye: Eye, time_s: float) -> NDArray[np.bo
 def projected(
     camera: Camera, points: NDArray, lens: RadialLens | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Project world points [N, 3]; return pixels [N, 2] and z [N]."""
+    """Project world points [N, 3] in mm; return pixel coordinates [N, 2] and depth z [N] in mm."""
     local = points.astype(np.float64) @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
     if lens is not None:
         x, y = lens.bent(local[:, 0] / local[:, 2], local[:, 1] / local[:, 2])
@@ -118,7 +118,7 @@ _WRITTEN = re.compile(
     rf"|images_right/{_FRAME}color\.png|true_depth/{_FRAME}depth\.png|(scene_)?flow/\d{{6}}\.npy"
     r"|poses_bounds\.npy|tracks\.npy|tracks_seen\.npy|recording\.json|views\.json|valid_mask\.png"
 )
-"""Pattern of the files written by `synthesize`."""
+"""Pattern of the relative paths of files that `synthesize` writes; other files in a target folder are foreign."""
 _FOLDERS = frozenset(f"{inside}{name}" for inside in ("", "views/third/") for name in ("images", "masks", "depth")) | {
     "behind",
     "behind/images",
@@ -189,7 +189,7 @@ VALID_MASK_FILE = "valid_mask.png"
 
 @dataclass(frozen=True)
 class FrameRow:
-    """Values of one frame that are collected into files of the whole recording."""
+    """Pose, and positions and visibility of the tracked points, of one frame, for the files that hold all frames."""
 
     pose_bounds: NDArray[np.float64]
     track: NDArray[np.float32]

@@ -33,7 +33,7 @@ class Breathing:
     start: float
     """Phase of breathing at time 0 in radians, before the asymmetry is applied."""
     ratio: float = 1.0
-    """Expiration to inspiration ratio: duration of the falling half over that of the rising half."""
+    """Duration of expiration (falling sine) divided by that of inspiration (rising sine)."""
     wander: float = 0.0
     """Largest relative deviation of the breathing rate from its mean."""
     wander_phases: tuple[float, float] = (0.0, 0.0)
