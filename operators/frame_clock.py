@@ -46,7 +46,7 @@ CATCH_UP_INTERVALS = 4.0
 
 @dataclass(frozen=True)
 class ClockSettings:
-    """Display deadline and step limits. Raises InvalidSetting for a value out of range."""
+    """Display deadline of live frames and limits on their optimiser steps. Raises InvalidSetting for a value out of range."""
 
     budget_ms: float | None = None
     """Display deadline after a frame's arrival, in milliseconds. None: `auto_share` of the frame
@@ -67,13 +67,13 @@ class ClockSettings:
     at_least_steps: int | None = None
     """Minimum number of optimiser steps per frame, even past the deadline. None: device default."""
     fewest_steps: int | None = None
-    """Minimum number of steps for a frame with further frames queued behind it. None: `at_least_steps`."""
+    """Minimum number of optimiser steps for a frame with further frames queued behind it. None: `at_least_steps`."""
     catch_up_intervals: float | None = None
     """Longest wait of a frame before it is dropped for newer ones, in frame intervals. None: device default."""
     at_most_steps: int = 80
     """Maximum number of optimiser steps before a frame is displayed."""
     first_at_least_steps: int | None = None
-    """Minimum number of steps for the first frame of a scene. None: device default."""
+    """Minimum number of optimiser steps for the first frame of a scene. None: device default."""
     rehearse_at_most: int = 120
     """Maximum number of optimiser steps on earlier frames (rehearsal) after each frame, however long the next one takes."""
 
@@ -155,7 +155,7 @@ class FrameClock:
         )
 
     def least_steps(self, behind: bool) -> int:
-        """Return the minimum number of steps of a frame; `behind`: further frames are queued."""
+        """Return the minimum number of optimiser steps of a frame; `behind`: further frames are queued."""
         at_least = self.settings.at_least_steps or 1
         return self.settings.fewest_steps or at_least if behind else at_least
 

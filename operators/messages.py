@@ -30,7 +30,7 @@ class Reconstruction:
     steps: int = 0
     """Number of optimiser steps on this frame."""
     arriving_loss: HostCopy | None = None
-    """Loss of the last step, possibly still in flight from the GPU; None without steps."""
+    """Loss of the last optimiser step on this frame, possibly still in flight from the GPU; None without steps."""
     content: Frame | None = None
     """Live runs: newest frame the model was trained on, which determines the picture's age. None means `frame` itself.
     """
@@ -49,7 +49,7 @@ class Reconstruction:
 
     @property
     def loss(self) -> float | None:
-        """Loss of the last step; blocks until the GPU has finished. None without steps."""
+        """Loss of the last optimiser step on this frame; blocks until the GPU has finished. None without steps."""
         return None if self.arriving_loss is None else self.arriving_loss.item()
 
 

@@ -257,7 +257,7 @@ def warm_reconstructor(
             if stereo:
                 right = reconstructor.camera.right_eye(EYES_APART * reconstructor.config.default_depth_mm)
                 frame = frame.with_fields(right_image=image, right_camera=right)
-            # A time budget makes the reconstructor measure the duration of a step.
+            # A time budget makes the reconstructor measure the duration of an optimiser step.
             reconstructor.observe(frame, budget=Budget.until(0.0, at_least=WARM_STEPS[reconstructor.device.type]))
             # All models are held, so that every snapshot slot and pinned buffer of a run is
             # allocated.

@@ -186,7 +186,7 @@ class Learner:
 
 
 class Training(ABC):
-    """Policy that decides how many steps the model is trained on a frame, and when."""
+    """Policy that decides how many optimiser steps the model is trained on each frame, and what is done between frames."""
 
     def begin(self) -> None:  # noqa: B027 - stateless policies do not override it
         """Prepare the policy for a new stream."""
@@ -220,7 +220,7 @@ class Training(ABC):
 
 
 class EveryFrame(Training):
-    """Trains the configured number of steps on each frame.
+    """Trains the configured number of optimiser steps on each frame.
 
     Damaged, withheld and held-out frames are displayed with the newest model, except frames that the model follows
     (`Frame.is_followed`). The first frame of a scene is trained on even if it is held out, because the following ones
@@ -232,7 +232,7 @@ class EveryFrame(Training):
         self._held_out = held_out
 
     def learn(self, frame: Frame, learner: Learner, frame_waits: Callable[[], bool]) -> Reconstruction | None:
-        """Train the configured number of steps on the frame, or display it untrained (see the class).
+        """Train the configured number of optimiser steps on the frame, or display it untrained (see the class).
 
         Returns: None for an unusable frame of a scene without a model.
         """

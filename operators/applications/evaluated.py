@@ -186,7 +186,7 @@ def with_poses_of_run(source: FrameSource, run: EvaluatedRun | None) -> FrameSou
 
 
 def _scale_of_model(made: Camera, seen: Camera, run_scale: float | None) -> float:
-    """Return the scale at which pictures of `seen` have the size of `made`; preferably 1 or the run's scale."""
+    """Return the scale at which pictures of the camera `seen` have the size of those of `made`; preferably 1 or `run_scale`."""
     for scale in (1.0, run_scale):
         if scale is not None:
             scaled = seen.scaled(scale)

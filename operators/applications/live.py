@@ -148,7 +148,8 @@ def new_parts(settings: LiveSettings, source: FrameSource) -> LiveParts:
 
 
 def warm_up(settings: LiveSettings, source: FrameSource) -> LiveParts:
-    """Create reconstructor and rasterizer and exercise them: capture graphs, allocate memory, measure the duration of a step."""
+    """Create reconstructor and rasterizer and exercise them: capture graphs, allocate memory, measure the duration
+    of an optimiser step."""
     camera = source.description.camera
     parts = new_parts(settings, source)
 

@@ -60,7 +60,7 @@ from operators.sources.source import FrameSource
 from operators.storage import storage_errors
 
 MINUTES_ON_GPU, MINUTES_ON_CPU = 0.75, 10.0
-"""Time limits of a training with an automatic number of steps, in minutes."""
+"""Time limits in minutes of an offline reconstruction that chooses its number of optimiser steps automatically."""
 ALTERNATIVE_SHARE = 0.1
 """Share of the time limit above which the first trial training was too slow to try other inputs (poses, depth, eyes)."""
 
@@ -84,7 +84,7 @@ class FittedModel:
     def observe(
         self, frame: Frame, *, budget: Budget | None = None, train: bool = True, doubtful: bool = False
     ) -> ObserveReport:
-        """Return a report without training steps."""
+        """Accept a frame without training on it, and return a report of 0 optimiser steps."""
         return ObserveReport(frame.seq, 0, None, self.model.gaussians.count)
 
     def publish(self) -> Model:
@@ -96,7 +96,7 @@ class FittedModel:
         return self.model
 
     def with_depth_errors(self, model: Model) -> Model:
-        """Return the model, which states the errors of its depth."""
+        """Return the model unchanged, because it already states the errors of its depth."""
         return model
 
 
@@ -242,10 +242,10 @@ class _Fitting:
         self._posed_inputs: _Inputs | None = None
         """Inputs with estimated poses while alternatives are tried; None if none were estimated."""
         self._setup_s = 0.0
-        """Time before the first step of the last training, in seconds."""
+        """Duration of the preparation of the last training before its first optimiser step, in seconds."""
 
     def done(self, steps: int | None) -> Fitted:
-        """Train with a number of steps. None first chooses the number and the inputs (poses, depth, right eye) that are
+        """Train with a number of optimiser steps. None first chooses the number and the inputs (poses, depth, right eye) that are
         best for validation frames.
         """
         settings = self._settings
@@ -278,7 +278,7 @@ class _Fitting:
         )
 
     def _chosen(self, inputs: _Inputs) -> tuple[_Inputs, ChosenSteps]:
-        """Return the inputs and the number of steps that are best for validation frames."""
+        """Return the inputs (poses, depth, eyes) and the number of optimiser steps that score best on validation frames."""
         if len(inputs.validating) < LEAST_FRAMES:
             return inputs, ChosenSteps(USUAL_STEPS, (), "few frames")
         limit_s = 60 * self._minutes
@@ -326,7 +326,8 @@ class _Fitting:
         return _without_depth(posed)
 
     def _trial(self, inputs: _Inputs) -> Train:
-        """Return a function that trains for a number of steps without the validation frames and scores the model on them."""
+        """Return a function that trains for a number of optimiser steps without the validation frames, and scores the model on
+        these."""
         kept = inputs.validating
         path = inputs.path
         if path is not None:
@@ -349,7 +350,7 @@ class _Fitting:
         return MINUTES_ON_CPU if settings.device == "cpu" else MINUTES_ON_GPU
 
     def _train(self, inputs: _Inputs, given: ToFit, steps: int, stage: str) -> Reconstructor:
-        """Train until the last step or a stop request."""
+        """Train an untrained reconstructor until the last optimiser step or a stop request, and return it."""
         learning = self._learning = inputs.new()
         begin_s, done = self._clock(), 0
 

@@ -187,7 +187,7 @@ class Session:
         self.finish, self.stop_requested = tuple(finish), stop_requested
         self.notes = list(notes)
         self.reached = OutcomeBuilder()
-        """Parts, outputs and notes that operators and finish steps have contributed so far."""
+        """Parts, outputs and notes that the operators and the functions in `finish` have contributed so far."""
         self.failure: Exception | None = None
         """First error of the run; None if there was none."""
         self.wall_s = 0.0
@@ -217,7 +217,7 @@ class Session:
         self.wall_s = perf_counter() - self.started.s
 
     def end(self) -> None:
-        """Collect the contributions of the operators, then perform the `finish` steps."""
+        """Collect the contributions of the operators, then call the functions in `finish`."""
         for contributor in self._contributors():
             self._attempt(lambda contributor=contributor: contributor.contribute(self.reached))  # type: ignore[misc]
         for step in self.finish:

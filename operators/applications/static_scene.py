@@ -152,7 +152,7 @@ TRAINING_FILE = "training.json"
 MODEL_FOLDER = "model"
 PLY_FILE = "scene.ply"
 REPORT_EVERY = 100
-"""Interval in steps of progress reports with the PSNR of a training picture."""
+"""Number of optimiser steps between two progress reports with the PSNR of a training picture."""
 
 
 @dataclass(frozen=True)
@@ -160,12 +160,12 @@ class SceneTraining:
     """Result of the training of a static scene."""
 
     steps: int
-    """Steps taken; fewer than requested if interrupted."""
+    """Number of optimiser steps taken; fewer than requested if interrupted."""
     training_images: int
     initial_gaussians: int
     gaussians: int
     training_s: float
-    """Duration of the steps in seconds, without reading, saving and evaluation."""
+    """Duration of the optimiser steps in seconds, without reading, saving and evaluation."""
     peak_memory_bytes: int
     """Peak resident memory of the process."""
     device_peak_bytes: int | None
@@ -250,7 +250,7 @@ def _train(
     report: ProgressCallback,
     stop_requested: Callable[[], bool],
 ) -> float:
-    """Take the steps of a training and return their duration in seconds."""
+    """Take the optimiser steps of a training and return their duration in seconds."""
     total_s, started_s = 0.0, perf_counter()
     for done in range(1, options.steps + 1):
         step = trainer.step()

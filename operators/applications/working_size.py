@@ -184,7 +184,7 @@ def lower_quartile(values: Iterable[float]) -> float:
 
 @dataclass(frozen=True)
 class Latency:
-    """Latency of a frame as a function of the size step: a fixed time and a time per pixel."""
+    """Latency of a frame as a function of the picture size in size steps (see `SCALE_STEPS`): a fixed time and a time per pixel."""
 
     fixed_s: float
     each_s: float
@@ -206,11 +206,11 @@ class Latency:
         return cls(fixed_s, each_s)
 
     def at(self, step: int) -> float:
-        """Return the latency in seconds at a size step."""
+        """Return the latency in seconds of a frame at the scale `step` / `SCALE_STEPS`."""
         return self.fixed_s + self.each_s * step**2
 
     def largest(self, sizes: Sequence[int], allowed_s: float) -> int:
-        """Return the largest of the size steps at which a frame takes at most `allowed_s`, or else the smallest."""
+        """Return the largest of the size steps `sizes` at which a frame takes at most `allowed_s` seconds; if none, the smallest."""
         return max((step for step in sizes if self.at(step) <= allowed_s * (1 + ROUNDING)), default=min(sizes))
 
 

@@ -121,7 +121,7 @@ def _same_scalar(one: Any, other: Any) -> bool:
 
 
 class Operator:
-    """One step of a graph, independent of the engine.
+    """Node of a graph that processes messages; independent of the engine that runs the graph.
 
     A subclass declares ports and parameters in `setup` and works in `compute`. Each run calls
     `initialize`, `start`, `compute` n times, and `stop`. Every started operator is stopped.
@@ -178,7 +178,7 @@ class Operator:
         """
 
     def compute(self, op_input: InputContext, op_output: OutputContext, context: ExecutionContext) -> None:
-        """Perform one step: receive, process and emit."""
+        """Receive messages from the inputs, process them and emit results. Called by the scheduler whenever the operator is ready."""
         raise NotImplementedError(f"operator {self.name!r} ({type(self).__name__}) has no compute method")
 
     def stop(self) -> None:

@@ -113,7 +113,7 @@ def _last_version(connection: sa.Connection, name: str, at: str) -> int:
 
 
 Reached = Callable[[str], None]
-"""Callback that receives the name of each completed step of a change."""
+"""Callback that receives the name of each completed stage of a change, such as `upload committed`."""
 
 
 def check_activatable(record: VersionRecord) -> None:

@@ -223,7 +223,7 @@ def set_active(connection: sa.Connection, name: str, version: int) -> None:
 
 
 def activation_steps(connection: sa.Connection, name: str) -> list[tuple[int, int]]:
-    """Return (step, version) of every activation that was not rolled back, oldest first."""
+    """Return the ascending number and the version of every activation that was not rolled back, oldest first."""
     query = sa.select(ACTIVATIONS.c.step, ACTIVATIONS.c.version).where(ACTIVATIONS.c.name == name)
     return [(row.step, row.version) for row in connection.execute(query.order_by(ACTIVATIONS.c.step))]
 

@@ -623,7 +623,7 @@ def show(worker: Worker, spec: EngineSpec, screen: Screen, layers: Layers, again
 
 
 def graph_figures(graph: Pipeline) -> dict[str, object]:
-    """Return counts of frames and steps, number of Gaussians and source state of a graph by name; empty before it runs."""
+    """Return counts of frames and optimiser steps, number of Gaussians and source state of a graph by name; empty before it runs."""
     if getattr(graph, "metrics", None) is None:
         return {}
     counts = graph.reconstruct.counts

@@ -136,7 +136,7 @@ class ScanFiles:
 
 
 def read_sensor(path: Path, findings: Findings) -> RangeSensor | None:
-    """Read `sensor.json`: the name of the sensor in `sensor`, and its fields. None after a problem."""
+    """Read `sensor.json`, which names a kind of range sensor (`sensor`) and states its parameters. None after a problem."""
     content = read_json(path, findings)
     if content is None:
         return None

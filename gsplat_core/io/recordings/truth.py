@@ -57,7 +57,8 @@ class RecordedView:
 
     name: str
     camera: Camera
-    """Camera; its pose maps from the recording's own camera, as that of `Frame.right_camera`."""
+    """Camera of the view. Its pose maps from coordinates of the recording's own camera to its own, as that of
+    `Frame.right_camera`."""
     files: tuple[Path, ...]
     masks: MaskFiles | None
     depth: DepthFiles | None

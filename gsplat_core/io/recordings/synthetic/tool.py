@@ -176,7 +176,7 @@ def _end(
     opening: float,
     scale: float,
 ) -> list[Part]:
-    """Return the capsules between the tip and the hinge. Radii are those of a tool of scale 1."""
+    """Return the capsules of a tool's working end, between hinge and tip. Their radii are those of a tool of scale 1."""
     if kind == "suction":
         return [Part(hinge, tip, 2.6, 2.4, SHAFT)]
     if kind == "hook":
