@@ -44,7 +44,7 @@ class RememberedTissue:
     def __init__(self) -> None:
         self._resize(0, 0)
         self._found: tuple[NDArray[np.uint8], tuple[int, int, int, int]] | None = None
-        """Last mask and its bounding box: left, top, width, height in pixels."""
+        """Newest mask of remembered tissue, with its bounding box (left, top, width, height in pixels); None before the first."""
 
     def _resize(self, height_px: int, width_px: int) -> None:
         self._grey, self._tools, self._scratch = (np.empty((height_px, width_px), np.uint8) for _ in range(3))

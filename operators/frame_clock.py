@@ -32,7 +32,8 @@ REHEARSAL_MARGIN_NS = 300_000
 SHOWN_WITHIN_S = 0.005
 """Longest wait for a picture to be displayed before rehearsal, in seconds."""
 AUTO_SHARE, AUTO_MOST_MS, LEAST_SHARE = 0.6, 18.3, 0.34
-"""Defaults for `ClockSettings.auto_share`, `auto_most_ms` and `least_share`."""
+"""Default display deadline, as a share of the frame interval and its upper limit in milliseconds, and default share of the
+interval that is guaranteed for training."""
 FIRST_MS = 20.0
 """Display deadline of a scene's first frame after its arrival, in milliseconds."""
 FIRST_AT_MOST_STEPS = 60
@@ -41,7 +42,7 @@ CATCH_UP_SHARE = 0.8
 """Share of the frame interval. Queued frames are caught up with, not dropped, only while training (with the minimum number of
 steps) and display each take less."""
 CATCH_UP_INTERVALS = 4.0
-"""Default for `ClockSettings.catch_up_intervals`."""
+"""Default for the longest wait of a frame before it is dropped for newer ones, in frame intervals."""
 
 
 @dataclass(frozen=True)

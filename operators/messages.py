@@ -67,7 +67,7 @@ class DeformedScene:
     camera: Camera
     trained: bool
     reconstruction: Reconstruction | None = None
-    """Source message of the scene; None if unknown."""
+    """Message with the frame and model from which this scene was made; None if unknown."""
 
     def __post_init__(self) -> None:
         if (self.camera.width_px, self.camera.height_px) != (self.frame.width_px, self.frame.height_px):

@@ -24,7 +24,7 @@ class OutcomeBuilder:
         self._notes: list[str] = []
 
     def add(self, part: object) -> None:
-        """Add a part. Raises InvalidInput if a part of the same class exists."""
+        """Add a part: results of one contributor, as a dataclass. Raises InvalidInput if a part of the same class exists."""
         kind = type(part)
         if kind in self._parts:
             raise InvalidInput(

@@ -530,7 +530,7 @@ def _check_results(folder: Path, marker: dict[str, object]) -> None:
 
 
 def _passing(name: str) -> bool:
-    """Return True for names that only a running or killed run leaves."""
+    """Return True for the names of files and folders that only a running or killed run leaves in its output folder."""
     return name == LOCK or _PASSING.fullmatch(name) is not None
 
 

@@ -43,7 +43,7 @@ class DeformOp(Operator):
         camera = model.camera if frame.pose is None else model.camera.with_pose(frame.pose)
         if model.device.type == "cpu":
             with torch.inference_mode():
-                model.at(frame.time_s)  # caches the state inside the model; the renderer reuses it
+                model.at(frame.time_s)  # caches the deformed Gaussians inside the model; the renderer reuses them
         op_output.emit(DeformedScene(frame, model, camera, message.trained, message), "scene")
 
 

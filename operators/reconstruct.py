@@ -77,7 +77,7 @@ class ModelResult:
     """Outcome part with the final model of a run."""
 
     model: Model
-    """Newest version, as an independent copy."""
+    """Newest version of the model, copied so that no later call changes it."""
 
 
 @dataclass(frozen=True)
@@ -165,7 +165,7 @@ class ReconstructOp(Operator):
         torch.mm(one, one)
 
     def stop(self) -> None:
-        # Free the optimiser state and the slots; keep the last model for saving.
+        # Free the optimiser state and the snapshot slots; keep the last model for saving.
         if self._learner is not None:
             self.model = self._learner.whole_model()
             self._eyes = self._learner.reconstructor.eyes.trained

@@ -45,9 +45,9 @@ class TrainingCounts:
     """Statistics of the training of a run."""
 
     frames: int = 0
-    """Number of frames that were trained on, with those that were only followed."""
+    """Number of frames passed to training, including unusable frames that the model only followed (`Frame.is_followed`)."""
     steps: int = 0
-    """Optimiser steps on the newest frame before its display."""
+    """Total number of optimiser steps on frames before their display, without rehearsal."""
     passed_over: int = 0
     """Number of frames dropped in favour of newer ones."""
     rehearsed: int = 0
@@ -276,7 +276,7 @@ class UntilDisplay(Training):
     def begin(self) -> None:
         """Reset the counters of growth and late depth for a new stream."""
         self._since_grown = 0
-        """Frames trained on since the last growth step."""
+        """Number of frames trained on since the last growth step."""
         self._depth_ages = Histogram()
         self._depths_taken = self._depths_dropped = 0
 

@@ -74,7 +74,7 @@ class EvaluationSettings:
     """Scale of the frames; None for the scale at which the model was made."""
     max_frames: int | None = None
     steps_per_frame: int | None = None
-    """Optimiser steps per frame in the causal protocol; None for the run's."""
+    """Optimiser steps per frame in the causal protocol; None for those of the run that made the model."""
     motion_prior: str | None = None
     """Motion prior of the causal protocol, a name in `MOTION_PRIORS`; None for the default."""
     places: tuple[Visits, ...] | None = None
@@ -428,7 +428,8 @@ class _Work:
         if math.isinf(from_s):
             until_s = min(until_s, self.playback.round_s - 0.5 / self.source.description.fps * self.playback.stretch)
         source = self.source
-        # Other protocols learn anew, or take the recording's poses as the truth.
+        # These stages render the finished model at the frames, with the poses of its training. The others train a new model,
+        # need no poses, or take those of the recording as ground truth.
         if stage in ("heldout", "retention", "second_eye"):
             source = with_poses_of_run(source, self.run)
         return SeenFrames(source, from_s, until_s, self.playback, self.stop_requested, self._progress(stage))

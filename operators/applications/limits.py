@@ -79,7 +79,7 @@ def frames_to_render(window_s: tuple[float, float], fps: float) -> int:
 
 
 FIXED_BYTES = 16 * 2**20
-"""Memory of threads, the video encoder and the report."""
+"""Memory of threads, the video encoder and the report, in bytes."""
 PIXEL_BYTES = 200
 """Bytes per pixel for training, scoring and the report's pictures."""
 WINDOW_PIXEL_BYTES = 26

@@ -172,7 +172,7 @@ class Fitted(NamedTuple):
 
     model: Model
     eyes: BothEyes
-    """Eyes that were trained on."""
+    """Eyes of the endoscope whose pictures the model was trained on."""
     steps: ChosenSteps
     source: FrameSource
     """Source of the frames. They have estimated poses if the settings require them, or if validation frames are

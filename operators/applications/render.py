@@ -53,7 +53,7 @@ MOST_PICTURED = 1_000_000
 """Number of Gaussians of a static scene above which `typical_depth` takes the depth from a sample of their centres instead of a
 rendered picture."""
 COVERED = 0.5
-"""Minimum opacity of a pixel that counts for `typical_depth`."""
+"""Minimum opacity of a rendered pixel whose depth counts for the median depth of a scene (`typical_depth`)."""
 
 
 @dataclass(frozen=True)

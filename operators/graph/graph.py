@@ -203,7 +203,7 @@ class Graph:
         self.stop()
 
     def record_fault(self, failure: OperatorFailed, action: FaultAction) -> None:
-        """Record a fault for the result."""
+        """Record an operator's exception and the reaction to it for the run's result; log it unless it stops the graph."""
         self.faults.append(Fault(failure, action))
         if action is not FaultAction.STOP_GRAPH:
             logger.warning("%s; %s", failure, action.value, exc_info=_traceback_of(failure))
@@ -408,7 +408,7 @@ class OperatorTask:
         return self._trail
 
     def start(self) -> None:
-        """Start the operator under its fault policy."""
+        """Call the operator's `start`. Its fault policy decides what follows an exception."""
         try:
             self.operator.start()
             self.started = True

@@ -164,7 +164,7 @@ class FlowTracker:
         return self._computes.setdefault(name, Histogram())
 
     def begin(self, operator: str, began_ns: int) -> Trail:
-        """Return the trail of a message emitted by a root."""
+        """Return the trail (paths and their start times) of a message from an operator that had received none (a root)."""
         root = self._roots.get(operator)
         if root is None:
             root = self._roots[operator] = PathNode((operator,))
@@ -181,7 +181,7 @@ class FlowTracker:
         return tuple(merged.items())
 
     def finish(self, operator: str, trails: list[Trail]) -> None:
-        """Record the latencies of messages that a leaf has processed."""
+        """Record the latency of each path of the messages that an operator without connected outputs (a leaf) has processed."""
         now_ns = perf_counter_ns()
         for trail in trails:
             for node, began_ns in trail:

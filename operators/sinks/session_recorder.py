@@ -299,7 +299,7 @@ class SessionRecorder:
                 writer.close(self._why)
         except OutputError as error:
             self._give_up(writer, str(error))
-        except av.FFmpegError as error:  # those that are not an OSError
+        except av.FFmpegError as error:  # FFmpeg's errors that are not an OSError
             self._give_up(writer, f"{self.folder}: the recording cannot be written ({error}); check its disk")
         except BaseException as error:  # noqa: BLE001 - raised again by `close`
             self._give_up(writer, f"the recording failed: {type(error).__name__}: {error}")

@@ -168,7 +168,7 @@ class VideoFile:
         except OutputError:
             self._broken = True
             raise
-        except av.FFmpegError as error:  # those that are not an OSError
+        except av.FFmpegError as error:  # FFmpeg's errors that are not an OSError
             self._broken = True
             raise OutputError(
                 f"{self.path}: the video cannot be written ({error}); check the path, its permissions and its disk"

@@ -396,7 +396,7 @@ class RealtimeAddress:
 
     place: str
     options: SourceOptions
-    """Options of the source with those of the address."""
+    """Given source options, overridden by those in the address."""
 
     @classmethod
     def parse(cls, rest: str, options: SourceOptions) -> Self:

@@ -51,7 +51,7 @@ def new_memory() -> int:
         # Shrinking the memory would crash the reader.
         fcntl.fcntl(fd, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK)
         return fd
-    with tempfile.TemporaryFile() as file:  # has no name in the file system either
+    with tempfile.TemporaryFile() as file:  # like a memfd, this file has no name in the file system
         return os.dup(file.fileno())
 
 

@@ -74,7 +74,9 @@ class _Teller:
         if now_s - self._said_s >= SAY_S or progress.done == progress.total:
             self._said_s = now_s
             next_db = progress.next_frame_db
-            self._next_db = self._next_db if next_db is None else next_db  # the last frame has no prediction score
+            self._next_db = (
+                self._next_db if next_db is None else next_db
+            )  # keep the earlier score, because the last frame has no prediction
             self._task.say_progress(
                 JobProgress(
                     progress.done, progress.total, progress.psnr_tissue_db, progress.previous_frame_db, self._next_db

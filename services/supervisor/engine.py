@@ -125,7 +125,7 @@ def _serialised(histogram: Histogram) -> dict[str, Any]:
 
 
 WAIT_S = 5.0
-"""Seconds that a snapshot waits for training on the next frame."""
+"""Seconds that the command `snapshot` waits for training on the next frame before it is refused."""
 
 
 class LiveSnapshots:
@@ -399,7 +399,7 @@ class ModelShow:
         self._previous: Showing | None = None
         self._late = 0
         self._gave_way: list[dict[str, Any]] = []
-        """Name, version and reason of the last eight models that were rolled back."""
+        """Name, version and reason of the last eight models that this engine stopped displaying after failures."""
         self._thread: threading.Thread | None = None
 
     def begin(self) -> None:

@@ -117,7 +117,7 @@ class Stream:
             self.folder.remove()
 
     def view(self) -> StreamView:
-        """Return configuration and current state."""
+        """Return the configuration and the current state of the stream, as the API's record."""
         engine = self.specs["engine"].engine
         assert engine is not None
         state, reason = "stopped", None
@@ -522,5 +522,5 @@ class ShownModels:
 
 
 def _given_up(figures: Mapping[str, Any]) -> GivenUp:
-    """Return the models that an engine rolled back, newest last."""
+    """Return name, version and reason of the models that an engine stopped displaying after failures, newest last."""
     return tuple((each["name"], each["version"], each["reason"]) for each in figures.get("gave_way") or ())

@@ -147,7 +147,7 @@ class Undistortion:
     """
 
     def __init__(self, camera: Camera, coefficients: Sequence[float]) -> None:
-        # Imported lazily, as in `Camera`.
+        # Imported only where it is needed, because importing torch takes long.
         import torch
 
         from gsplat_core.scene.distortion import Lens
@@ -196,7 +196,7 @@ class Undistortion:
         rays = ideal.rays(torch.stack([columns, rows], -1).reshape(1, -1, 2), torch.tensor(self.camera.K)[None])
         source = lens.project(rays.directions, K)
         visible = (rays.valid & source.valid)[0, :, None]
-        places = torch.where(visible, source.points[0] - PIXEL_CENTRE, -2.0)  # outside of the picture
+        places = torch.where(visible, source.points[0] - PIXEL_CENTRE, -2.0)  # -2: outside, where `remap` gives 0
         across, down = places.reshape(height, width, 2).float().unbind(-1)
         self._maps = across.contiguous().numpy(), down.contiguous().numpy()
         inside = self.plane(np.ones((height, width), np.uint8))
@@ -570,7 +570,7 @@ def _distortion(numbers: Sequence[float] | Any, name: str) -> Numbers:
         if np.any(found[8:]):
             raise _Unusable(f"{name} has {found.size} numbers; up to 8 are understood")
         found = found[:8]
-    # Next number of distortion coefficients supported by OpenCV.
+    # Pad with zeros to the next number of distortion coefficients that OpenCV supports.
     return np.pad(found, (0, next(length for length in (4, 5, 8) if length >= found.size) - found.size))
 
 

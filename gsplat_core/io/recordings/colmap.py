@@ -37,7 +37,7 @@ MOST_TRANSLATION = 1e9
 SAME_SHAPE = 0.01
 """Largest relative difference of the aspect ratios of a camera and its image file."""
 HELD_OUT_EVERY = 8
-"""Default interval of held-out images."""
+"""Default interval of held-out images: the first image, and every eighth after it."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class ColmapScene:
 
     folder: Path
     sparse: Path
-    """Folder of the reconstruction."""
+    """Folder of COLMAP's reconstruction: the files of cameras, images and points."""
     images: tuple[PosedImage, ...]
 
     def held_out(self, every: int = HELD_OUT_EVERY) -> tuple[PosedImage, ...]:
@@ -219,7 +219,7 @@ class _Binary:
         self.size = os.fstat(file.fileno()).st_size
 
     def take(self, layout: str) -> tuple[float, ...]:
-        """Read a struct. Raises RecordingInvalid at the end of the file."""
+        """Read the values of a `struct` format. Raises RecordingInvalid at the end of the file."""
         size = struct.calcsize(layout)
         data = self._file.read(size)
         if len(data) < size:

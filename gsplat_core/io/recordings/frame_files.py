@@ -35,7 +35,7 @@ from gsplat_core.scene.range_sensors import RangeScan, RangeSensor
 
 SENSOR_FILE = "sensor.json"
 CLASSES = 4
-"""Number of classes of the loss `semantics`."""
+"""Number of classes of pixel labels (values from 0), which the loss `semantics` learns."""
 UNKNOWN = 255
 """Label of a pixel without a class."""
 

@@ -104,7 +104,7 @@ class FileRecording:
         # Close the inner generator explicitly. Python 3.12 would close it only when the outer generator is collected.
         with closing(self._contents.frames(Findings(strict=True), self.frame_count)) as frames:
             for frame in frames:
-                assert frame is not None  # a strict collector has raised
+                assert frame is not None  # with strict findings, a problem raises instead of yielding None
                 yield resized_frame(frame, self.width_px, self.height_px)
 
     def __len__(self) -> int:
@@ -140,7 +140,7 @@ def open_recording(path: str | os.PathLike[str], *, scale: float = 1.0, max_fram
         raise InvalidSetting(f"max_frames must be at least 1, got {max_frames}")
     findings = Findings(strict=True)
     contents = inspect(Path(path), findings)
-    assert contents is not None  # a strict collector has raised
+    assert contents is not None  # with strict findings, a problem raises instead of returning None
     _check_scaled_size(contents.images.width_px, contents.images.height_px, scale)
     return FileRecording(contents, scale, max_frames, tuple(str(finding) for finding in findings.warnings))
 

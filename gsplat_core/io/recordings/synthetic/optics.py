@@ -23,7 +23,7 @@ Array = NDArray[np.floating]
 LIGHTS_MM = ((-3.2, -2.2, 0.0), (3.2, -2.2, 0.0))
 """Positions of the two light fibres in mm, around the centre of the scope's tip."""
 REFERENCE_MM = 66.0
-"""Distance in mm at which a white surface facing the scope has radiance 1."""
+"""Distance from the lamp in mm at which a white surface facing the scope has radiance 1; sets the exposure."""
 SHADOW_MM = (0.0, -7.0, 0.0)
 """Origin of the shadow rays, above the fibres so that shadows are not hidden behind the tool."""
 
@@ -51,7 +51,7 @@ class Lamp:
     shadow_from: Array
     """Origin of the shadow rays in mm, [3]."""
     reference_mm: float = REFERENCE_MM
-    """Reference distance in mm that sets the exposure."""
+    """Distance in mm at which a white surface facing the lamp has radiance 1; sets the exposure."""
     beam: float = 2.0
     """Exponent of the cosine of the angle from the beam axis."""
 
@@ -123,7 +123,7 @@ class Air:
     """Smoke and exposure as functions of time."""
 
     smoke: float
-    """Strength of the smoke; 0 for none."""
+    """Strength of the smoke: 0 for none, 1 for dense smoke."""
     exposure_changes: bool
     clouds: Array
     """Periodic noise [CELLS, CELLS] from 0 to about 2, mean 1."""
@@ -201,13 +201,13 @@ class Particles:
     places: NDArray[np.float64]
     """Positions at time 0 in shares of the box, [N, 3]."""
     velocities_mm_s: NDArray[np.float64]
-    """Velocities of the particles, [N, 3]."""
+    """Velocities of the particles in mm/s, [N, 3]."""
     radii_mm: NDArray[np.float64]
-    """Radii of the particles, [N]."""
+    """Radii of the particles in mm, [N]."""
     whiteness: NDArray[np.float64]
-    """Reflectances of the particles, [N]."""
+    """Reflectances of the particles, 0..1, [N]."""
     box_mm: tuple[float, float, float]
-    """Size of the box, which starts at the scope's plane at time 0 and is centred on its axis."""
+    """Size of the box in mm along x, y and z. It starts at the scope's plane at time 0 and is centred on its axis."""
 
     @classmethod
     def drawn(cls, random: np.random.Generator, count: int, size_mm: float, distance_mm: float) -> Particles:
