@@ -236,7 +236,8 @@ class _Channel:
             await asyncio.gather(task, return_exceptions=True)
 
     async def _show(self) -> None:
-        """Encode and distribute pictures until the last viewer leaves."""
+        """Encode pictures and distribute them to the viewers until cancelled, when the last viewer leaves. While none arrive, repeat
+        the last one dimmed."""
         socket = subscribe(zmq.asyncio.Context.instance().socket(zmq.SUB), self._endpoint)
         last: Picture | None = None
         came_s = time.monotonic()

@@ -102,7 +102,7 @@ def _tighten(path: Path) -> bool:
     """Remove the permissions of group and others from a file of this user.
 
     Returns:
-        True if there were any.
+        True if group or others had permissions.
     """
     try:
         found = path.lstat()

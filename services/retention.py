@@ -138,7 +138,7 @@ async def again_and_again(enforce: Callable[[], Awaitable[None]]) -> None:
 
 FILE = "clock.json"
 JUMP_S = 86_400.0
-"""Clock step or service pause in seconds, beyond which ages are not trusted."""
+"""Step of the clock, or pause between two runs of the service, in seconds, beyond which ages are not trusted."""
 CONFIRM_S = 86_400.0
 """Seconds for which the service must run without another clock step before ages are trusted again."""
 WRITE_S = 600.0
@@ -164,7 +164,7 @@ class ClockGuard:
         self._looked = wall(), monotonic()
         self._written_s: float | None = None
         self._since_s: float | None = None
-        """Monotonic time of the jump; None while the clock is trusted."""
+        """Monotonic time at which a jump of the clock was detected, in seconds; None while the clock is trusted."""
         seen = self._read()
         if seen is not None and self._looked[0] - seen > JUMP_S:
             self._doubt(self._looked[0] - seen, "since the service last ran")

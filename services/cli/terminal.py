@@ -135,7 +135,7 @@ def _as_the_system_spells_it(error: UnicodeError) -> tuple[bytes | str, int]:
 
 
 MOST_WORD = 240
-"""Longest word in a message; a longer value is shortened in the middle."""
+"""Longest word in an error message, in characters; a longer value is shortened in the middle."""
 
 
 def sentence(text: str) -> str:
@@ -159,7 +159,7 @@ _MACHINE = {
     errno.EIO: "check the disk",
     errno.ESTALE: "check the network drive",
 }
-"""System errors that are independent of the file, with their remedies."""
+"""Remedies by errno, for system errors whose cause is the machine and not the named file."""
 _MEMORY_WORDS = ("can't allocate memory", "cannot allocate memory", "out of memory", "bad_alloc", "insufficient memory")
 
 
@@ -255,7 +255,7 @@ def _causes(error: BaseException | None) -> Iterator[BaseException]:
 
 
 WIDEST = 60
-"""Widest cell in characters, except in the last column."""
+"""Largest width of a cell of a printed table, in characters; longer texts are cut, except in the last column."""
 Columns = Mapping[str, str]
 """Headings by field name; a dot selects a nested field (`figures.age_ms`)."""
 KEY_COLUMNS: Columns = {

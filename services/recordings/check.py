@@ -114,7 +114,7 @@ def _verdict(path: Path, folder: Path) -> dict[str, Any]:
 MOST_ENTRIES = 65_000
 """Largest number of files and folders in an archive."""
 MOST_RATIO = 100
-"""Largest compression ratio of a file above one megabyte."""
+"""Largest ratio of unpacked to packed size, for files of an archive that unpack to more than 1 MiB."""
 
 
 MOST_LIST_BYTES = 16 << 20

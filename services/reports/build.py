@@ -280,7 +280,7 @@ REMEDIES = {
     **dict.fromkeys(("black", "one colour", "noise", "duplicate", "frozen", "torn", "out of order"), CHECK_PICTURE),
     **dict.fromkeys(("blur", "smoke", "cut in doubt"), "a longer run shows such a stream after a second or two"),
 }
-"""Remedy for each reason of withheld frames."""
+"""Remedy for the user by the reason for which frames were withheld, for runs that displayed no frame."""
 
 
 def require_shown(outcome: RunOutcome) -> None:

@@ -203,7 +203,7 @@ def quality_over_time_section(report: RunReport) -> str:
 
 
 def _is_sampled(report: RunReport) -> bool:
-    """Return True if only some frames are predicted; their scores are drawn as points without a line."""
+    """Return True for a live run, in which only some frames are predicted: their scores are drawn as points without a line."""
     return report.live is not None
 
 

@@ -129,7 +129,7 @@ class CapturedSource(LiveSource):
                 socket.close(0)
 
     def _begin_anew(self) -> None:
-        """Prepare for a frame whose numbering starts again, because the capture process or its source was restarted."""
+        """Let the next frame continue the sequence, although the restarted capture process or source numbers its frames from 0."""
         if self._order is not None:
             self._order.restart()
 
