@@ -362,7 +362,7 @@ class TakenDepth:
     """Statistics of late depth: estimates used by a live model after it was trained on their frames."""
 
     frames: int
-    """Number of frames whose late depth the model has used."""
+    """Number of frames whose depth was estimated after training on them, and then used by the model."""
     age_p50_ms: float
     """Median delay from the frame's arrival to the use of its depth, in milliseconds."""
     dropped: int

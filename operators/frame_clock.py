@@ -30,7 +30,7 @@ DISPLAY_DECAY = 0.2
 REHEARSAL_MARGIN_NS = 300_000
 """Time before the next expected frame at which training on earlier frames (rehearsal) ends, in nanoseconds."""
 SHOWN_WITHIN_S = 0.005
-"""Longest wait for a picture to be displayed before rehearsal, in seconds."""
+"""Longest wait for the newest picture to be displayed before training on earlier frames begins, in seconds."""
 AUTO_SHARE, AUTO_MOST_MS, LEAST_SHARE = 0.6, 18.3, 0.34
 """Default display deadline, as a share of the frame interval and its upper limit in milliseconds, and default share of the
 interval that is guaranteed for training."""
@@ -177,8 +177,8 @@ class FrameClock:
         )
 
     def may_rehearse(self, made: int, ahead_ns: float) -> bool:
-        """Return True if another rehearsal step ends before the next frame is expected, and fewer than
-        `rehearse_at_most` were made.
+        """Return True if another optimiser step on earlier frames (rehearsal) ends before the next frame is expected, and
+        fewer than `rehearse_at_most` were made.
 
         Args:
             made: rehearsal steps since the last frame.

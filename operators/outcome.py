@@ -65,5 +65,5 @@ class Contributor(Protocol):
     """An operator or a graph that contributes to the outcome of its run."""
 
     def contribute(self, outcome: OutcomeBuilder) -> None:
-        """Add the current results. Called before the run, to detect conflicts early, and after the run."""
+        """Add this contributor's current results to `outcome`. Called before the run, to detect conflicts early, and after it."""
         ...

@@ -35,9 +35,10 @@ from operators.outcome import OutcomeBuilder
 from operators.sinks.session_recorder import SessionRecorder
 
 REHEARSED_AT_ONCE = 3
-"""Rehearsal steps on a GPU between two checks for a new frame. On the slower CPU it is one step."""
+"""Number of rehearsal steps (optimiser steps on earlier frames) on a GPU between two checks for a new frame; 1 on a CPU."""
 GROWN_AT_LATEST = 10
-"""Maximum number of trained frames between two growth steps; beyond it growth runs even without spare time."""
+"""Maximum number of trained frames between two growth steps, which create and archive Gaussians. Beyond it a growth step runs even
+without spare time."""
 
 
 @dataclass
@@ -45,7 +46,7 @@ class TrainingCounts:
     """Statistics of the training of a run."""
 
     frames: int = 0
-    """Number of frames passed to training, including unusable frames that the model only followed (`Frame.is_followed`)."""
+    """Number of frames trained on, including withheld frames that are trained on nevertheless (`Frame.is_followed`)."""
     steps: int = 0
     """Total number of optimiser steps on frames before their display, without rehearsal."""
     passed_over: int = 0
@@ -53,7 +54,7 @@ class TrainingCounts:
     rehearsed: int = 0
     """Number of rehearsal steps, which train on earlier frames of the training window."""
     withheld: dict[str, int] = field(default_factory=dict)
-    """Number of withheld and damaged frames, by reason; the model may have followed some of them."""
+    """Number of withheld and damaged frames, by reason, including withheld frames trained on nevertheless (`Frame.is_followed`)."""
     withheld_now: dict[str, int] = field(default_factory=dict)
     """Number of withheld and damaged frames since the last usable one, by reason."""
     scenes: dict[str, int] = field(default_factory=dict)
@@ -61,7 +62,7 @@ class TrainingCounts:
     renewed: int = 0
     """Number of times that the model of a scene fell behind and was started anew."""
     places_found: int = 0
-    """Number of new scenes recognised as a place that the stream had shown before."""
+    """Number of new scenes whose tissue was recognised from an earlier scene of the stream."""
 
 
 class Learner:
@@ -162,12 +163,13 @@ class Learner:
         return taken
 
     def grow(self, frame: Frame) -> None:
-        """Run a growth step of the model. `frame` is the newest trained frame, already displayed."""
+        """Run a growth step of the model, which creates, archives or restores Gaussians. `frame` is the newest trained frame, already
+        displayed."""
         self.reconstructor.grow(frame)
         self._record(lambda: Grown(seq=frame.seq))
 
     def record_rehearsal(self, steps: int) -> None:
-        """Count and record rehearsal steps since the last frame."""
+        """Count the rehearsal steps (optimiser steps on earlier frames) since the last frame, and record them for a replay."""
         self.counts.rehearsed += steps
         if steps:
             self._record(lambda: Rehearsed(steps=steps))
@@ -222,9 +224,9 @@ class Training(ABC):
 class EveryFrame(Training):
     """Trains the configured number of optimiser steps on each frame.
 
-    Damaged, withheld and held-out frames are displayed with the newest model, except frames that the model follows
-    (`Frame.is_followed`). The first frame of a scene is trained on even if it is held out, because the following ones
-    need a model.
+    Damaged, withheld and held-out frames are displayed with the newest model and not trained on, except blurred frames
+    and possible cuts (`Frame.is_followed`). The first frame of a scene is trained on even if it is held out, because the
+    following frames need a model.
     """
 
     def __init__(self, held_out: Callable[[Frame], bool] = lambda frame: False) -> None:
@@ -254,10 +256,10 @@ class EveryFrame(Training):
 
 
 class UntilDisplay(Training):
-    """Trains on each frame until its display deadline, and rehearses until the next frame.
+    """Trains on each frame until its display deadline, and then on earlier frames (rehearsal) until the next frame.
 
     Frames that are too late are dropped. Withheld and damaged frames are displayed with the current model and not
-    trained on, except frames that the model follows (`Frame.is_followed`).
+    trained on, except blurred frames and possible cuts (`Frame.is_followed`).
     """
 
     def __init__(
@@ -313,7 +315,7 @@ class UntilDisplay(Training):
         return replace(shown, taken_ns=taken_ns, published_ns=published_ns)
 
     def rest(self, frame: Frame, learner: Learner, frame_waits: Callable[[], bool]) -> None:
-        """Take late depth, run a growth step if due, then rehearse until the next frame is queued or expected."""
+        """Take late depth, run a growth step if due, then train on earlier frames until the next frame is queued or expected."""
         if not frame_waits():
             self._clock.wait_until_shown()
         self._take_depth(learner)
@@ -373,8 +375,8 @@ class RecordedCalls(Training):
         """
         self._schedule, self._late_depths = schedule, late_depths
         self.missing: int | None = None
-        """Sequence number of the first recorded frame, or late depth, that is missing; later
-        pictures may differ. None if complete.
+        """Sequence number of the first recorded frame that is missing, or whose late depth is missing; later pictures may
+        differ. None if complete.
         """
         self._lines: Iterator[ScheduleLine | LostLine] = iter(())
         self._depths: Iterator[dict[str, Any] | None] = iter(())

@@ -78,7 +78,7 @@ class LiveSettings(LiveOptions):
     Disable for endless runs, because the log grows.
     """
     clock: ClockSettings = dataclasses.field(default_factory=ClockSettings)
-    """Display deadlines and step limits. The option `budget_ms` overrides `clock.budget_ms`."""
+    """Display deadlines, and limits on optimiser steps. The option `budget_ms` overrides `clock.budget_ms`."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -87,7 +87,7 @@ class LiveSettings(LiveOptions):
 
     @property
     def chosen_clock(self) -> ClockSettings:
-        """Display deadlines and step limits with the defaults of the device filled in."""
+        """Display deadlines, and limits on optimiser steps, with the defaults of the device filled in."""
         at_least = self.clock.at_least_steps or LIVE_LEAST_STEPS[self.device]
         fewest = self.clock.fewest_steps or at_least
         share, most_ms = LIVE_SHOW_AFTER[self.device]

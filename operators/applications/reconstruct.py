@@ -223,7 +223,8 @@ class _Inputs:
 
 
 class _Fitting:
-    """Training of one model on the training frames of a source. Notes for the report are added to `notes`."""
+    """Offline training of one model: choice of inputs and optimiser steps by validation, then training on all training
+    frames of a source. Notes for the report are added to `notes`."""
 
     def __init__(
         self,

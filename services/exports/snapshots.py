@@ -153,7 +153,7 @@ class SnapshotStore:
 
 
 WRITE_S = 60.0
-"""Seconds that an engine may take to write its model."""
+"""Seconds that an engine may take to write its model for a snapshot, before the command fails."""
 CHECKED = (State.READY, State.ACTIVE, State.RETIRED)
 
 

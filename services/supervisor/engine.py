@@ -94,7 +94,7 @@ def engine_scale(
 
 
 def scene_of(shown: ShownPicture, newest: Model | Snapshot | None) -> LayerScene | None:
-    """Return the scene for drawing layers: the newest model at the live picture's time and camera. None
+    """Return the scene for drawing layers such as depth: the newest model at the live picture's time and camera. None
     without a model, or if model and picture differ in size because a new scene has begun."""
     rendered = shown.rendered
     frame = rendered.frame

@@ -149,7 +149,7 @@ Picture = tuple[NDArray[np.uint8], dict[str, Any]]
 
 @dataclass(frozen=True)
 class LayerScene:
-    """Displayed scene, with the data needed to render additional layers."""
+    """Displayed scene, with the data needed to render layers: its depth, its confidence and the view of a virtual camera."""
 
     model: Model | Snapshot
     """Model of the scene; referenced only while the scene exists."""
@@ -264,7 +264,7 @@ def _counted(unseen_s: torch.Tensor | None) -> str:
 
 log = logging.getLogger(__name__)
 PERIOD_S = {"cpu": 0.1, "cuda": 1 / 30}
-"""Minimum time between two pictures of a layer, in seconds, by device."""
+"""Minimum time between two pictures of a layer such as depth, in seconds, by device of the engine."""
 MOST_SHARE = {"cpu": 1 / 6, "cuda": 1 / 4}
 """Largest share of time spent on drawing layers, by device. A slow picture is followed by a longer pause."""
 LOOK_S = 0.2
@@ -273,7 +273,7 @@ Scene = Callable[[], LayerScene | None]
 
 
 class Layers:
-    """Low-priority thread that draws the layers with viewers. `offer` and `camera` are thread-safe.
+    """Low-priority thread that draws the layers (depth, confidence and orbit pictures), each while it has viewers. `offer` and `camera` are thread-safe.
 
     The publisher sockets detect subscribers. Without a subscriber no layer is drawn, and no scene is kept in memory.
     """

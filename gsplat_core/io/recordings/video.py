@@ -106,7 +106,7 @@ def read_index(opened: av.container.InputContainer, stream: av.VideoStream, cont
 
 
 def _frame_duration(stream: av.VideoStream) -> Fraction | None:
-    """Return the frame duration in time units; None if the frame rate is unknown."""
+    """Return the frame duration in units of the stream's time base; None if the frame rate is unknown."""
     rate = frame_rate(stream)
     if not rate or not stream.time_base:
         return None
