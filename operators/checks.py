@@ -222,8 +222,8 @@ def _settled(frame: Frame, came: Frame) -> bool:
 
 @dataclass(frozen=True)
 class SequenceCounts(StageCounts):
-    """Withheld frames by reason (black, one colour, noise, duplicate, frozen, torn, out of order),
-    and clock jumps and gaps.
+    """Number of withheld frames by reason (black, one colour, noise, duplicate, frozen, torn, out of order), and of clock jumps
+    and gaps.
     """
 
 

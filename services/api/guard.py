@@ -351,7 +351,7 @@ def _status_of(request: Request, error: Exception) -> int:
 
 
 GRACE_S = 5.0
-"""Grace period, in seconds, before the rate of a body is checked."""
+"""Seconds from the start of a request body in which its transfer rate is not checked."""
 
 
 def refuse_by_length(request: Request, most_bytes: int) -> None:

@@ -273,7 +273,8 @@ Scene = Callable[[], LayerScene | None]
 
 
 class Layers:
-    """Low-priority thread that draws the layers (depth, confidence and orbit pictures), each while it has viewers. `offer` and `camera` are thread-safe.
+    """Low-priority thread that draws the layers (depth, confidence and orbit pictures), each while it has viewers. `offer` and
+    `camera` are thread-safe.
 
     The publisher sockets detect subscribers. Without a subscriber no layer is drawn, and no scene is kept in memory.
     """
