@@ -229,7 +229,7 @@ class BumpTensors(ContinuedField):
 
     @property
     def columns(self) -> Columns:
-        """Position of each bump (column) in time and in the tensors."""
+        """Layout of the bump columns: their positions in time and in the tensors."""
         return self._columns
 
     def frame_time(self, time_s: float) -> float:
@@ -307,7 +307,7 @@ class BumpTensors(ContinuedField):
             self.extend((start, time_s + ahead_s + self.spacing_s), hold_at_s=newest_s)
 
     def select(self, index: Tensor) -> None:
-        """Keep the bumps of the Gaussians in `index`."""
+        """Keep only the bumps of the Gaussians in `index` (int64 rows or bool mask), in that order."""
         used = self.count
         self._set_parameters(*(p.data[:used][index] for p in self._whole_parameters()))
         self._change_moments(lambda t: t[:used][index])

@@ -86,8 +86,8 @@ ROUNDS = 4
 
 
 class DepthFromMotion:
-    """Estimates the distance of a scene once from camera motion, and refines the depth of each
-    Gaussian with every frame.
+    """Estimator of depth from optical flow of a moving camera: of the scene's distance once, then of each Gaussian's depth
+    with every frame.
     """
 
     def __init__(self) -> None:

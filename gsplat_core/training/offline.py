@@ -48,9 +48,9 @@ from gsplat_core.transfers import tensor_of
 EDGE_PX = 1
 """Width in pixels of the margin around tools and depth holes where depth is not read, since tracked points may be off."""
 POSITIONS_AT_ONCE = 1 << 22
-"""Number of positions of trajectories that are computed at once, to limit memory."""
+"""Largest number of trajectory positions (Gaussians times frames) that are computed at once, to limit memory."""
 FEWEST_ROWS = 64
-"""Smallest number of trajectories computed at once, for very long recordings."""
+"""Smallest number of Gaussians whose trajectories are computed at once, also for very long recordings."""
 
 
 class SurfaceTracks:

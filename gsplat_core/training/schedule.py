@@ -397,7 +397,7 @@ class WindowSchedule(Schedule):
     def train(
         self, step: TrainingStep, window: ObservationWindow, observation: Observation, budget: Budget, *, first: bool
     ) -> ObserveReport:
-        """Train the scene within the budget of the newest frame."""
+        """Make the steps that the budget of the newest frame allows, on that frame and on earlier frames of the window."""
         spending = Spending(budget, self.step_s)
         plan: list[Observation] = [observation]
         first_loss: HostCopy | None = None
@@ -475,7 +475,7 @@ class NewestFirstSchedule(Schedule):
     def train(
         self, step: TrainingStep, window: ObservationWindow, observation: Observation, budget: Budget, *, first: bool
     ) -> ObserveReport:
-        """Train the scene within the budget of the newest frame."""
+        """Make the steps that the budget of the newest frame allows, all on that frame."""
         spending = Spending(budget, self.step_s)
         loss = None
         while spending.allows_step(by_turns=observation.right_eye is not None):

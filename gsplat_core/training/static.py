@@ -215,7 +215,7 @@ class CompiledAdam(torch.optim.Optimizer):
 
 
 FULL_STEPS = 30_000
-"""Number of steps to which the schedules refer; shorter trainings shorten them in proportion."""
+"""Number of steps of a full training, for which all schedules are given; shorter trainings shorten them in proportion."""
 RATES = {"means": 1.6e-4, "scales": 5e-3, "quats": 1e-3, "opacities": 5e-2, "sh0": 2.5e-3, "shN": 2.5e-3 / 20}
 """Learning rates of Adam. That of the means is multiplied by the extent of the scene."""
 MEANS_DECAY = 0.01
@@ -244,7 +244,7 @@ class Start:
 
 
 STARTS = {"adc": Start(), "mcmc": Start(0.5, 0.1, 0.01, 0.01), "none": Start()}
-"""Initial values for each strategy: adaptive density control, MCMC, and a fixed number of Gaussians."""
+"""Initial values and regularisation for each strategy: adaptive density control, MCMC, and a fixed number of Gaussians."""
 ABSGRAD_THRESHOLD = 0.0008
 """Gradient above which Gaussians multiply with `absgrad` (Ye et al. 2024)."""
 REFINE_EVERY = 100

@@ -491,7 +491,9 @@ class LeftScenes:
 
 
 def compared_size(width_px: int, height_px: int) -> tuple[int, int]:
-    """Return width and height at which pictures of this aspect ratio are compared."""
+    """Return width and height in pixels to which pictures of this aspect ratio are reduced, to compare them with an earlier
+    scene.
+    """
     return COMPARED_PX, max(1, round(COMPARED_PX * height_px / width_px))
 
 

@@ -44,9 +44,11 @@ class FrameMode(IntEnum):
     """Purpose of a frame, which determines the layout of its tile lists."""
 
     SHARED = 0
-    """Picture. Tile lists of any length are stored consecutively in a buffer of `capacity` instances."""
+    """Mode for a picture whose tile lists, of any length, are stored consecutively in one buffer of `capacity` instances."""
     TRAINING = 1
-    """Layout of SHARED. Also returns the values needed by the backward pass; depth is the sum of weight times z."""
+    """Mode for a training step. Tile lists are stored as in SHARED. The frame also has the values that the backward pass needs,
+    and its depth is the sum of weight times z.
+    """
     SEGMENTS = 2
     """Mode for a picture in which every tile's list has its own segment of the buffer, with space for `capacity`
     instances.

@@ -1,6 +1,7 @@
 """Optimiser step of a scene: deformation, rendering, loss, backward pass and update.
 
-`AutogradTraining` trains any deformation field.
+`TrainingStep` holds the scene in training and makes the steps. It uses `AutogradTraining` for deformation fields without a
+trainer of their own, and `PictureTraining` for renderers other than alpha blending.
 """
 
 from __future__ import annotations
@@ -155,7 +156,7 @@ def _turned(quats: Tensor, vectors: Tensor) -> Tensor:
 
 
 SETTLE_EVERY = 32
-"""Captured steps after which the host synchronises to detect overflowing tile lists; also after the first step."""
+"""Number of captured steps after which the host synchronises to detect overflowing tile lists; also after the first step."""
 
 
 def mm_per_px(gaussians: Gaussians, camera: Camera) -> float:

@@ -50,13 +50,13 @@ class DefaultStrategy(Strategy):
     refine_scale2d_stop_iter: int = 0
     """Step at which splitting and removal of Gaussians by their radius in the picture end; 0 never uses the radius."""
     refine_start_iter: int = 500
-    """Step after which refinement begins."""
+    """Training step after which Gaussians begin to be duplicated, split and removed."""
     refine_stop_iter: int = 15_000
     """Step at which refinement and resets end."""
     reset_every: int = 3000
     """Steps between two resets of the opacities to twice `prune_opa`."""
     refine_every: int = 100
-    """Steps between two refinements."""
+    """Number of training steps between two refinements, in which Gaussians are duplicated, split and removed."""
     pause_refine_after_reset: int = 0
     """Number of training steps after a reset of the opacities in which no refinement is made."""
     absgrad: bool = False
@@ -293,4 +293,4 @@ class SceneAdc:
 
 
 KIND = StrategyKind(SceneAdc, DefaultStrategy, screen_gradients=True)
-"""Entry of this module's strategy in the registry `STRATEGIES`."""
+"""Entry of the strategy `adc` (adaptive density control) in the registry `STRATEGIES`."""

@@ -60,7 +60,7 @@ class MCMCStrategy(Strategy):
     refine_stop_iter: int = 25_000
     """Step at which Gaussians stop to move and grow in number."""
     refine_every: int = 100
-    """Steps between two refinements."""
+    """Number of training steps between two refinements, in which dead Gaussians move and copies are added."""
     min_opacity: float = 0.005
     """Opacity up to which a Gaussian is dead."""
     verbose: bool = False
@@ -181,7 +181,7 @@ class SceneMcmc:
 
 
 KIND = StrategyKind(SceneMcmc, MCMCStrategy, losses={"opacity": 0.01, "scale": 0.01})
-"""Entry of this module's strategy in the registry `STRATEGIES`."""
+"""Entry of the strategy `mcmc` in the registry `STRATEGIES`."""
 
 
 RATE = 0.05
@@ -242,4 +242,4 @@ def relocated(parents: Gaussians) -> tuple[Gaussians, Gaussians]:
 
 
 BIRTH_DEATH = StrategyKind(lambda plan: Rounds(plan, birth_death))
-"""Entry of this module's strategy in the registry `STRATEGIES`."""
+"""Entry of the strategy `birth_death` in the registry `STRATEGIES`."""

@@ -20,8 +20,8 @@ from gsplat_core.training.steps.step import TrainingStep
 from gsplat_core.training.strategies.strategy import Plan, StrategyKind
 
 UNSEEN_PX = 0.5
-"""Largest sum of blending weights over the pixels of any picture, in pixels, below which a Gaussian counts as
-invisible.
+"""Sum of a Gaussian's blending weights over the pixels of a picture, in pixels. A Gaussian with a smaller sum in every picture
+counts as invisible.
 """
 
 
@@ -143,4 +143,4 @@ def densify(step: TrainingStep, shares: Shares, count: int) -> None:
 
 
 KIND = StrategyKind(lambda plan: Rounds(plan, densify))
-"""Entry of this module's strategy in the registry `STRATEGIES`."""
+"""Entry of the strategy `streaming` in the registry `STRATEGIES`."""
