@@ -382,7 +382,9 @@ class BumpTensors(ContinuedField):
         return copied.requires_grad_(False)
 
     def _held(self, time_s: float) -> Tensor:
-        """Return the deltas [N, 13] that new bumps continue; decayed for Gaussians trained since the newest bump."""
+        """Return the deltas [N, 13] at `time_s` with which new bumps start; decayed for Gaussians trained since the newest bump
+        was created.
+        """
         deltas = self.deltas(time_s).detach()
         if self._fading_s == math.inf or self._moments is None:
             return deltas

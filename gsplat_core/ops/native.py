@@ -116,7 +116,7 @@ def differentiable_once(backward: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(backward)
     def called(ctx: Any, *v: Any) -> Any:
-        if not torch.is_grad_enabled():  # without create_graph
+        if not torch.is_grad_enabled():  # backward pass without create_graph=True
             return backward(ctx, *v)
         with torch.no_grad():
             found = backward(ctx, *v)

@@ -406,7 +406,9 @@ class FrameControls:
         self.rates = self._values[26:]
 
     def set(self, camera: Camera, time: float, rates: Sequence[float] = ()) -> None:
-        """Enqueue new values. They are passed as arguments of one launch, so the caller may reuse its memory at once."""
+        """Enqueue the copy of a camera, a time and learning rates to the device buffer. They are passed as arguments of one
+        launch, so the caller may reuse its memory at once.
+        """
         values = [*camera.world_to_camera.ravel().tolist(), *camera.K.ravel().tolist(), time, *rates]
         store_scalars_(self._values, values)
 

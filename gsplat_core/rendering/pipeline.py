@@ -217,7 +217,7 @@ def blend_splats(
 
 
 def _distances_of_centres(means: Tensor, viewmats: Tensor) -> Tensor:
-    """Return the distances [..., C, N] of Gaussians from the cameras."""
+    """Return the distances [..., C, N] of the Gaussians' centres from the camera centres."""
     local = means[..., None, :, :] @ viewmats[..., :3, :3].mT + viewmats[..., None, :3, 3]
     return torch.linalg.vector_norm(local, dim=-1)
 

@@ -21,8 +21,8 @@ from gsplat_core.ops.surface_motion import surface_motion
 from gsplat_core.scene.cameras import Camera
 
 Flow: TypeAlias = NDArray[np.float32]
-"""Displacement of the content to the right and down in pixels of the full picture, float32 [h, w,
-2], for cells of `CELL_PX` squared.
+"""Optical flow: displacement of the visible points to the right and down in pixels of the full picture, float32 [h, w, 2], for
+cells of `CELL_PX` x `CELL_PX` pixels.
 """
 CELL_PX = 4
 """Side of a flow cell in pixels."""

@@ -80,7 +80,7 @@ LEAST_PARALLAX_PX = 1.5
 LEAST_EXPLAINED = 0.5
 """Share of the motion remaining after camera rotation that a single distance must explain."""
 SMALLEST_SHIFT = 1e-9
-"""Smallest displacement of a camera along an axis in scene units; less is rounding."""
+"""Displacement of a camera along an axis, in scene units, below which it counts as a rounding error and as no displacement."""
 ROUNDS = 4
 """Rounds of reweighting in the fit of the scene's distance, which reduce the influence of points that move on their own."""
 

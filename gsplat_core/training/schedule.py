@@ -290,7 +290,7 @@ class LiveTraining:
     first_rate: float = 2.0
     """Factor of all learning rates in a frame's first step; large steps follow large motion."""
     last_rate: float = 0.5
-    """Factor of all learning rates at the end; small steps converge."""
+    """Factor of all learning rates from step `rate_steps` of a frame on; small steps converge."""
     rate_steps: int = 30
     """Number of steps from the first to the last factor in equal ratios; further steps use the last factor."""
     recent_share: float = 0.6

@@ -246,7 +246,7 @@ class Start:
 STARTS = {"adc": Start(), "mcmc": Start(0.5, 0.1, 0.01, 0.01), "none": Start()}
 """Initial values and regularisation for each strategy: adaptive density control, MCMC, and a fixed number of Gaussians."""
 ABSGRAD_THRESHOLD = 0.0008
-"""Gradient above which Gaussians multiply with `absgrad` (Ye et al. 2024)."""
+"""Mean gradient above which a Gaussian is duplicated or split, with the option `absgrad` (Ye et al. 2024)."""
 REFINE_EVERY = 100
 RESETS_AT_LEAST = 10
 """Smallest interval between resets of the opacities, in refinements; keeps short trainings from resetting too often."""

@@ -40,7 +40,7 @@ from gsplat_core.training.observations import Observation, depth_of, pixels_of, 
 from gsplat_core.training.steps.step import TrainingStep
 
 RELAX_EVERY = 128
-"""Training steps between two relaxation rounds."""
+"""Number of training steps between two rounds in which sizes, opacities and colours relax towards default values."""
 RENEW_EVERY = 512
 """Training steps between two searches for useless Gaussians and sparse tissue, which take milliseconds on a GPU."""
 RELAXING_STEPS = 3600

@@ -87,7 +87,7 @@ class AutogradTraining:
 
 
 class PictureTraining:
-    """Training of a scene by the pictures of a differentiable renderer, with the renderer's values for the scene."""
+    """Training of a scene by the pictures of a differentiable renderer, together with the renderer's scene-wide scalars."""
 
     def __init__(self, name: str, distance: float, device: torch.device) -> None:
         """Start training with the values of the renderer for a scene at a distance.
@@ -103,21 +103,21 @@ class PictureTraining:
         self.restart(distance)
 
     def restart(self, distance: float) -> None:
-        """Reset the renderer's values for another scene, at this typical distance from the camera."""
+        """Reset the renderer's scene-wide scalars for another scene, at this typical distance from the camera."""
         first = self.renderer.first_values(distance)
         self._logs = {name: torch.full((1,), math.log(value), device=self._device) for name, value in first.items()}
         self._adam = FusedAdam(self._logs, rows=False)
 
     @property
     def values(self) -> dict[str, Tensor]:
-        """Current values of the renderer for the scene, [] each."""
+        """Current scene-wide scalars of the renderer by name, tensors [] each."""
         return {name: log[0].exp() for name, log in self._logs.items()}
 
     def __call__(
         self, scene: Gaussians, observation: Observation, weights: LossWeights, losses: Callable[[Gaussians], Tensor | None],
         rate_scale: float,
     ) -> Compared:  # fmt: skip
-        """Compare the scene with an observation, and do one Adam step for the renderer's values."""
+        """Compare the scene with an observation, and do one Adam step for the renderer's scene-wide scalars."""
         values = self.values
         compared = loss_by_autograd(
             scene, values, observation, weights,

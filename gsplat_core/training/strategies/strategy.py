@@ -103,7 +103,7 @@ GEOMETRY = ("means", "scales", "quats", "opacities")
 
 
 MOST_COPIES = 51
-"""Largest number of copies in the table of `binomials`."""
+"""Largest number of copies of one Gaussian that `compute_relocation` can handle: size of the table of `binomials`."""
 ROWS_AT_ONCE = 1 << 16
 """Gaussians whose sums are computed together, with three temporary values of 8 bytes per Gaussian and coefficient."""
 
