@@ -548,7 +548,7 @@ class OutOfBodyGateOp(Operator):
 
 
 def withheld(frame: Frame) -> Frame:
-    """Return a copy of the frame without any picture content."""
+    """Return a copy of the frame with black pictures, without depth and pose, and with no pixel that counts in the loss."""
     size = frame.image.shape[:2]
     right = None if frame.right_image is None else np.zeros_like(frame.right_image)
     return frame.with_fields(

@@ -270,7 +270,7 @@ def _adapter(hint: Any) -> TypeAdapter[Any]:
 
 def options_of(kind: type[Section]) -> Mapping[str, Declared]:
     """Return the declarations of a class's options by name: first those of the option sections that it inherits, in order, then
-    those of its other base classes."""
+    its own and those of its other base classes."""
     return _options_of(cast(Any, kind))
 
 

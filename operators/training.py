@@ -89,7 +89,7 @@ class Learner:
         self.reconstructor = make()
 
     def renew(self) -> None:
-        """Replace the reconstructor by a new one."""
+        """Replace the reconstructor by a new, untrained one, and discard the published model."""
         self.reconstructor, self.newest = self._make(), None
 
     def accepts(self, frame: Frame) -> bool:
@@ -215,10 +215,11 @@ class Training(ABC):
         """
 
     def rest(self, frame: Frame, learner: Learner, frame_waits: Callable[[], bool]) -> None:  # noqa: B027
-        """Work between the publication of the frame's model and the next frame. Arguments as for `learn`."""
+        """Use the time between the publication of the frame's model and the next frame, for example to train on earlier frames.
+        Arguments as for `learn`."""
 
     def contribute(self, outcome: OutcomeBuilder, counts: TrainingCounts) -> None:  # noqa: B027
-        """Add results and notes to the outcome of the run. `counts` are those of its learner."""
+        """Add the policy's results and notes to the outcome of the run. `counts` are the statistics of the run's learner."""
 
 
 class EveryFrame(Training):

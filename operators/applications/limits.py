@@ -31,7 +31,7 @@ MAX_RENDERED_FRAMES = 1_000_000
 
 
 def check_picture(camera: Camera, scale: float) -> None:
-    """Raise InvalidSetting if the pictures of an already scaled camera are too large."""
+    """Raise InvalidSetting if the pictures of `camera`, which is already scaled by `scale`, are too large."""
     width_px, height_px = camera.width_px, camera.height_px
     if max(width_px, height_px) > MAX_SIDE_PX or width_px * height_px > MAX_PIXELS:
         raise InvalidSetting(
@@ -109,7 +109,7 @@ def replay_bytes(source: SourceDescription, config: ReconstructorConfig, *, offl
 
 
 def render_bytes(width_px: int, height_px: int, parameters: int) -> int:
-    """Estimate the memory in bytes for rendering pictures of this size from a loaded model of `parameters` values."""
+    """Estimate the memory in bytes for rendering pictures of this size from a loaded model with `parameters` tensor values."""
     return FIXED_BYTES + width_px * height_px * RENDER_PIXEL_BYTES + RENDER_PARAMETER_BYTES * parameters
 
 

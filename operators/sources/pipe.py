@@ -42,7 +42,7 @@ PLANES: dict[str, tuple[tuple[int, int, int], ...]] = {
     "yuyv422": ((2, 1, 4),),
     "uyvy422": ((2, 1, 4),),
 }
-"""Planes by FFmpeg's format name: horizontal and vertical subsampling, and bytes per element."""
+"""Planes of raw pictures by FFmpeg's pixel format: horizontal and vertical subsampling, and bytes per element."""
 
 
 class RawFormat:

@@ -160,7 +160,7 @@ class Replays:
 
 
 class Workspace:
-    """Working folder of one pool; deleted when closed."""
+    """Working folder of one pool, with a sub-folder for each running attempt; deleted when closed."""
 
     def __init__(self, results: Results, pool: str) -> None:
         self._running = results.folder / RUNNING
@@ -170,13 +170,13 @@ class Workspace:
         fcntl.flock(self._lock, fcntl.LOCK_EX)
 
     def attempt(self, job_id: str, number: int) -> Path:
-        """Create the folder of an attempt."""
+        """Create and return the working folder of an attempt of a job."""
         folder = self.folder / f"{job_id}-{number}"
         folder.mkdir(mode=0o700)
         return folder
 
     def remove(self, folder: Path) -> None:
-        """Delete the folder of an ended attempt."""
+        """Delete the working folder of an ended attempt. Its published result is kept."""
         shutil.rmtree(folder, ignore_errors=True)
 
     def close(self) -> None:
@@ -227,12 +227,12 @@ class Task:
 
     @property
     def out(self) -> Path:
-        """Return the folder for the result."""
+        """Return the folder, inside the attempt's folder, into which the attempt writes its result."""
         return Path(self.folder) / OUT
 
     @property
     def log(self) -> Path:
-        """Return the log file of the process."""
+        """Return the log file of the attempt's process."""
         return Path(self.folder) / LOG
 
     def say_progress(self, reached: JobProgress) -> None:

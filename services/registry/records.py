@@ -264,7 +264,7 @@ MOST_GAUSSIANS = 2_000_000
 MOST_TENSOR_BYTES = 4 * GIB
 """Largest total size of the tensors in memory, in bytes."""
 MOST_PIXELS = 4096 * 4096
-"""Largest picture of the model's camera, in pixels."""
+"""Maximum number of pixels of the pictures of an uploaded model's camera."""
 CHECK_MEMORY_BYTES = 12 * GIB
 """Memory of the checking process beyond torch itself, in bytes."""
 CHECK_S = 120.0

@@ -215,7 +215,7 @@ def keyframe_pictures(scored: ScoredFrame) -> KeyframePictures:
 
 @dataclass(frozen=True)
 class HiddenPictures:
-    """Pictures of the last frame with content hidden from the camera, as `data:` URIs."""
+    """Pictures of the last frame that show tissue hidden from the camera, behind tools and from the side, as `data:` URIs."""
 
     seq: int
     time_s: float

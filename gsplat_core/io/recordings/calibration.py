@@ -187,7 +187,7 @@ class Undistortion:
             raise InvalidInput(f"the distortion {[float(each) for each in coefficients]} leaves nothing of the picture")
         fx, fy = width / (right - left), height / (bottom - top)
         self.camera = replace(camera, K=np.array([[fx, 0, -left * fx], [0, fy, -top * fy], [0, 0, 1]]))
-        """Camera without distortion, at the pose of the distorted one."""
+        """Camera of the undistorted pictures, at the pose of the distorted camera."""
         rows, columns = torch.meshgrid(
             torch.arange(height, dtype=torch.float64) + PIXEL_CENTRE,
             torch.arange(width, dtype=torch.float64) + PIXEL_CENTRE,

@@ -334,7 +334,7 @@ def jpeg_damage(data: bytes) -> str | None:
 
 
 MAX_PIXELS = 64 * 1024 * 1024
-"""Largest decoded image (8192 x 8192); surgical video has 8 Mpx at most."""
+"""Maximum number of pixels of a decoded image (8192 x 8192); surgical video has 8 Mpx at most."""
 MAX_FILE_BYTES = 512 * 1024 * 1024
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg"})
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"

@@ -136,7 +136,7 @@ USUAL_LOOK = TissueLook()
 
 
 class TissueTexture:
-    """Reflectance, wetness and the gradient of the fine relief over the undeformed sheet."""
+    """Texture maps of reflectance, wetness and the slopes of the fine relief over the undeformed sheet."""
 
     def __init__(self, rng: np.random.Generator, texel_mm: float, look: TissueLook = USUAL_LOOK) -> None:
         base, pale, deep, fat_colour, vein, artery = (
@@ -412,7 +412,7 @@ FOLD_TILT = (1.1, -0.7)
 
 
 class Colon(Tissue):
-    """Tube of tissue without a tool, with the motion of the open sheet."""
+    """Tube of tissue seen along its axis, without a tool, with the breathing and pulse of the open sheet."""
 
     focal_factor = 0.62
     exposed_mm = 42.0
