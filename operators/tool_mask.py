@@ -51,7 +51,7 @@ class MaskFinder(Protocol):
 
 @dataclass(frozen=True)
 class FoundMasks:
-    """Statistics of a tool detector."""
+    """Statistics of a tool detector in one run: detected, recorded and rejected masks, and the share of tool pixels."""
 
     method: str
     """Name of the detector in `TOOL_MASKS`."""

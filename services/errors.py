@@ -83,7 +83,7 @@ class ExportRefused(ExportsError):
 
 
 class ExportBusy(ExportsError):
-    """Too many exports are waiting."""
+    """An export was refused because too many exports are waiting."""
 
 
 class ExportFailed(ExportsError):

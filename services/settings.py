@@ -487,7 +487,7 @@ _NAME_TAGS = ("tag:yaml.org,2002:str", "tag:yaml.org,2002:merge")
 
 @dataclass(frozen=True)
 class YamlFile:
-    """Values of a settings file."""
+    """Values of a settings file, with the line number of each key for error messages."""
 
     values: dict[str, Any]
     lines: dict[tuple[str, ...], int]

@@ -60,7 +60,7 @@ class SceneSettings:
 
 @dataclass(frozen=True)
 class ImageScore:
-    """Scores of one held-out image."""
+    """PSNR and SSIM of one held-out image."""
 
     name: str
     psnr_db: float

@@ -330,7 +330,9 @@ class SessionRecorder:
             if wrong is None:
                 self._written[what] += 1
             else:
-                self._lost[f"{what}: {_UNFIT}"] += 1  # counted under one name; the schedule line has the exact reason
+                self._lost[f"{what}: {_UNFIT}"] += (
+                    1  # all such errors count under one name; the schedule line has the exact reason
+                )
 
     def _give_up(self, writer: SessionWriter, why: str) -> None:
         with self._changed:

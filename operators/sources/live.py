@@ -83,8 +83,8 @@ class FrameOrder:
         """Forget the previous stream. The next frame gets number 0 and time 0. If the sender is trusted, it keeps
         its own number and timestamp."""
         self._counts.clear()
-        self._out: Frame | None = None  # last frame, as passed on
-        self._in: Frame | None = None  # last frame, as received
+        self._out: Frame | None = None  # last frame that was passed on, with repaired number and timestamp
+        self._in: Frame | None = None  # the same frame as it was received
         self._arrived_ns = 0
         self._seq_offset = self._pts_offset_ns = 0
         self._late: Frame | None = None

@@ -81,7 +81,7 @@ class _Ticket:
 
 
 class Tickets:
-    """Unused tickets, held in memory; a restart invalidates them."""
+    """Store of unused single-use tickets for URLs. It is in memory only, so a restart of the server invalidates them."""
 
     def __init__(self, lifetime_s: float, clock: Callable[[], float] = time.monotonic) -> None:
         self.lifetime_s = lifetime_s

@@ -38,7 +38,7 @@ Counts = Mapping[str, int]
 
 @dataclass(frozen=True)
 class Summary:
-    """Result of a batch."""
+    """Result of the batch replay of a folder of recordings: job counts, failures and duration."""
 
     counts: Counts
     already: int

@@ -247,7 +247,7 @@ class Tracks:
 
 @dataclass(frozen=True)
 class TissueBehindTools:
-    """Pictures and depth of a recording with transparent tools."""
+    """Ground truth of the tissue behind tools: pictures and depth rendered as if the tools were transparent."""
 
     images: tuple[Path, ...]
     depth: DepthFiles
