@@ -1,4 +1,5 @@
-"""Surface seen by a camera: depth along each ray, normals, spread, classes and confidence, with gradients.
+"""Surface seen by a camera: depth along each ray, normals, spread, classes and confidence, with gradients. Also removal of
+Gaussians that contribute to no picture.
 
 The density of a Gaussian along a ray is highest at the midpoint of the chord in its ellipsoid, not at its centre's z
 (UniGS, Xie et al. 2025). `render_rays` blends these depths and further values of the splats with the weights of the

@@ -1,4 +1,5 @@
-"""Tissue that enters and leaves the view: creation of Gaussians where a frame shows tissue that the scene does not cover.
+"""Tissue that enters and leaves the view: creation of Gaussians where a frame shows tissue that the scene does not cover, and
+an archive of Gaussians that are out of view.
 
 For a moving camera, the time at which each Gaussian was last visible is known. Gaussians that have been out of view are
 archived, to free capacity in a scene of fixed size, and return with their tissue. Tissue that comes into view is filled

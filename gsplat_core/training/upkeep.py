@@ -1,4 +1,4 @@
-"""Maintenance of a scene that is trained without end.
+"""Maintenance of a scene that is trained without end, and recognition of earlier scenes to which a stream returns.
 
 Adam moves every parameter by about its learning rate even if pictures hardly constrain it. Unconstrained parameters
 therefore drift. Thin Gaussians become needles, opacities and colours diverge, quaternions grow, depths spread along the

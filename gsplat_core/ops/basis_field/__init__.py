@@ -1,4 +1,5 @@
-"""Basis-function deformation: per-Gaussian deltas from bumps in time, gradients, fused lazy Adam.
+"""Basis-function deformation: per-Gaussian deltas from bumps in time, gradients, fused lazy Adam, and changes of the weights
+that give wanted deltas or colours at one time.
 
 Maths, shapes and truncation are those of `gsplat_core.reference.basis_field`; float32 on CPU and CUDA. On CUDA the host
 does not synchronise. If `tau` and the learning rates are device tensors, a captured launch reads them at every replay.

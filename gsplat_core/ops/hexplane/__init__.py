@@ -1,4 +1,4 @@
-"""HexPlane features (Cao & Johnson 2023), their gradients, and factorised inference.
+"""HexPlane features (Cao & Johnson 2023), their gradients, factorised inference, and decoding of features by an MLP.
 
 Shapes and maths are those of `gsplat_core.reference.hexplane_features`, `hexplane_space` and
 `hexplane_modulate`; float32 on the CPU. Gradients do not depend on the number of threads.

@@ -1,4 +1,5 @@
-"""Loss of a rendered frame and its gradient at the Gaussians, computed directly by ops without autograd.
+"""Loss of a rendered frame and its gradient at the Gaussians, for alpha blending computed directly by ops without autograd, for
+other renderers by autograd.
 
 Both eyes of a stereo scope train the geometry. Each eye's colours are trained by its own pictures only, because
 view-dependent differences such as highlights would otherwise pull every colour back and forth. Temporal colour changes

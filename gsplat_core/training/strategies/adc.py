@@ -1,4 +1,6 @@
-"""Adaptive density control (Kerbl et al. 2023, section 5): Gaussians with large gradients in the picture are multiplied."""
+"""Adaptive density control (Kerbl et al. 2023, section 5): Gaussians with large gradients in the picture are duplicated or split,
+and transparent ones are removed.
+"""
 
 from __future__ import annotations
 
