@@ -63,7 +63,9 @@ OUTPUTS: Registry[OutputKind] = Registry(
         "occlusion": "gsplat_core.rendering.renderer:OCCLUSION",
     },
 )
-"""Outputs in addition to picture, opacity and depth, by name. `Capabilities.outputs` states those of a renderer."""
+"""Planes that a renderer can return in addition to picture, opacity and depth, by name. `Capabilities.outputs` states those of a
+renderer.
+"""
 
 DEPTHS: Registry[type[Estimator]] = Registry(
     "depth",
@@ -79,7 +81,7 @@ DEPTHS: Registry[type[Estimator]] = Registry(
 )
 """Depth estimators by name. The constructor takes an address if the name is in `DEPTHS_WITH_ADDRESS`."""
 DEPTHS_WITH_ADDRESS = {"onnx": "onnx:FILE"}
-"""Names of depth estimators that are followed by a colon and an address, with an example of the syntax."""
+"""Names of the depth estimators that need an address, such as a file, each with the syntax of the user's setting."""
 
 MOTION_PRIORS: Registry[Callable[[Any], Any]] = Registry(
     "motion prior",
@@ -89,7 +91,9 @@ MOTION_PRIORS: Registry[Callable[[Any], Any]] = Registry(
         "learned": "gsplat_core.experimental.learned_prior:LearnedPrior",
     },
 )
-"""Factories of motion priors by name; each takes a `ReconstructorConfig`. `bumps` uses the field's extrapolation alone."""
+"""Factories of motion priors by name; each takes a `ReconstructorConfig`. `bumps` adds no prior: the deformation field alone
+extrapolates motion.
+"""
 
 LOSSES: Registry[LossKind] = Registry(
     "loss",
@@ -117,7 +121,9 @@ STRATEGIES: Registry[StrategyKind] = Registry(
         "mcmc": "gsplat_core.training.strategies.mcmc:KIND",
     },
 )
-"""Changes of the Gaussians during offline training, by name. `StrategyKind.library` is the class for one's own loop."""
+"""Strategies that add, move and remove Gaussians during offline training, by name. `StrategyKind.library` is the strategy class for
+a training loop of a library user.
+"""
 
 KERNELS: Registry[type[Any]] = Registry(
     "kernel",
@@ -126,7 +132,9 @@ KERNELS: Registry[type[Any]] = Registry(
         "cut": "gsplat_core.experimental.cut_gaussians:CutKernel",
     },
 )
-"""Falloffs of a splat by name. Renderers use `gaussian`; `cut` is experimental (`render_kernel`)."""
+"""Functions by which a splat's opacity falls off from its centre, by name. Renderers use `gaussian`; `cut` is experimental
+(`render_kernel`).
+"""
 
 SENSORS: Registry[type[RangeSensor]] = Registry(
     "range sensor",
@@ -136,14 +144,14 @@ SENSORS: Registry[type[RangeSensor]] = Registry(
         "oct_line": "gsplat_core.scene.range_sensors:OctLine",
     },
 )
-"""Range sensors by name, whose scans the loss `range` compares."""
+"""Range sensors by name. The loss `range` compares their recorded scans with the scene."""
 
 Eyes = Literal["left", "both"]
 """Eyes of a stereo scope whose pictures are trained on."""
 
 
 STANDARD = ("image", "alpha", "depth")
-"""Outputs of every renderer."""
+"""Names of the outputs that every renderer returns: the picture, its opacity and its depth."""
 _SAMPLED = ("samples", "supersampling", "seed", "progressive", "storage")
 OPTIONS: Mapping[str, tuple[str, ...]] = {
     "alpha": (),
@@ -151,24 +159,26 @@ OPTIONS: Mapping[str, tuple[str, ...]] = {
     "points": _SAMPLED,
     "weighted_sum": (),
 }
-"""Options of `RendererOptions` that a renderer has, by renderer."""
+"""Names of the fields of `RendererOptions` that apply to a renderer, by the renderer's name."""
 OUTPUTS_OF: Mapping[str, tuple[str, ...]] = {
     "alpha": (*STANDARD, *OUTPUTS),
     "stochastic": STANDARD,
     "points": STANDARD,
     "weighted_sum": STANDARD,
 }
-"""Outputs by renderer."""
+"""Names of the outputs (image, alpha, depth and those in `OUTPUTS`) that a renderer can return, by the renderer's name."""
 OWN_OPACITIES = ("weighted_sum",)
-"""Renderers that train opacities of their own. Losses other than those of every step blend by the opacities of `alpha`."""
+"""Renderers whose opacities differ in meaning from those of alpha blending. They exclude the losses and strategies that rely on
+alpha blending.
+"""
 WITH_OPACITIES_OF_ALPHA = ("adc", "mcmc")
-"""Strategies that rely on alpha blending as the renderer that trains the scene."""
+"""Strategies that rely on the opacities of alpha blending; refused for the renderers in `OWN_OPACITIES`."""
 OF_EVERY_STEP = ("photometric", "depth")
-"""Losses that every training step computes, by the picture of the renderer that trains the scene."""
+"""Losses that every training step computes, from the picture of the renderer that trains the scene."""
 
 
 NEEDED_BY: Mapping[str, tuple[str, str]] = {"semantics": ("labels", "labels/"), "range": ("ranges", "scans/")}
-"""Field of frames that a loss compares with, and the folder of a recording that has it, by loss."""
+"""Field of `Frame` that a loss needs, and the folder of a recording that contains its data, by the loss's name."""
 
 
 def check_renderer_options(renderer: str, given: Iterable[str]) -> None:
@@ -186,7 +196,7 @@ def check_renderer_options(renderer: str, given: Iterable[str]) -> None:
 
 
 def check_outputs(renderer: str, outputs: Iterable[str]) -> None:
-    """Check that a renderer has the outputs.
+    """Check that a renderer can return the outputs with the names `outputs`.
 
     Raises:
         InvalidSetting: otherwise.
@@ -202,7 +212,7 @@ def check_outputs(renderer: str, outputs: Iterable[str]) -> None:
 
 
 def check_compared(losses: Iterable[str], fields: Iterable[str], source: str) -> None:
-    """Check that frames have the fields with which losses compare the scene.
+    """Check that frames have the fields that the losses need (`NEEDED_BY`).
 
     Args:
         losses: losses, each a name or `name:weight`.
@@ -222,7 +232,7 @@ def check_compared(losses: Iterable[str], fields: Iterable[str], source: str) ->
 
 
 def check_losses(renderer: str, losses: Iterable[str]) -> None:
-    """Check that a scene that `renderer` trains can be trained by further losses, each a name or `name:weight`.
+    """Check that `renderer` can train a scene with the losses, each a name or `name:weight`.
 
     Raises:
         InvalidSetting: otherwise.
@@ -237,7 +247,7 @@ def check_losses(renderer: str, losses: Iterable[str]) -> None:
 
 
 def check_strategy(renderer: str, strategy: str) -> None:
-    """Check that a strategy can change the Gaussians of a scene that `renderer` trains.
+    """Check that a strategy can add and remove Gaussians of a scene that `renderer` trains.
 
     Raises:
         InvalidSetting: otherwise.

@@ -32,9 +32,9 @@ from gsplat_core.training.strategies.adc import DefaultStrategy
 from gsplat_core.training.strategies.strategy import Optimizers, Params
 
 SSIM_WINDOW_PX = 11
-"""Side of the only window of `ssim_loss`."""
+"""Side in pixels of the Gaussian window of `ssim_loss`; no other size is supported."""
 LEAST_SLOPE = 1e-8
-"""Slopes and variances of colours below this are those of a constant picture."""
+"""Lower bound of a channel's variance in the colour fit; a fitted slope of smaller magnitude is replaced by 1."""
 
 
 def l1_loss(pred: Tensor, target: Tensor) -> Tensor:
@@ -74,12 +74,12 @@ def depth_l1_loss(pred_depth: Tensor, gt_depth: Tensor, scene_scale: float = 1.0
 
 
 def opacity_reg_loss(opacities: Tensor) -> Tensor:
-    """Return the mean opacity of logits."""
+    """Return the mean of the opacities, which are given as logits."""
     return opacities.sigmoid().mean()
 
 
 def scale_reg_loss(scales: Tensor) -> Tensor:
-    """Return the mean standard deviation of logarithms."""
+    """Return the mean of the standard deviations, which are given as logarithms (`scales`)."""
     return scales.exp().mean()
 
 
@@ -94,7 +94,7 @@ def total_variation_loss(x: Tensor) -> Tensor:
 
 
 def color_correct_affine(img: Tensor, ref: Tensor) -> Tensor:
-    """Return pictures with the colours of others, by an affine map of each channel.
+    """Return the pictures `img` with their colours adapted to those of `ref`, by an affine map of each channel.
 
     Each channel of `img` is fitted by a scaled and shifted channel of `ref` (least squares); the map is then inverted.
 
@@ -115,7 +115,7 @@ def color_correct_affine(img: Tensor, ref: Tensor) -> Tensor:
 
 
 def color_correct_quadratic(img: Tensor, ref: Tensor, num_iters: int = 5, eps: float = 0.5 / 255) -> Tensor:
-    """Return pictures with the colours of others, by repeated quadratic maps of all channels.
+    """Return the pictures `img` with their colours adapted to those of `ref`, by repeated quadratic maps of all channels.
 
     Each round fits the channels of `ref` by the quadratic polynomials of the current colours that fit best (least squares).
     Pixels that are saturated in `img`, in `ref` or in the current colours do not count.
@@ -153,7 +153,7 @@ def _require_same(name: str, own: Tensor, other: Tensor) -> None:
 
 
 LEAST_VARIANCE = 1e-12
-"""Minimum product of both sums of squares in the correlation of depths."""
+"""Lower bound of the product of the two depth maps' sums of squares, by whose root their correlation is divided."""
 COUNT_EPSILON = 1e-8
 
 
@@ -202,7 +202,7 @@ def multi_frame_depth_unprojection(
 
 
 def knn_scale_init(xyz: Tensor, k: int = 3, eps: float = 1e-7, chunk_size: int = 1024) -> Tensor:
-    """Return the logarithm of the root mean squared distance of each point to its nearest others, [N].
+    """Return the logarithm of the root mean squared distance of each point to its `k` nearest neighbours, [N].
 
     Args:
         xyz: points [N, 3].
@@ -295,7 +295,7 @@ def compute_tv_loss_targeted(image: Tensor, mask: Tensor | None = None) -> Tenso
 
 @dataclass
 class TwoStageScheduleStep:
-    """Stage and frame of a training step."""
+    """Stage (coarse or fine) and video frame to train on of one optimiser step."""
 
     stage: Literal["coarse", "fine"]
     frame_index: int
@@ -304,7 +304,7 @@ class TwoStageScheduleStep:
 
 
 class TwoStageScheduler:
-    """Schedule of two stages: one frame first, then all frames in turn."""
+    """Schedule of optimiser steps in two stages: on one frame first, then on all frames in turn."""
 
     def __init__(self, coarse_steps: int, fine_steps: int, coarse_frame_index: int = 0) -> None:
         """Store the numbers of coarse and fine steps and the frame of the coarse steps.
@@ -342,20 +342,20 @@ class TwoStageScheduler:
 AXES = tuple(combinations(range(4), 2))
 """Axes of gsplat's planes in its order: xy, xz, xt, yz, yt, zt."""
 ORDER = tuple(AXES.index(axes) for axes in plain_torch.PLANE_AXES)
-"""Index among gsplat's planes of each plane that `hexplane_features` takes."""
+"""Indices by which the six planes in gsplat's order are put into the order that `hexplane_features` takes."""
 SPACE = tuple(place for place, axes in enumerate(AXES) if 3 not in axes)
-"""Indices among gsplat's planes of those without time."""
+"""Indices, in gsplat's order of the six planes, of the three without the time axis."""
 TIME = tuple(place for place, axes in enumerate(AXES) if 3 in axes)
-"""Indices among gsplat's planes of those with time."""
+"""Indices, in gsplat's order of the six planes, of the three with the time axis."""
 PLANES_CONFIG: Mapping[str, Any] = {
     "grid_dimensions": 2,
     "input_coordinate_dim": 4,
     "output_coordinate_dim": 32,
     "resolution": [64, 64, 64, 25],
 }
-"""Default of `planes_config`."""
+"""Default of the argument `planes_config` of `HexPlaneField`: numbers of axes and features, and the resolution."""
 LEAST_CURVED = 3
-"""Minimum height of a plane that has a second difference."""
+"""Smallest number of rows of a HexPlane plane that has second differences; lower planes have no smoothness term."""
 
 
 class HexPlaneField(torch.nn.Module):
@@ -593,7 +593,7 @@ def hexplane_regularization(
 
 
 def _summed(counted: Sequence[Tensor], term: Callable[[Tensor], Tensor], planes: Sequence[Tensor]) -> Tensor:
-    """Return the sum of a term over planes; a zero on the device of `planes` if none counts."""
+    """Return the sum of `term` over the planes `counted`; if there are none, a zero on the device of `planes`."""
     if counted:
         return torch.stack([term(plane) for plane in counted]).sum()
     return planes[0].new_zeros(()) if planes else torch.zeros(())

@@ -46,7 +46,7 @@ class TrainedBy:
     renderer: str = "alpha"
     """Name in `RENDERERS`."""
     values: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    """Values of the renderer for the whole scene, learned or fixed at the start."""
+    """Parameters of the renderer that apply to the whole scene, by name; learned, or fixed at the start of training."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,9 +190,9 @@ class Model:
         return render_surface(gaussians, camera or self.camera, certain)
 
     def description(self) -> dict[str, Any]:
-        """Return everything except tensors and version as JSON-serialisable values."""
+        """Return the model's metadata (everything except tensors and version) as JSON-serialisable values."""
         source = self.depth_source
-        # Omitted if unknown, which preserves the digest of models of earlier versions.
+        # An unknown depth source is omitted, so that models of earlier versions, which have none, keep their digest.
         depth: dict[str, Any] = {}
         if source is not None:
             depth = {"depth": {"origin": source.origin.name, "metric": source.metric}}
@@ -239,7 +239,7 @@ class Model:
 
 
 ROW_STEP = 1024
-"""The number of Gaussians for which a slot has room is a multiple of this."""
+"""Granularity of a slot's capacity: its number of Gaussians is a multiple of this."""
 ROW_HEADROOM = 1.25
 MOST_SLOTS = 9
 """Maximum number of simultaneously held snapshots per publisher. Replay needs three or four."""
@@ -253,12 +253,12 @@ class SnapshotSlot:
         self.number = number
         self._fewest_rows = rows
         self.layout = 0
-        """Generation of the tensors; a change invalidates graphs captured for the previous ones."""
+        """Generation number of the slot's tensors. It changes when they are reallocated, which invalidates CUDA graphs captured for them."""
         self._gaussians: Gaussians | None = None
         self._field: FieldSlot | None = None
         self._count = 0
         self._in_use: list[Tensor] = []
-        """Views of the first `_count` rows of every tensor."""
+        """Views of the used part, the first `_count` Gaussians, of every tensor of the slot."""
         self._holder: weakref.ref[Snapshot] | None = None
         self._order = _DeviceOrder(device)
 
@@ -478,7 +478,7 @@ class SnapshotSlots:
 
 
 class _DeviceOrder:
-    """Ordering of writes and reads of a memory region across CUDA streams; a no-op on the CPU."""
+    """Events that order a slot's writes and reads across CUDA streams; a no-op on the CPU."""
 
     def __init__(self, device: torch.device) -> None:
         self._device = device

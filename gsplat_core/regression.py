@@ -25,7 +25,7 @@ from gsplat_core.ops.arguments import require_float32
 from gsplat_core.ops.splat_regression import check_splats, splat_regression
 
 SMALLEST_MASS = 1e-4
-"""Lower bound of the mass that gradients are divided by, relative to the largest mass."""
+"""Lower bound of the mass (magnitude of the weight) by which a splat's gradients are divided, relative to the largest mass."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +52,7 @@ class Splats:
 
     @property
     def masses(self) -> Tensor:
-        """|v| of each splat, [k]."""
+        """Mass of each splat: the norm of its weights v, [k]."""
         return self.values.norm(dim=1)
 
 
@@ -142,13 +142,13 @@ def births_and_deaths(phi: Tensor, rate: float, random: torch.Generator) -> Birt
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-8
 BIRTH_EVERY = 10
-"""Steps between rounds of birth and death."""
+"""Number of optimiser steps between two rounds in which splats die and are replaced by copies of others."""
 BIRTH_RATE = 0.5
 """Death rate per round of a splat whose ∂L/∂ln|v| is one standard deviation above the mean of all splats; v is its
 value. Each dead splat is replaced by a copy of a splat below the mean.
 """
 BIRTH_SPREAD = 2.0
-"""Distance of a copy from its parent in standard deviations of the parent, for a normal draw."""
+"""Factor on the random distance of a copied splat from its parent, which is drawn from the parent's normal density."""
 
 
 @dataclass(frozen=True)
@@ -166,11 +166,11 @@ class FitOptions:
     metric: bool = True
     """Divide the gradients of each splat by its mass (Bures-Wasserstein metric)."""
     birth_death: bool = True
-    """Replace splats by copies of others in regular rounds."""
+    """Let splats die at random every `BIRTH_EVERY` steps, each replaced by a copy of a better one."""
     birth_until: float = 0.7
-    """Share of the steps after which rounds end, so that the last copies are trained."""
+    """Share of the steps after which no more splats die or are copied, so that the last copies are trained."""
     start_width: float = 0.05
-    """Standard deviation of the first splats, relative to the extent of the points."""
+    """Initial standard deviation of the splats, relative to the extent of the points."""
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -245,7 +245,7 @@ def first_splats(points: Tensor, values: Tensor, count: int, width: float, rando
 
 
 class _Fitting:
-    """Optimiser state of one fit."""
+    """Splats, Adam state and random generator of one call of `fit`."""
 
     def __init__(
         self, points: Tensor, values: Tensor, start: Splats, options: FitOptions, random: torch.Generator
@@ -283,7 +283,7 @@ class _Fitting:
             parameter.addcdiv_(first, (second / second_scale).sqrt_().add_(EPSILON), value=-rate / first_scale)
 
     def _move(self, moves: BirthDeath) -> None:
-        """Replace dying splats by copies at a random distance, which share their parent's value."""
+        """Replace each dying splat by a copy of its parent at a random distance. The parent's weight is divided equally among them."""
         if len(moves.dying) == 0:
             return
         dying, parents = moves.dying, moves.parents

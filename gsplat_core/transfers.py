@@ -1,4 +1,7 @@
-"""Asynchronous copies of tensors. Between host and device memory, CPU tensors are not copied."""
+"""Asynchronous copies of tensors within a GPU, and between it and the host through page-locked memory.
+
+On the CPU, a transfer shares memory where possible instead of copying.
+"""
 
 from __future__ import annotations
 

@@ -159,11 +159,11 @@ class JsonObject:
         return [self._matrix(f"{key}[{index}]", rows, size, wanted) for index, rows in enumerate(listed)]
 
     def numbers(self, key: str, wanted: NumberIn, most: int) -> list[float]:
-        """Return the list of 1 to `most` numbers stored under a key."""
+        """Return the list of 1 to `most` numbers stored under a key, each in the range `wanted`."""
         return [float(value) for value in self._checked(key, ListOf(wanted, 1, most))]
 
     def integers(self, key: str, wanted: IntegerIn, most: int) -> tuple[int, ...]:
-        """Return the list of at most `most` integers stored under a key."""
+        """Return the list of at most `most` integers stored under a key, each in the range `wanted`."""
         listed = self.values.get(key)
         if not isinstance(listed, list) or len(listed) > most:
             raise BundleCorrupt(
@@ -175,7 +175,7 @@ class JsonObject:
             raise BundleCorrupt(f"{self.name}: {error}") from error
 
     def window(self, key: str, wanted: NumberIn, longest: float) -> tuple[float, float]:
-        """Return start and end, times in seconds in order and at most `longest` apart."""
+        """Return start and end of a time window in seconds; the end is not earlier than the start and at most `longest` later."""
         start, end = self._checked(key, ListOf(wanted, 2, 2))
         if not start <= end <= start + longest:
             raise BundleCorrupt(

@@ -212,7 +212,7 @@ _OLD_CONSTANTS: Mapping[str, Mapping[str, Any]] = {
     "rasterize_to_indices_in_range": {"max_alpha": 0.999},
     "rasterize_to_pixels": {"max_alpha": 0.999},
 }
-"""Functions whose option defaults change to the constants of gsplat 1.5.3, with those options; see
+"""Defaults of options that give a function the numerical constants of gsplat 1.5.3, by function; see
 `gsplat_core.rendering.settings.CONSTANTS`.
 """
 
@@ -259,12 +259,12 @@ def _bound(function: Any, options: tuple[tuple[str, Any], ...]) -> Any:
 
 
 def _with_options(value: Any, options: Mapping[str, Any] | None) -> Any:
-    """Return a function with other defaults of its options, the same wrapper object at every call; `value` for None."""
+    """Return the function `value` with `options` as defaults; equal arguments give the same wrapper. Without options, return `value`."""
     return value if options is None else _bound(value, tuple(options.items()))
 
 
 _EXTENSION = "gsplat.csrc"
-"""Compiled extension of gsplat, whose presence programs test."""
+"""Module name of gsplat's compiled extension, which programs import to test whether CUDA kernels exist."""
 _OF_0_1 = (
     "_torch_impl", "cuda_legacy", "nd_rasterize", "project_gaussians", "rasterize", "rasterize_gaussians", "sh",
 )  # fmt: skip
@@ -369,11 +369,11 @@ def install(constants: str = "1.6") -> None:
 PATH_ENTRY = str(Path(__file__).parent / "path_entry")
 """Folder whose modules install the hook in processes that inherit `sys.path`, but not `sys.meta_path`."""
 _CONSTANTS_VARIABLE = "INTRASPLAT_GSPLAT_CONSTANTS"
-"""Environment variable with the constants of such processes."""
+"""Environment variable that tells spawned processes which version's constants to use (argument of `install`)."""
 
 
 def install_for_spawned_processes(constants: str) -> None:
-    """Install the hook in this process, and in those that `multiprocessing` starts from now on.
+    """Install the import hook in this process, and in the processes that `multiprocessing` starts from now on.
 
     Args:
         constants: see `install`.
@@ -381,12 +381,14 @@ def install_for_spawned_processes(constants: str) -> None:
     install(constants)
     os.environ[_CONSTANTS_VARIABLE] = constants
     if PATH_ENTRY not in sys.path:
-        # Before the folder of the program, which may be a copy of gsplat's sources.
+        # First in the search path: the program's own folder may contain a copy of gsplat's sources.
         sys.path.insert(0, PATH_ENTRY)
 
 
 def take_over(name: str) -> None:
-    """Install the hook, and replace the module `name` of `PATH_ENTRY`, which is being imported, by that of the hook."""
+    """Install the import hook and import the module `name` with it, in place of the placeholder in `PATH_ENTRY` that is being
+    imported.
+    """
     del sys.modules[name]
     install(os.environ.get(_CONSTANTS_VARIABLE, CONSTANTS[0]))
     importlib.import_module(name)

@@ -36,7 +36,7 @@ def main() -> None:
             parser.error(f"there is no module {program}")
         runpy.run_module(program, run_name="__main__", alter_sys=True)
     else:
-        # As when Python itself runs a script, so that the script finds the modules in its folder.
+        # Python does the same for a script that it runs, so that the script finds the modules in its folder.
         sys.path.insert(0, str(Path(program).resolve().parent))
         install_for_spawned_processes(chosen.constants)
         runpy.run_path(program, run_name="__main__")

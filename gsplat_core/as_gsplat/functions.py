@@ -127,7 +127,7 @@ def _multinomial_sample(weights: Tensor, n: int, replacement: bool = True) -> Te
 
 
 LARGEST_SCALE = 0.02
-"""Largest standard deviation of the Gaussians along an axis."""
+"""Largest standard deviation along an axis of the random Gaussians of `load_test_data`, in world units."""
 
 
 def load_test_data(
@@ -172,4 +172,4 @@ def load_test_data(
 
 
 _C = object()
-"""Not None, which would mean that there are no compiled kernels. It has no functions."""
+"""Stand-in for gsplat's compiled extension, without functions. It is not None because None means that there are no kernels."""

@@ -33,11 +33,11 @@ ENDS = (2.0, 98.0)
 ROUNDS = 10
 LEAST_VALUES = 64
 CONSTANT = 1e-4
-"""Ratio of spread to magnitude below which values count as constant."""
+"""Ratio of the spread of a network's output to its magnitude below which the output counts as constant, without relief."""
 
 
 class Affine(NamedTuple):
-    """Affine map `factor` · values + `summand`."""
+    """Affine map `factor` · values + `summand` from a network's output to reference values."""
 
     factor: float
     summand: float
@@ -98,7 +98,7 @@ def fitted(values: Plane, known: Plane) -> Affine | None:
 
 
 def _by_medians(values: Plane, known: Plane, sign: float) -> Affine:
-    """Return a start value of the affine fit from medians, on which outliers have little influence.
+    """Return a start value of the affine fit, computed from medians and therefore robust to outliers.
 
     Args:
         values: values of the depth network, in any scale.
@@ -111,7 +111,7 @@ def _by_medians(values: Plane, known: Plane, sign: float) -> Affine:
 
 
 def _middle(values: Plane) -> tuple[float, float]:
-    """Return the median and the median absolute deviation. If the latter is zero, the standard deviation replaces it."""
+    """Return the median of values and their median absolute deviation, or their standard deviation if that is zero."""
     median = float(np.median(values))
     return median, float(np.median(np.abs(values - median))) or float(values.std())
 
@@ -139,7 +139,7 @@ GRID_PX = 80
 EVERY_S = 0.3
 """Time from one inference to the next in seconds. The previous result is reused in between unless the scope moves."""
 ALIKE = 0.6
-"""Smallest correlation with the reference depth at which both count as showing the same scene."""
+"""Smallest correlation of a network's output with a reference depth at which both count as showing the same scene."""
 LEAST_SEEN = 0.05
 """Share of tissue in the picture below which the depth is rejected."""
 UNSEEN = "too little of the picture is tissue for a depth network"
@@ -273,12 +273,12 @@ class LearnedDepth(Estimator):
         )
 
     def _kind(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Convert depth to values of the network's kind, or back."""
+        """Convert depth to the kind of values that the network returns (depth or inverse depth), or back."""
         return 1 / values if self._inverse else values
 
     def _by_given(self, grid: NDArray[np.float64], seen: NDArray[np.bool_], frame: Frame) -> Affine | str | None:
-        """Align to the frame's own depth. Returns None if the depth covers too little, or a rejection
-        reason if the two do not correlate.
+        """Return the map that aligns the network's output to the frame's own depth. None if that depth covers too little, or a
+        rejection reason if the two do not correlate.
         """
         if frame.depth is None:
             return None
@@ -293,14 +293,14 @@ class LearnedDepth(Estimator):
         return AGAINST if found.alike <= -ALIKE else UNLIKE
 
     def _by_before(self, grid: NDArray[np.float64], seen: NDArray[np.bool_]) -> Affine | None:
-        """Align to the previous result. Returns None if there is none, or if it shows another scene."""
+        """Return the map that aligns the network's output to the previous result. None without one, or if it shows another scene."""
         if self._before is None:
             return None
         found = fitted(grid[seen], self._before[seen])
         return found if found is not None and found.alike >= ALIKE else None
 
     def _assumed(self, values: NDArray[np.float64]) -> Affine:
-        """Return the map with the offset of `with_assumed_zero` and the mean depth `RELATIVE_DISTANCE` (geometric)."""
+        """Return the map with the offset of `with_assumed_zero` that gives the geometric mean depth `RELATIVE_DISTANCE`."""
         zero = with_assumed_zero(values)
         positive = np.clip(zero.of(values), *np.percentile(zero.of(values), ENDS))
         factor = self._kind(np.array(RELATIVE_DISTANCE)) / np.exp(np.log(positive).mean())

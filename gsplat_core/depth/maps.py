@@ -145,7 +145,7 @@ class OnDevice(Protocol):
     """Estimator that can run on a device other than the CPU."""
 
     def work_on(self, device: str) -> None:
-        """Run on this device from now on, concurrently with other work there."""
+        """Run the estimator on this device from now on, concurrently with other work there."""
         ...
 
 
@@ -186,9 +186,9 @@ def _has_pose(frame: Frame) -> bool:
 
 
 AUTO: dict[str, Callable[[Frame], bool]] = {"recorded": _always, "stereo": _has_calibrated_eyes}
-"""Sources tried by `auto` in real-time use, in order, with the condition that a frame must meet."""
+"""Depth sources that the setting `auto` tries in real-time use, in order, each with the condition that a frame must meet."""
 AUTO_WITH_TIME: dict[str, Callable[[Frame], bool]] = {**AUTO, "parallax": _has_pose}
-"""Sources tried by `auto` without a real-time limit."""
+"""Depth sources that the setting `auto` tries without a real-time limit, each with the condition that a frame must meet."""
 
 
 def check_depth(choice: str) -> None:
@@ -217,34 +217,39 @@ def with_surface(frame: Frame, camera: Camera) -> Frame:
 
 
 def _kinds(choice: str) -> dict[str, type[Estimator]]:
-    """Return the estimators that a setting may use, by name."""
+    """Return the estimators that the depth setting `choice` may use, by name; several for `auto`."""
     return {name: DEPTHS[name] for name in (AUTO_WITH_TIME if choice == "auto" else (choice.partition(":")[0],))}
 
 
 def keeps_recorded(choice: str) -> bool:
-    """Return True if a frame keeps its recorded depth with a setting."""
+    """Return True if frames keep their recorded depth with the depth setting `choice`."""
     return RecordedDepth in _kinds(choice).values()
 
 
 def may_be_metric(choice: str) -> bool:
-    """Return True if depth by a setting can have a known scale."""
+    """Return True if the depth setting `choice` can give depth of known scale (millimetres)."""
     kinds = _kinds(choice).values()
     return RecordedDepth in kinds or any(kind.origin is not None and kind.origin.scale != "relative" for kind in kinds)
 
 
 def evidence(choice: str, fields: frozenset[str]) -> list[str]:
-    """Return what may show the distance in frames with some fields of `Frame`, as noun phrases."""
+    """Return noun phrases for messages that name the evidence of distance which the depth setting `choice` uses.
+
+    Args:
+        choice: depth setting.
+        fields: fields of `Frame` that the frames have; estimators that need another field are left out.
+    """
     kinds = _kinds(choice).values()
     return [kind.evidence for kind in kinds if kind.evidence and (kind.needs is None or kind.needs in fields)]
 
 
 def of_recording(choice: str) -> str | None:
-    """Return which estimator of a setting needs all frames of a recording, by name; None if none does."""
+    """Return the name of the estimator of the depth setting `choice` that needs all frames of a recording; None if none does."""
     return next((name for name, kind in _kinds(choice).items() if issubclass(kind, OfRecording)), None)
 
 
 def depth_inputs(choice: str) -> tuple[Path, ...]:
-    """Return the files that the setting `choice` of the depth source makes it read; often none."""
+    """Return the files that the depth setting `choice` reads, such as a network; empty for most settings."""
     name, _, address = choice.partition(":")
     path = address.partition("?")[0]
     return (Path(path),) if name in DEPTHS_WITH_ADDRESS and path else ()
@@ -319,7 +324,7 @@ class DepthFinder:
         if (camera.width_px, camera.height_px) != (
             frame.width_px,
             frame.height_px,
-        ):  # the stream may have changed its picture size
+        ):  # a stream may change its picture size, and the camera has to match it
             camera = camera.resized(frame.width_px, frame.height_px)
         # Frames that are not trained on need no estimated depth; their own depth is free.
         shown_only = shown_only or frame.status is FrameStatus.DAMAGED or frame.withheld is not None
@@ -350,11 +355,11 @@ class DepthFinder:
 
 
 ALIKE = 0.1
-"""Largest difference of neighbouring depths on one surface, as a share of the farther one."""
+"""Largest difference of the depths of neighbouring pixels on one surface, as a share of the larger depth."""
 NEAREST = 0.1
-"""Share of the median depth below which a value is noise around zero."""
+"""Share of a map's median depth below which a value counts as unknown, because it is noise around zero."""
 STRIDE = 4
-"""Step between the rows and columns from which the median is computed."""
+"""Distance in pixels between the sampled rows and columns from which a map's median depth is computed."""
 PAIRS = (
     (np.s_[:, :-1], np.s_[:, 1:]),
     (np.s_[:-1, :], np.s_[1:, :]),
@@ -391,7 +396,9 @@ def measured_confidence(depth: NDArray[np.floating]) -> NDArray[np.float32]:
 
 
 def _median(values: NDArray[np.float32]) -> float:
-    """Return the median of the positive values, of a sample of pixels if it has any, or 0 without any."""
+    """Return the median of the positive values: of every `STRIDE`-th row and column, or of all pixels if these have none; 0
+    without positive values.
+    """
     for some in (values[STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE], values):
         if np.any(some):
             return float(np.median(some[some > 0]))
@@ -399,8 +406,8 @@ def _median(values: NDArray[np.float32]) -> float:
 
 
 def believed_depth(frame: Frame) -> NDArray[np.float32]:
-    """Return the frame's confident depth [H, W], 0 elsewhere and within the edge margin of its origin; without
-    confidence all of its depth.
+    """Return the frame's depth [H, W] where its confidence is at least `BELIEVED`; 0 elsewhere and within the edge margin
+    (`DepthOrigin.edge_margin_px`) of such pixels. Depth without confidence is returned unchanged.
     """
     return _depth_from(frame, BELIEVED, 1.0)
 
@@ -414,8 +421,14 @@ def possible_depth(frame: Frame) -> NDArray[np.float32]:
 
 
 def _depth_from(frame: Frame, least: float | None, margin: float) -> NDArray[np.float32]:
-    """Return the frame's depth [H, W] where its confidence is at least `least` (None: that of its origin), 0 elsewhere and
-    within the share `margin` of the origin's margin next to it. Depth without confidence is returned unchanged.
+    """Return the frame's depth [H, W] where its confidence is high enough, 0 elsewhere and near such pixels.
+
+    Depth without confidence is returned unchanged.
+
+    Args:
+        frame: frame with depth.
+        least: smallest confidence; None for `least_confidence` of the depth's origin.
+        margin: width of the margin next to rejected pixels, as a share of the origin's `edge_margin_px`.
     """
     origin = frame.depth_origin
     if frame.depth is None or origin is None:
@@ -427,7 +440,7 @@ def _depth_from(frame: Frame, least: float | None, margin: float) -> NDArray[np.
 
 
 def _inner(where: NDArray[np.bool_], margin_px: int) -> NDArray[np.bool_]:
-    """Erode a mask [H, W] by a margin."""
+    """Erode a bool mask [H, W] by `margin_px` pixels."""
     if margin_px == 0:
         return where
     side = 2 * margin_px + 1
@@ -441,12 +454,12 @@ MOST_DISAGREEMENT = 0.25
 LEAST_SHARED = 0.1
 """Share of the picture that both depth maps must cover."""
 UNCONFIRMED = "two depth maps by parallax disagree about the relief, so a level plane may be as accurate"
-"""Reason given for depth that no second depth map confirms."""
+"""Rejection reason of a parallax depth map that a second one of the same tissue contradicts."""
 
 
 @dataclass(frozen=True)
 class Look:
-    """Depth map at reduced size with its camera, for comparisons."""
+    """Depth map at reduced size with its camera, for the comparison of two maps (`agree`)."""
 
     inverse: NDArray[np.float32]
     """Inverse depth of a reduced depth map, [h, w]."""
@@ -502,5 +515,5 @@ def disagreement(first: Look, second: Look) -> float:
 
 
 def agree(first: Look, second: Look) -> bool:
-    """Return True if two depth maps confirm each other."""
+    """Return True if two depth maps of the same tissue confirm each other: they differ by at most `MOST_DISAGREEMENT`."""
     return disagreement(first, second) <= MOST_DISAGREEMENT

@@ -44,7 +44,7 @@ AGREES = 0.2
 
 @dataclass(frozen=True)
 class View:
-    """Grey picture with its camera."""
+    """Grey picture with its tissue mask and its camera, including the pose."""
 
     grey: NDArray[np.float32]
     """Grey levels 0 to 255, float32 [H, W]."""
@@ -111,7 +111,7 @@ def _moments(grey: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np
 
 
 def _whole_patches(tissue: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Return 1 where the whole correlation window is tissue."""
+    """Return float32 [H, W], 1 where the whole correlation window around a pixel is tissue, else 0."""
     return np.asarray(cv2.erode((tissue != 0).astype(np.uint8), np.ones((WINDOW_PX, WINDOW_PX), np.uint8)), np.float32)
 
 
@@ -195,13 +195,13 @@ FEWEST_POINTS = 24
 TRACK_ERROR_PX = 0.5
 """Standard deviation of a tracked position in pixels."""
 RELIEF = 0.5
-"""Prior standard deviation of inverse depth, relative to that of the best-fitting plane."""
+"""Prior standard deviation of a point's inverse depth, relative to the inverse depth of the best-fitting plane."""
 LARGEST_RELIEF = 4.0
-"""Bound of the ratio between a point's inverse depth and that of the plane."""
+"""Largest ratio between a point's inverse depth and that of the plane, in either direction."""
 LEAST_PARALLAX_PX = 1.5
 """Smallest sufficient `Parallax.parallax_px`; with less, depth is noise."""
 MOST_LEFT_PX, MOST_LEFT = 1.0, 0.25
-"""Median residual in pixels, and as a share of the view's parallax. A view that exceeds both contradicts its pose."""
+"""Limits of a view's median residual, in pixels and as a share of its parallax. A view that exceeds both contradicts its pose."""
 POSE_ERROR_PX = 0.6
 """Residual of static tissue in pixels, from errors of poses and tracking."""
 FEWEST_AGREEING = 0.6
@@ -294,7 +294,10 @@ def _followed(
 def _terms(
     corners: NDArray[np.float32], target: NDArray[np.float32], before: Camera, after: Camera
 ) -> tuple[Array, Array]:
-    """Return c and d [n, 2] of the equation w c = d for the corners' inverse depths w, in units of the focal length."""
+    """Return c and d [n, 2] of the triangulation equation w c = d for the inverse depth w of each corner.
+
+    The residual d - w c is an image distance in units of the focal length.
+    """
     between = after.world_to_camera @ np.linalg.inv(before.world_to_camera)
     first, second = _normalised(corners, before), _normalised(target, after)
     ray = np.concatenate([first, np.ones((len(first), 1))], 1) @ between[:3, :3].T
@@ -307,12 +310,15 @@ def _normalised(pixels: NDArray[np.float32], camera: Camera) -> Array:
 
 
 def _medians(values: Array, seen: NDArray[np.bool_]) -> Array:
-    """Return the median over each view's tracked points [views]."""
+    """Return the median of values [views, points] over the tracked points of each view, [views]."""
     return np.array([float(np.median(row[mask])) for row, mask in zip(values, seen, strict=True)])
 
 
 def _plane(c: Array, d: Array, seen: NDArray[np.bool_], focal: float) -> float:
-    """Return one inverse depth that robustly fits w c = d; c and d are [views, points, 2]."""
+    """Return the common inverse depth w of all points (a fronto-parallel plane) that fits w c = d robustly.
+
+    c and d [views, points, 2] are those of `_terms`.
+    """
     weight, inverse = seen.astype(np.float64), 0.0
     for _ in range(ROUNDS):
         inverse = float((weight * (c * d).sum(-1)).sum() / max((weight * (c * c).sum(-1)).sum(), 1e-20))
@@ -334,7 +340,9 @@ def _relief(c: Array, d: Array, seen: NDArray[np.bool_], focal: float, plane: fl
 
 
 def _agreement(c: Array, d: Array, focal: float, inverse: Array) -> Array:
-    """Return weights [views, points] for iteratively reweighted least squares that minimise the robust L1 norm."""
+    """Return weights [views, points] of iteratively reweighted least squares: 1 up to the residual `TRACK_ERROR_PX`, and inverse
+    to larger residuals (Huber).
+    """
     return np.asarray(TRACK_ERROR_PX / np.maximum(_off_px(c, d, focal, inverse), TRACK_ERROR_PX))
 
 
@@ -359,7 +367,7 @@ MARGIN = 1.6
 WORST_COST, BEST_COST = 0.35, 0.15
 """Mean matching cost ((1 - ZNCC) / 2) at which the confidence is 0, and below which it is not reduced."""
 UNIQUE = 0.2
-"""Relative cost margin to any other depth from which the confidence is not reduced."""
+"""Relative margin between the best matching cost and that of any other depth from which the confidence is not reduced."""
 SMALLEST_PATCH = 0.0014
 """Smallest connected patch of confident depth, as a share of the picture; smaller ones are chance matches."""
 MOST_OWN_MOTION = 0.06
@@ -460,8 +468,11 @@ def _without_speckles(labels: NDArray[np.float32], confidence: NDArray[np.float3
 def _filled(
     inverse: NDArray[np.float32], confidence: NDArray[np.float32], found: Parallax
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Replace unconfident depth by a smooth continuation of the confident depth around it, and far from any by the
-    mean plane. Its confidence becomes at most `FILLED`.
+    """Replace unconfident inverse depth by a smooth continuation of the confident values around it, and far from them by the
+    fitted plane. The confidence of replaced values becomes at most `FILLED`.
+
+    Returns:
+        Inverse depth and confidence, both [h, w].
     """
     height, width = inverse.shape
     believed = (confidence >= BELIEVED).astype(np.float32)
@@ -509,7 +520,7 @@ class ParallaxDepth(Estimator):
         self._kept: list[tuple[float, View]] = []
         self._found_s: float | None = None
         self._look: Look | None = None
-        """Depth map estimated at time `_found_s`."""
+        """Reduced copy of the last depth map, estimated at time `_found_s`, which has to confirm the next one."""
 
     def estimate(self, frame: Frame, camera: Camera) -> DepthMap | None:
         """Estimate the depth of a frame by parallax against the key frames; None for a frame without pose, for other cameras

@@ -37,7 +37,7 @@ def terms_of(weight: Sums, x: Sums, y: Sums, values: Sums) -> tuple[Sums, ...]:
 
 
 def at_middles(sums: tuple[Sums, ...], x: Sums, y: Sums, level: Sums | float, relative_level: float = 0.0) -> Sums:
-    """Evaluate the locally fitted plane at each cell centre.
+    """Return the value of a locally fitted plane at each cell centre, from the moments in a window around it.
 
     Args:
         sums: windowed sums of `terms_of`, each [h, w].
@@ -50,7 +50,7 @@ def at_middles(sums: tuple[Sums, ...], x: Sums, y: Sums, level: Sums | float, re
     """
     w = np.maximum(sums[0], 1e-12)
     at_x, at_y, mean = sums[1] / w, sums[2] / w, sums[6] / w
-    # Moments about the mean position.
+    # Convert the moments to those about the mean position.
     xx, xy, yy = (each / w for each in sums[3:6])
     xx, xy, yy = xx - at_x * at_x, xy - at_x * at_y, yy - at_y * at_y
     xv, yv = sums[7] / w - mean * at_x, sums[8] / w - mean * at_y
@@ -67,8 +67,8 @@ SURFACE_CELL_PX = 2
 NEAR_PX, FAR_PX = 9.0, 24.0
 """Standard deviations in pixels of the fit's window, where points are dense and where they are sparse."""
 ENOUGH = 1.5
-"""Effective number of points in the narrow window from which the wide one has its smallest weight, 0.02; with fewer
-points the weight grows linearly to 1.
+"""Effective number of points in the narrow window from which the wide window has its smallest weight, 0.02. With fewer
+points, the wide window's weight grows linearly to 1.
 """
 FLOOR = 0.005
 """Relative error added to every point so that none dominates."""
@@ -128,7 +128,7 @@ def _planes(sums: Array) -> Array:
 
 
 def _at_full_size(values: Array, size: tuple[int, int]) -> Array:
-    """Upsample cells linearly to pixels."""
+    """Interpolate values of cells [h, w] linearly to pixels; `size` is height and width of the result."""
     large = cv2.resize(
         values, (values.shape[1] * SURFACE_CELL_PX, values.shape[0] * SURFACE_CELL_PX), interpolation=cv2.INTER_LINEAR
     )
@@ -139,11 +139,11 @@ Plane = NDArray[np.float32]
 FILL_CELL_PX = 4
 """Smallest side of the grid cells on which planes are fitted, in pixels."""
 WINDOWS = (0.12, 0.03)
-"""Standard deviations of the Gaussian windows, as shares of the picture's width."""
+"""Standard deviations of the wide and the narrow Gaussian window of `filled_depth`, as shares of the picture's width."""
 CELLS_A_WINDOW = 4.0
 """Standard deviation of a window in grid cells; a wide window uses large cells to limit its cost."""
 LEAST_KNOWN = 0.02
-"""Share of a window with known depth at which its plane gets half its weight."""
+"""Share of a window with known depth at which the plane fitted in it gets half of its full weight."""
 TILT_DOUBT = 0.003
 """Regularisation of a plane's slope. The slope is damped more if the known values are along one
 edge than if they fill the window.
@@ -218,7 +218,7 @@ def local_plane(values: Plane, weight: Plane, sigma: float) -> Plane:
 
 
 WINDOW = 0.03
-"""Standard deviation of a plane's window, as a share of the picture's width."""
+"""Standard deviation of the Gaussian window of a local plane fit to disparities, as a share of the picture's width."""
 ALIKE_PX2 = 0.1**2
 """Variance of the error shared by neighbouring disparities, in squared pixels of the matched
 pictures. It is added to the variance that the matcher estimates.

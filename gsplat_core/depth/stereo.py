@@ -162,7 +162,7 @@ LEAST_SHARE = 0.2
 row offset.
 """
 ROW_ERROR_PX = 1.5
-"""Row error in pixels above which a point counts as wrongly matched."""
+"""Deviation in pixels from the fitted row difference between the eyes above which a point counts as wrongly matched."""
 MOST_SLOPE_PX = 1.0
 """Largest accepted row difference at the edge of the picture in pixels, relative to the common row offset."""
 MOST_OFFSET = 0.03
@@ -241,7 +241,9 @@ def _points_in_both(
     the number of corners tried.
     """
     shown = np.asarray(cv2.erode((left < SATURATED).astype(np.uint8), np.ones((7, 7), np.uint8)), np.uint8)
-    if usable is not None:  # a border of the picture that the window contains has no disparity
+    if (
+        usable is not None
+    ):  # a window that contains the border of the field of view finds the border, which has no disparity
         window = np.ones((FLOW_WINDOW_PX, FLOW_WINDOW_PX), np.uint8)
         shown &= np.asarray(cv2.erode(usable, window), np.uint8)
     corners = cv2.goodFeaturesToTrack(_levelled(left), CORNERS, CORNER_QUALITY, CORNER_APART_PX, mask=shown)
@@ -314,21 +316,23 @@ def _fitted_rows(here: Points, lower: Points, width: int, height: int) -> tuple[
 LOOK_EVERY = 30
 """Frames between two checks of the pair. The eyes are rigid, but the distance of the tissue changes."""
 KEPT_LOOKS = 15
-"""Number of checks whose row offsets are combined by their median."""
+"""Number of newest pair checks whose row offsets are combined by their median."""
 MATCHED_WIDTH_PX = 800
 """Width above which pictures are matched at an integer fraction of their size. Endoscopes blur by
 more than one of their pixels, and the fit is sub-pixel.
 """
 COMPANY_PX = 15
-"""Side of the window in which half of the pixels must be confident, in pixels of the matched pictures."""
+"""Side of the window around a confident pixel in which at least half of the pixels must be confident as well; otherwise the pixel
+is rejected. In pixels of the matched pictures.
+"""
 MATCH_WINDOW_PX = 15
-"""Side of the window that two pixels are compared in, in pixels of the matched pictures."""
+"""Side of the correlation window of stereo matching, in pixels of the matched pictures."""
 MARGIN_SHARE, MARGIN_PX = 0.2, 4
 """Margin of the search range around the observed disparities, as a share of their span and in pixels."""
 HALF_BELIEVED_PX = 0.5
 """Standard deviation of a disparity at which its confidence is one half, in pixels of the matched pictures."""
 SAMPLED_PX = 200
-"""Number of samples along a row (up to twice as many) for the depth range and the typical error of a picture."""
+"""Number of pixels along a row (up to twice as many) from which a picture's depth range and typical error are computed."""
 LEAST_BELIEVED = 0.05
 """Share of confident pixels below which the depth map is rejected."""
 ROWS_FROM_PX = 0.05
@@ -422,7 +426,7 @@ class StereoDepth(Estimator):
         return float(np.median((self.standard_error(some, frame, camera)[known]) / some.depth[known]))
 
     def standard_error(self, found: DepthMap, frame: Frame, camera: Camera) -> NDArray[np.float32]:
-        """Return the standard error of the last estimated depth [H, W] in its unit; meaningless where it is unknown.
+        """Return the standard error of an estimated depth map [H, W], in the depth's unit; meaningless where depth is unknown.
 
         It combines the error of matching with that of the calibration. The calibration is assumed to be wrong along
         the rows by as much as across them, which the pictures show.
@@ -444,7 +448,7 @@ class StereoDepth(Estimator):
         return look
 
     def _widen_to(self, seen: tuple[float, float]) -> None:
-        """Extend the search range by the disparities of the last frame.
+        """Extend the search range to the disparities `seen` (lowest, highest) of the last frame.
 
         Until the next check of the pair the range only grows, by at most one margin. Wrong matches occur anywhere in
         the range and would otherwise widen it without limit. A stable range also matches similar pictures alike.
@@ -454,7 +458,7 @@ class StereoDepth(Estimator):
         self._span = min(self._span[0], max(seen[0], least)), max(self._span[1], min(seen[1], most))
 
     def _span_of(self, width_px: int) -> Span:
-        """Return the search range in pixels of the matched pictures."""
+        """Return the search range of disparities with its margins, in pixels of the reduced pictures that are matched."""
         assert self._span is not None
         low, high = self._span
         shrink = _shrink(width_px)
@@ -470,7 +474,7 @@ class StereoDepth(Estimator):
         span: Span,
         parallel_px: float,
     ) -> NDArray[np.float32]:
-        """Return depth and confidence [2, H, W]."""
+        """Match the pair in the search range `span` and return depth and confidence, stacked as [2, H, W]."""
         assert self._span is not None
         rows = np.median(self._rows, axis=0)
         aligned = _with_rows_of_left(right, rows, sum(self._span) / 2)
@@ -492,7 +496,7 @@ class StereoDepth(Estimator):
         return both
 
     def _inside_both(self, usable: NDArray[np.uint8], disparity_px: Tensor, shrink: int) -> Tensor:
-        """Return the pixels, bool [H, W], whose windows are inside of the field of view of both eyes.
+        """Return a bool mask [H, W] of the pixels whose matching windows are inside the field of view of both eyes.
 
         The field is that of the left eye. The right one of a stereo scope has the same outline.
         """
@@ -538,7 +542,7 @@ class StereoDepth(Estimator):
 
 
 def _widened(span: tuple[float, float]) -> tuple[float, float]:
-    """Return a range of disparities extended by the margin at both ends."""
+    """Return a range of disparities (lowest, highest) in pixels, extended at both ends by the margin of the search range."""
     margin = MARGIN_PX + MARGIN_SHARE * (span[1] - span[0])
     return span[0] - margin, span[1] + margin
 
@@ -640,13 +644,15 @@ def _depth_error(
 
 
 def reach_of(frame: Frame, camera: Camera) -> float:
-    """Return depth times disparity in millimetres times pixels; in baselines times pixels without a right camera."""
+    """Return the product of depth and disparity (focal length times baseline), in mm times pixels; without a right camera in
+    baselines times pixels.
+    """
     baseline = 1.0 if frame.right_camera is None else -float(frame.right_camera.world_to_camera[0, 3])
     return float(camera.K[0, 0] * baseline)
 
 
 def _has_company(confidence: NDArray[np.float32], shrink: int) -> NDArray[np.bool_]:
-    """Return the pixels, bool [H, W], around which at least half of the pixels are confident.
+    """Return a bool mask [H, W] of the pixels around which at least half of the pixels are confident (`COMPANY_PX`).
 
     Wrong matches in occluded areas form islands between pixels that do not match.
     """
@@ -666,7 +672,7 @@ def _tensors_of(pictures: list[NDArray[np.uint8]], device: torch.device) -> list
 
 
 def _off_along_rows(rows: NDArray[np.float64], height: int, width: int, device: torch.device) -> Tensor:
-    """Return the possible error of disparities in pixels [H, W]. A rotation or a scale difference
+    """Return the possible error of disparities in pixels [H, W] by wrong calibration. A rotation or a scale difference
     between the eyes shifts points along rows as well as across.
     """
     y, x = torch.linspace(-1, 1, height, device=device)[:, None], torch.linspace(-1, 1, width, device=device)

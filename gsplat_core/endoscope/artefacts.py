@@ -31,17 +31,17 @@ Outline = NDArray[np.float64]
 
 
 DARKEST_LEVEL = 40
-"""Largest level of the surround, 0 to 255."""
+"""Largest brightness of the dark surround outside the field of view, 0 to 255."""
 SURROUND_RANGE = 12
-"""Largest variation of the surround's level over the picture and time."""
+"""Largest variation of the surround's level, 0 to 255, over the picture and time."""
 EDGE_CONTRAST = 18
-"""Smallest brightness step from the surround to the inside of the outline."""
+"""Smallest brightness step from the surround to the inside of the outline, in levels 0 to 255."""
 EDGE_SHARE = 0.6
 """Share of the outline that must have a brightness step of at least `EDGE_CONTRAST`."""
 LEAST_SURROUND = 0.015
-"""Smallest share of the picture covered by the surround."""
+"""Smallest share of the picture that the dark surround must cover; with less, the field of view is the whole picture."""
 LEAST_FIELD = 0.15
-"""Smallest share of the picture covered by the field."""
+"""Smallest share of the picture that a plausible field of view covers."""
 ELLIPSE_SHARE = 0.7
 """Share of the outline off the picture's border that must be on the fitted ellipse for the ellipse to replace it."""
 ELLIPSE_DISTANCE = 0.015
@@ -54,7 +54,7 @@ MARGIN_SHARE = 0.01
 """Margin inside the outline that is excluded because it is blurred or has a bright ring, as a share of the longer side.
 """
 WINDOW_FRAMES = 30
-"""Number of frames per examined window; the first frame is examined alone."""
+"""Number of frames whose extreme levels are examined together for the field of view; the first frame is examined alone."""
 WINDOWS_TO_CHANGE = 3
 """Number of consecutive consistent windows before a smaller field, or none, is accepted; a
 larger one is accepted at once.
@@ -149,14 +149,14 @@ class FieldOfView:
         inside = _inside(outline, (height, width)).astype(np.uint8)
         margin = round(MARGIN_SHARE * max(height, width))
         if margin:
-            # The margin is not applied along the picture's own edge.
+            # Erode the field of view by the margin, but not along the picture's own edge.
             kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * margin + 1, 2 * margin + 1))
             inside = np.asarray(cv2.erode(inside, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=1))
         self.mask = inside
 
 
 def find_outline(brightest: NDArray[np.uint8], darkest: NDArray[np.uint8]) -> Outline | None:
-    """Find the field's outline.
+    """Find the outline of the field of view in the extreme levels of a window of frames.
 
     Args:
         brightest: largest level of each pixel in a window, uint8 [H, W].
@@ -227,7 +227,7 @@ def _up_to_the_edge(outline: Outline, shape: tuple[int, int]) -> Outline:
 
 
 def _along(hull: Outline) -> Outline:
-    """Return points along the polygon at distances of about a pixel."""
+    """Return points [N, 2] along the outline of a polygon, about one pixel apart."""
     parts = []
     for start, end in zip(hull, np.roll(hull, -1, axis=0), strict=True):
         steps = max(1, round(float(np.hypot(*(end - start)))))
@@ -268,25 +268,25 @@ def _overlap(one: NDArray[np.bool_], other: NDArray[np.bool_]) -> float:
 LONG_SIDE_PX = 800
 """Longest side in pixels above which pictures are subsampled in the search for strips."""
 SMALLEST_PX = 64
-"""Minimum height and width in pixels; smaller pictures are not examined."""
+"""Minimum height and width in pixels; smaller pictures are not examined for strips and text."""
 
 
 BAND_SHARE = 0.08
 """Width of the examined band at each border, as a share of the picture's height or width."""
 EXAMINE_EVERY = 4
-"""Number of frames in which all four borders are examined in turn."""
+"""Number of frames in which the four borders of the picture are examined for strips, one border per frame."""
 DECIDE_EVERY = 10
 """Number of rounds of examination between two decisions whether there is a strip."""
 REMEMBERED_FRAMES = 40
-"""Time constant of the temporal means, in rounds."""
+"""Time constant of the temporal means of gradients, in rounds of examination of all four borders."""
 EDGE_LEVELS = 10.0
 """Smallest step of brightness at a strip's edge, in levels of 255."""
 EDGE_STEADINESS = 2.5
 """Smallest ratio of a strip's edge step to the step's mean temporal deviation."""
 STRIP_LENGTH = 0.15
-"""Smallest length of an unbroken edge, as a share of the border."""
+"""Smallest length of an unbroken edge that counts as a strip's, as a share of the border's length."""
 WHOLE_SHARE = 0.6
-"""Visible share of the border from which a strip is extended along all of it."""
+"""Share of the border along which a strip's edge must be visible for the strip to be extended along the whole border."""
 TEXT_LEVELS = 25.0
 """Smallest step of brightness that counts as text, in levels of 255."""
 TEXT_STEADINESS = 5.0
@@ -393,7 +393,7 @@ class _Band:
         edges = (strength >= EDGE_LEVELS) & (steadiness >= EDGE_STEADINESS)
         depth, length = edges.shape
         least = round(STRIP_LENGTH * length)
-        # Close gaps of an edge that is tilted by a pixel or interrupted by letters.
+        # Close gaps of a strip's edge that is tilted by a pixel or interrupted by letters.
         joined = cv2.morphologyEx(
             cv2.dilate(edges.astype(np.uint8), np.ones((3, 1), np.uint8)), cv2.MORPH_CLOSE, np.ones((1, 9), np.uint8)
         )
@@ -423,7 +423,7 @@ def _text(strength: NDArray[np.float32], steadiness: NDArray[np.float32]) -> NDA
 
 
 BLOCK_ROWS, BLOCK_COLUMNS, COLUMN_STEP = 16, 8, 4
-"""Block size in lines and sampled columns, and the column step."""
+"""Size of the blocks that are tested for interlacing combs, in lines and in sampled columns, and the step of the sampling."""
 
 
 COMB_RATIO = 1.2
@@ -431,11 +431,11 @@ COMB_RATIO = 1.2
 COMB_LEVELS = 5.0
 """Smallest difference of neighbouring lines of a combed block, in levels 0 to 255."""
 COMB_SHARE = 0.02
-"""Share of combed blocks from which a picture is combed."""
+"""Share of combed blocks from which a picture counts as combed (interlaced and moving)."""
 COMBED_FRAMES = 4
 """Number of combed pictures among the last `JUDGED_FRAMES` from which a stream is interlaced."""
 JUDGED_FRAMES = 12
-"""Number of pictures over which combed ones are counted."""
+"""Number of newest pictures among which the combed ones are counted."""
 FORGOTTEN_FRAMES = 600
 """Consecutive pictures without combs after which a stream is no longer interlaced."""
 STAND_OUT_LEVELS = 4
@@ -494,7 +494,7 @@ def without_combs(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     over = cv2.subtract(grey_odd, cv2.max(grey_above, grey_below))
     under = cv2.subtract(cv2.min(grey_above, grey_below), grey_odd)
     stands_out = (np.asarray(cv2.max(over, under)) > STAND_OUT_LEVELS).view(np.uint8)
-    # Include the ends of a comb's tooth, which differ less from the neighbouring lines than its middle.
+    # Widen outliers along the line: the ends of a comb's tooth differ less from the neighbouring lines than its middle.
     near = cv2.dilate(stands_out, np.ones((1, 5), np.uint8))
     odd[:] = cv2.copyTo(cv2.addWeighted(above, 0.5, below, 0.5, 0), near, np.ascontiguousarray(odd))
     return result

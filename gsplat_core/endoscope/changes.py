@@ -53,15 +53,15 @@ LEAST_CONTRAST = 0.02
 BLOCK_PLACES = [
     (top, left) for top in range(0, HEIGHT_PX, BLOCK_HEIGHT_PX) for left in range(0, WIDTH_PX, BLOCK_WIDTH_PX)
 ]
-"""Upper left corners of the blocks: row and column."""
+"""Upper left corners (row, column) of the blocks that are searched near their position in another picture."""
 QUARTER_PLACES = [(0, 0), (0, 32), (24, 0), (24, 32), (12, 16)]
-"""Upper left corners of four quarters and of the middle: row and column."""
+"""Upper left corners (row, column) of the picture's four quarters and of an equally large part in its middle."""
 Part = tuple[int, int, NDArray[np.float32]]
-"""Row and column of a part's upper left corner, and the part of `View.detail`."""
+"""Rectangular part of a picture: row and column of its upper left corner, and its values of `View.detail`."""
 
 
 class View:
-    """Reduced picture with the features that are compared."""
+    """Reduced picture with the features that are compared to find cuts between scenes."""
 
     def __init__(self, image: NDArray[np.uint8]) -> None:
         """Reduce an RGB uint8 picture [H, W, 3] of any size and divide each channel by its median."""
@@ -73,7 +73,7 @@ class View:
             lit = channel[self.bright]
             channel -= median_of(lit) if len(lit) else 0.0
         self.logs: NDArray[np.float32] = logs
-        """Log levels without gain, [3, HEIGHT_PX, WIDTH_PX]."""
+        """Log levels of red, green and blue, each minus the channel's median (its gain), [3, HEIGHT_PX, WIDTH_PX]."""
         self._detail: NDArray[np.float32] | None = None
         self._blocks: list[Part] | None = None
         self._quarters: list[Part] | None = None
@@ -81,7 +81,7 @@ class View:
 
     @property
     def detail(self) -> NDArray[np.float32]:
-        """Structure without slow shading; 0 in dark regions."""
+        """Log brightness without slow shading, float32 [HEIGHT_PX, WIDTH_PX]; 0 in dark regions and at the rim of the view."""
         if self._detail is None:
             # Exclude the rim, so that the edge of the field of view or of a letterbox is not structure.
             rim = cv2.getStructuringElement(cv2.MORPH_RECT, (2 * RIM_PX + 1, 2 * RIM_PX + 1))
@@ -173,7 +173,7 @@ def _parts(detail: NDArray[np.float32], places: Iterable[tuple[int, int]], size:
 
 
 def _best(around: NDArray[np.float32], part: NDArray[np.float32]) -> float:
-    """Return the best correlation of a part anywhere in a picture."""
+    """Return the best normalised correlation of a part at any position in the picture `around`."""
     return cv2.minMaxLoc(cv2.matchTemplate(around, part, cv2.TM_CCOEFF_NORMED))[1]
 
 
@@ -190,18 +190,18 @@ SAME_AFTER_GAP_DIFFERENCE = 0.2
 their colours agree as well.
 """
 SAME_AFTER_GAP_COLOURS = 0.65
-"""Overlap of colours required for frames after a gap."""
+"""Smallest overlap of hue histograms at which frames before and after a gap of unusable frames may show the same scene."""
 LONGEST_DOUBT_FRAMES, LONGEST_DOUBT_S = 6, 0.25
 """Largest number of consecutive unmatched frames, and their duration in seconds, before a cut is reported. Normally a
 cut is confirmed by the next frame matching the unmatched one. Each cut without confirmation halves the number until a
 frame matches, so that a stream of unrelated pictures passes.
 """
 KEPT_VIEWS = 4
-"""Number of views kept of the present scene."""
+"""Number of earlier reduced pictures of the present scene with which a frame is compared."""
 VIEW_EVERY = 15
-"""Number of frames between two kept views."""
+"""Number of frames between two reduced pictures that are kept of the present scene."""
 RATE_RATIO = 1.4
-"""Factor from the usual to the new frame rate, in either direction, above which the rate counts as changed."""
+"""Ratio between the usual and the new frame rate, in either direction, above which the rate counts as changed."""
 RATE_FRAMES = 15
 """Number of frames over which the frame rate is observed."""
 
@@ -257,7 +257,7 @@ class CutDetector:
             return self._accept(view, "resized")
         if self._same(view, self._last, self._gap):
             return self._accept_related(view, other_rate)
-        # Compared before the views of the scene, because the first picture of a new scene is to be shown without delay.
+        # Compare with the unmatched frame before the views of the old scene, so that a new scene is shown without delay.
         settled = self._doubted is not None and self._same(view, self._doubted, gap=False)
         if not settled and any(self._same(view, earlier, self._gap) for earlier in self._views):
             return self._accept_related(view, other_rate)
@@ -272,7 +272,7 @@ class CutDetector:
         return SceneVerdict(in_doubt=True)
 
     def _accept_related(self, view: View, other_rate: bool) -> SceneVerdict:
-        """Accept a view of the present scene; with another frame rate, a new scene starts nevertheless."""
+        """Accept a picture as one of the present scene; if the frame rate has changed, a new scene starts nevertheless."""
         self._most_doubts = LONGEST_DOUBT_FRAMES
         return self._accept(view, "frame rate" if other_rate else None)
 
@@ -330,7 +330,7 @@ APART_PX = 8
 COLOUR_WIDTH_PX, COLOUR_HEIGHT_PX = 40, 32
 """Size of the picture for measuring colours, in pixels."""
 LONGEST_RECENT = 600
-"""Largest number of recent frames, independent of the frame rate."""
+"""Largest number of frames in the window of the usual sharpness, at any frame rate."""
 
 
 BLURRED_BELOW = 0.75
@@ -350,7 +350,9 @@ RECENT_S = 1.5
 Smoke that lasts longer becomes the usual state.
 """
 RECENT_FRAMES = 5
-"""Smallest number of frames for the median, for low frame rates. Until there are as many, all frames pass."""
+"""Smallest number of frames for the median of the usual sharpness, also at low frame rates. Until there are as many, all
+frames pass.
+"""
 CLEAR_FRAMES = 300
 """Number of good frames for the usual contrast, saturation and haze (medians)."""
 
@@ -370,11 +372,11 @@ class Appearance:
     saturation: float
     """Median of 1 - darkest channel / brightest channel."""
     haze: float
-    """10th percentile of the darkest channel."""
+    """10th percentile over the pixels of the darkest channel, 0 to 255; smoke raises it."""
 
 
 class SharpnessGate:
-    """Comparison of each frame of a stream with the usual values, in constant memory."""
+    """Detector of blurred and smoky frames: compares each frame of a stream with the stream's usual values, in constant memory."""
 
     def __init__(self) -> None:
         self._clear: NDArray[np.float64] = np.empty((CLEAR_FRAMES, 3))
@@ -432,7 +434,7 @@ class SharpnessGate:
         return self._fault
 
     def _remember(self, elapsed_s: float, seen: Appearance) -> None:
-        """Append the frame's sharpness and drop frames outside the window."""
+        """Append the frame's sharpness, and drop frames that are older than the window of `RECENT_S` seconds."""
         self._recent.append((elapsed_s, seen.rows, seen.columns))
         together_s = sum(each[0] for each in self._recent)
         while len(self._recent) > RECENT_FRAMES and together_s - self._recent[0][0] > RECENT_S:

@@ -17,7 +17,7 @@ from gsplat_core.endoscope.reduced import enlarged, sampled
 LONG_SIDE_PX = 800
 """Longest side in pixels above which pictures are subsampled."""
 SHRINK = 8
-"""Reduction factor for averaging the surroundings."""
+"""Factor by which pictures are reduced before the surroundings of highlights are averaged, to save time."""
 BLACK = 28
 """Level below which pixels are excluded from the surroundings, since they may be outside the field of view."""
 
@@ -29,9 +29,9 @@ DARKEST_CHANNEL = 170
 ABOVE_SURROUNDINGS = 30
 """Smallest excess of a highlight's darkest channel over the mean of the surroundings, in levels."""
 SURROUNDINGS_SHARE = 0.12
-"""Side of the square of surroundings, as a share of the longer side."""
+"""Side of the square window around a pixel whose mean is the pixel's surroundings, as a share of the picture's longer side."""
 GROWN_SHARE = 0.003
-"""Dilation of highlights as a share of the longer side, 2 px of 640."""
+"""Width by which detected highlights are dilated, as a share of the picture's longer side: 2 px of 640."""
 MOST_SHARE = 0.25
 """Largest share of highlights in a picture; more indicates overexposure or a white object, and none are reported."""
 

@@ -23,7 +23,7 @@ from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.io.files import read_regular
 
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
-"""Wire types."""
+"""Wire types of protobuf fields: how the bytes of a value are encoded."""
 
 
 def fields(message: memoryview) -> Iterator[tuple[int, int | bytes | memoryview]]:
@@ -99,7 +99,9 @@ _PARTS: dict[str, dict[int, str]] = {
     "attribute": {5: "tensor", 6: "graph", 10: "tensor", 11: "graph", 22: "sparse", 23: "sparse"},
     "sparse": {1: "tensor", 2: "tensor"},
 }
-"""Fields of each message type that lead to tensors (onnx.proto, IR version 13)."""
+"""Field numbers that lead from an ONNX message to nested messages with tensors, with the type of the nested message, by message
+type (onnx.proto, IR version 13).
+"""
 
 
 def read_model(path: Path, what: str) -> bytes:
@@ -361,7 +363,7 @@ class OnnxToolFinder:
     """
 
     def __init__(self, path: Path) -> None:
-        """Load and try the model.
+        """Load a tool model and run it once on trial pictures.
 
         Raises:
             InvalidSetting: for a model that cannot be used.
@@ -412,7 +414,7 @@ class OnnxToolFinder:
         chosen[list(range(1, len(planes)) if tools is None else tools)] = True
         if np.isnan(planes).any():
             return np.full(planes.shape[1:], np.nan, np.float32)
-        # Infinite scores, for example of a mask inside the network, would cancel to NaN.
+        # The difference of two infinite scores, for example of a mask inside the network, would be NaN.
         planes = np.clip(planes, -1e30, 1e30)
         ahead = planes[chosen].max(axis=0) - planes[~chosen].max(axis=0)
         return np.asarray(ahead - np.float32(np.log(threshold / (1 - threshold))), np.float32)

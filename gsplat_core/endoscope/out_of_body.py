@@ -34,7 +34,9 @@ SMALLEST_PX = 16
 DARKEST = 25
 """Brightness (largest channel, 0..255) below which a pixel's colour is not judged."""
 DIM = 40.0
-"""Brightness that 5 % of the lit pixels must exceed; rounding decides the colours of darker pictures."""
+"""Brightness, 0 to 255, that 5 % of the lit pixels must exceed. Darker pictures are not judged, because rounding decides their
+colours.
+"""
 CLIPPED = 252
 """Level from which a channel counts as clipped. With two clipped channels a pixel's colour is unknown."""
 LEAST_LIT, LEAST_JUDGED = 0.05, 0.1
@@ -67,7 +69,7 @@ open for less than `RECENT_FRAMES` pictures closes at the first one.
 FRAMES_TO_RETURN = 10
 """Consecutive pictures of clear tissue that reopen the gate."""
 FRAMES_WITHOUT_EVIDENCE = 30
-"""Pictures without evidence of the outside that reopen the gate."""
+"""Consecutive judged pictures without evidence of the outside that reopen the gate, even if some do not show clear tissue."""
 
 
 @dataclass(frozen=True)
@@ -79,9 +81,9 @@ class Evidence:
     cold: float
     """Share of pixels in which red does not exceed green and blue."""
     redness: float
-    """Upper quartile of the log of red over green."""
+    """Upper quartile over the pixels of the logarithm of red over green."""
     even: float
-    """Lower quartile of brightness over its 95th percentile."""
+    """Evenness of the light: ratio of the lower quartile of brightness to its 95th percentile."""
     smooth: float
     """Share of the lit area, without its border, with hardly any brightness change."""
     straight: float
@@ -165,7 +167,7 @@ class BodyGate:
         self._inside = True
         self._tissue = self._without = 0
         self._recent: deque[bool] = deque(maxlen=RECENT_FRAMES)
-        """Evidence of the outside in recent pictures."""
+        """True for each recent picture that had evidence of the outside."""
 
     def reset(self) -> None:
         """Open the gate and forget all pictures, for another stream."""

@@ -20,7 +20,7 @@ def median_of(values: NDArray[np.floating], share: float = 0.5) -> float:
 
 
 SAMPLES = 128
-"""Approximate number of rows and columns of the shorter side that are averaged; others are skipped to save time."""
+"""Approximate number of samples along the shorter side that are averaged. Other rows and columns are skipped to save time."""
 
 
 def sampled(plane: NDArray[np.uint8], step: int) -> NDArray[np.uint8]:
@@ -61,7 +61,7 @@ def averaged(image: NDArray[np.uint8], size: tuple[int, int], samples: int = 2) 
 
 
 def enlarged(plane: NDArray[np.uint8], width_px: int, height_px: int) -> NDArray[np.uint8]:
-    """Enlarge [H, W] by repeating pixels."""
+    """Enlarge a plane [H, W] to `height_px` x `width_px` by repeating pixels."""
     height, width = plane.shape
     step = width_px // width
     if (step * width, step * height) != (width_px, height_px):
@@ -79,7 +79,7 @@ def sampled_mask(mask: NDArray[np.generic], step: int) -> NDArray[np.uint8]:
 
 
 def reduced_mask(mask: NDArray[np.generic], width_px: int, height_px: int) -> NDArray[np.bool_]:
-    """Return where all sampled pixels of a result pixel are not 0, bool [height_px, width_px]."""
+    """Reduce a mask to bool [height_px, width_px]: True where all sampled mask pixels within a result pixel are not 0."""
     some = sampled_mask(mask, max(1, min(mask.shape[:2]) // SAMPLES))
     return np.asarray(cv2.resize(some * np.uint8(255), (width_px, height_px), interpolation=cv2.INTER_AREA) == 255)
 

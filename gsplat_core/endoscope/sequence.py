@@ -29,9 +29,10 @@ SMALLEST_FOR_NOISE_PX = 32
 
 
 BLACK_LEVEL = 20
-"""Level below which a picture is black, except for `ODD_SHARE` of its pixels."""
+"""Grey level (0 to 255) that a black picture stays below, except for the share `ODD_SHARE` of its pixels."""
 ONE_COLOUR_LEVELS = 3
-"""Deviation from the most frequent colour within which a picture has one colour, except for `ODD_SHARE` of its pixels.
+"""Largest deviation (levels of 255) from the most frequent colour in a single-coloured picture, except for the share `ODD_SHARE`
+of its pixels.
 """
 ODD_SHARE = 0.03
 """Tolerated share of other pixels in a black or single-coloured picture, such as a line of text or a logo."""
@@ -40,9 +41,9 @@ NOISE_SHARE = 0.5
 noise. Tissue has 0.01 to 0.04.
 """
 AVERAGED_PX = 4
-"""Side in pixels of squares. A picture is noise if its pixels and the averages of its squares are."""
+"""Side in pixels of squares that are averaged. A picture counts as noise only if these averages are noise as well."""
 SAME_LEVELS = 2
-"""Largest difference of equal pixels, as caused by re-encoding."""
+"""Largest difference, in levels of 255, at which pixels of two pictures count as equal; re-encoding causes such differences."""
 SAME_SHARE = 0.9995
 """Share of equal pixels from which a picture repeats the previous one."""
 FROZEN_S = 0.25
@@ -117,7 +118,7 @@ class SequenceCheck:
         if self._one_grey(levels, pixels) and self._one_colour(small):
             return "one colour"
         if min(image.shape[:2]) >= SMALLEST_FOR_NOISE_PX and _roughness(image) > NOISE_SHARE:
-            # A picture is left if averages are smooth, as with fibre bundles or a noisy camera.
+            # If averages over small squares are smooth, the picture has content, as with fibre bundles or a noisy camera.
             height, width = image.shape[:2]
             size = width // AVERAGED_PX, height // AVERAGED_PX
             averages = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
@@ -127,7 +128,7 @@ class SequenceCheck:
 
     def _one_grey(self, levels: NDArray[Any], pixels: int) -> bool:
         """Return True if all but `ODD_SHARE` of the pixels have nearly one grey level; faster than comparing colours."""
-        # Allow one more level on either side, since grey values are rounded.
+        # Allow one more grey level on either side than for colours, since grey values are rounded.
         wide = min(2 * ONE_COLOUR_LEVELS + 3, len(levels))
         below = np.append(0, levels.cumsum())
         return bool((below[wide:] - below[:-wide]).max() >= (1 - ODD_SHARE) * pixels)
@@ -196,7 +197,7 @@ ARRIVAL_AGREES_S = 1.0
 LATE_FRAMES = 4
 """Number of consecutive frames with earlier timestamps that mean that the clock was set back; fewer are late frames."""
 GAP_INTERVALS = 4.0
-"""Step in usual intervals above which a gap is reported."""
+"""Time between two frames, as a multiple of the usual interval, above which a gap in the stream is reported."""
 
 
 @dataclass(frozen=True)
@@ -215,9 +216,9 @@ class StreamClock:
     def __init__(self) -> None:
         self._offset_ns = 0
         self._given_ns: int | None = None
-        """Original timestamp of the newest frame."""
+        """Timestamp of the newest frame as the source gave it, in nanoseconds."""
         self._shown_ns = 0
-        """Corrected timestamp of the newest frame."""
+        """Corrected timestamp of the newest frame, in nanoseconds."""
         self._arrived_ns: int | None = None
         self._late: list[int] = []
         self._steps: deque[int] = deque(maxlen=15)
@@ -288,13 +289,13 @@ class Turns:
         self._due_ns = [pts_ns + self._every_ns * (k + 1) // self._looks for k in range(self._looks)]
 
     def due(self, pts_ns: int) -> frozenset[int]:
-        """Return the numbers of the checks due by half a frame interval after this time, and schedule them again."""
-        # This picture is the nearest to their due time if the interval is constant.
+        """Return the indices of the checks that are due up to half a frame interval after this time, and schedule them again."""
+        # At a constant frame interval, this picture is the nearest to the due time of the checks up to half an interval later.
         reached_ns = pts_ns + max(0, pts_ns - self._last_ns) // 2
         self._last_ns = pts_ns
         due = frozenset(k for k, due_ns in enumerate(self._due_ns) if due_ns <= reached_ns)
         for k in due:
-            # Keep the phase so that checks stay apart, unless the time jumped.
+            # Schedule the check one period after its last due time, so that checks stay apart, unless the time jumped.
             after_ns = self._due_ns[k] + self._every_ns
             self._due_ns[k] = after_ns if after_ns > reached_ns else pts_ns + self._every_ns
         return due
@@ -386,7 +387,7 @@ class OrdinaryPictures:
 
 
 def _sampled(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.float64], float]:
-    """Return some of the pixels, their mean colour, and the mean difference of neighbours in some of the rows."""
+    """Return sampled pixels of a picture, their mean colour, and its sharpness: the mean difference of neighbours in some rows."""
     height, width = image.shape[:2]
     size = min(width, SAMPLES_PER_SIDE), min(height, SAMPLES_PER_SIDE)
     small = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_NEAREST), np.uint8)
@@ -409,7 +410,7 @@ def _change_of_bands(small: NDArray[np.uint8], before: NDArray[np.uint8]) -> NDA
 STEP_PX = 4
 """Smallest subsampling step of the rows and columns of masks and depth maps, in pixels."""
 LEAST_TISSUE = 0.02
-"""Share of tissue below which a frame is not trained on."""
+"""Share of tissue pixels in a mask below which the frame is not trained on."""
 LOST_TOOL_SHARE = 0.05
 """Share of tool pixels in the previous mask from which a mask without any tool counts as lost."""
 LOST_FRAMES, LOST_S = 5, 0.19
@@ -423,17 +424,17 @@ WRONG_DEPTH_SHARE = 0.2
 USUAL_DEPTH_RATIO = 4.0
 """Ratio of the median depth to that of earlier frames, in either direction, from which a frame's depth is discarded."""
 UNUSUAL_FRAMES = 10
-"""Largest number of consecutive discarded frames. After that the new distance is accepted."""
+"""Largest number of consecutive depth maps that are discarded for their scale. After that the new distance is accepted."""
 
 
 class MaskCheck:
-    """Consistency check of consecutive tool masks."""
+    """Check of tool masks for missing tissue, and for tools that disappear suddenly."""
 
     def __init__(self) -> None:
         self._tool_share = 0.0
         self._lost = 0
         self._seen_ns = 0
-        """Time of the newest mask that was not lost."""
+        """Timestamp in nanoseconds of the newest mask that did not count as lost."""
 
     def fault(self, mask: NDArray[np.generic], pts_ns: int) -> str | None:
         """Return "no tissue" or "tool mask lost" for a faulty mask [H, W] (1 = tissue) at `pts_ns`, else None."""
@@ -461,7 +462,7 @@ class CheckedDepth:
 
 
 class DepthCheck:
-    """Consistency check of consecutive depth maps."""
+    """Check of depth maps for invalid values, and for sudden changes of the median depth."""
 
     def __init__(self) -> None:
         self._medians: deque[float] = deque(maxlen=15)

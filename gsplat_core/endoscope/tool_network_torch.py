@@ -90,10 +90,10 @@ class TorchToolNetwork:
 
 @dataclass(frozen=True)
 class Node:
-    """Call of an operator."""
+    """Call of an operator in an ONNX graph."""
 
     operator: str
-    """Name in `OPERATORS`."""
+    """Name of the operator, a key of `OPERATORS`."""
     inputs: tuple[str, ...]
     """Names of values; an omitted input has the name ""."""
     output: str
@@ -103,7 +103,7 @@ class Node:
 
 @dataclass(frozen=True)
 class Graph:
-    """Content of an ONNX file."""
+    """Network of an ONNX file: constant tensors, and operator calls in order of execution."""
 
     nodes: tuple[Node, ...]
     """Operators in an order in which each follows the operators whose outputs it reads."""
@@ -120,9 +120,9 @@ class Operator:
 
     run: Callable[..., Any]
     options: frozenset[str] = frozenset()
-    """Attributes passed to `run`."""
+    """Names of the attributes that are passed to `run` as keyword arguments."""
     fixed: Mapping[str, Any] = field(default_factory=dict)
-    """Attributes with a single supported value."""
+    """Attributes of which only one value is supported, with that value."""
 
 
 def _convolved(
@@ -154,7 +154,7 @@ def _convolved(
 
 
 def _constant(*, value: NDArray[Any]) -> NDArray[Any]:
-    """Return an array, such as axes, which stays on the host."""
+    """Return the value of the operator `Constant`, such as axes, as an array on the host."""
     return value
 
 

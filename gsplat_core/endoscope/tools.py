@@ -55,7 +55,7 @@ BORDER: NDArray[np.uint8] = np.ones((7, 7), np.uint8)
 
 @dataclass(frozen=True)
 class _Network:
-    """Loaded network and its input."""
+    """Loaded tool network and the size of its input."""
 
     logits: Callable[[NDArray[np.float32]], NDArray[np.float32]]
     """Function of `features` [1, inputs, h, w] that returns logits of tool [h / 2, w / 2]."""
@@ -212,9 +212,9 @@ def features(small: NDArray[np.uint8], inputs: int = 5) -> NDArray[np.float32]:
 Plane = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 SMALLEST_REGION = 0.003
-"""Smallest area of a region, as a share of the field of view; smaller ones are glare or noise."""
+"""Smallest area of a tool region, as a share of the field of view; smaller grey regions are glare or noise."""
 SMALLEST_INNER_REGION = 0.01
-"""Smallest area of a region that does not reach the border, as a share of the field of view."""
+"""Smallest area of a tool region that does not reach the border of the view, as a share of the field of view."""
 MOST_GLARE = 0.3
 """Share of a tool region without contact to the border that may be as bright as the brightest pixels, as highlights
 are.
@@ -226,23 +226,23 @@ CORE = 0.35
 CLEARLY_BELOW = 0.08
 """Distance of a pixel's redness below the threshold for tools from which the pixel counts as clearly grey."""
 KNOWN = 0.5
-"""Share of a region that was tool in the previous frame, from which thresholds are reduced."""
+"""Share of a region that was tool in the previous frame above which the region's thresholds are reduced (`KNOWN_DISCOUNT`)."""
 KNOWN_DISCOUNT = 0.75
 """Factor of the thresholds for a region that was mostly tool in the previous frame (`KNOWN`)."""
 DARKEST = 0.15
-"""Share of the mean brightness below which colour is ignored."""
+"""Brightness below which a pixel cannot be tool, because its colour is noise; as a share of the mean brightness."""
 EDGE_AT = 0.6
 """Position of a tool's edge between its own redness and that of the surroundings. A value above 0.5 removes some tissue
 rather than keep parts of a tool.
 """
 GROWTH_PX = 4
 MARGIN_PX = 1
-"""Dilation of tools at working size, four pixels of a 640-pixel-wide picture."""
+"""Width in pixels of the reduced picture by which detected tools are dilated: four pixels of a 640-pixel-wide picture."""
 
 
 @dataclass(frozen=True)
 class Regions:
-    """Planes [h, w] of a picture for the classification."""
+    """Reduced picture as planes [h, w] (redness, brightness, masks), with the thresholds that classify its regions."""
 
     redness: Plane
     threshold: float
@@ -314,7 +314,7 @@ def whole_tools(view: Regions, found: Bytes) -> Bytes:
     own = cv2.mean(view.redness, found)[0]
     seen = view.redness if view.whole else np.where(view.inside.view(np.bool_), view.redness, np.float32(-1))
     around = cv2.dilate(seen, neighbourhood(9), dst=np.empty_like(seen))
-    # Include pixels nearer to the tool's own redness than to that of the surroundings.
+    # Add pixels whose redness is closer to that of the tool than to that of its surroundings.
     like_tool = _less(cv2.scaleAdd(around, -EDGE_AT, view.redness, dst=around), (1 - EDGE_AT) * own)
     if not view.whole:
         like_tool &= view.inside
@@ -327,7 +327,7 @@ def whole_tools(view: Regions, found: Bytes) -> Bytes:
 
 
 def _less(plane: NDArray[Any], value: float) -> Bytes:
-    """Return 1 where a plane is below a value."""
+    """Return a mask uint8 [h, w], 1 where a plane is below a value, else 0."""
     return (plane < np.float32(value)).view(np.uint8)
 
 
@@ -347,7 +347,7 @@ def _change(view: Regions) -> Plane:
 
 
 def _outline(view: Regions, grey: Bytes) -> Bytes:
-    """Return 1 on the outlines of grey regions, except along the border of the view."""
+    """Return a mask [h, w], 1 on the outlines of grey regions, except along the border of the view; 0 elsewhere."""
     outline = np.empty_like(grey)
     cv2.erode(grey, neighbourhood(3), dst=outline, borderType=cv2.BORDER_CONSTANT, borderValue=1)
     cv2.subtract(grey, outline, dst=outline)
@@ -362,7 +362,7 @@ def _well_inside(inside: Bytes) -> Bytes:
 
 
 def _border(view: Regions) -> Bytes:
-    """Return 1 next to the border of the picture or of the field of view."""
+    """Return a mask [h, w], 1 next to the border of the picture or of the field of view; 0 elsewhere."""
     if view.whole:
         border = np.zeros_like(view.inside)
     else:
@@ -382,36 +382,42 @@ LONG_SIDE_PX = 160
 SMALLEST_PX = 24
 """Shortest side of a picture that is analysed, in pixels; smaller ones count as all tissue."""
 RED_SCENE = 0.8
-"""Third quartile of redness to which paler scenes (smoke, fat, a phantom) are stretched."""
+"""Third quartile of a scene's redness below which all its redness is multiplied up to it: smoke, fat or a phantom is pale."""
 PALEST_SCENE = 0.2
-"""Lower limit of the third quartile from which the stretch is computed; it limits the stretch of very pale scenes."""
+"""Lower limit of the scene's third quartile of redness in that multiplication, so that very pale scenes are not stretched without
+limit.
+"""
 BINS, LOWEST, HIGHEST = 100, -0.3, 0.7
-"""Bins of the redness distribution; values beyond count in the first and last bin."""
+"""Number of bins of the redness histogram, and its range; values beyond the range count in the first and last bin."""
 MEMORY = 0.9
-"""Share of the distribution kept from one frame to the next; it adapts within about ten frames."""
+"""Weight of the earlier frames in the running mean of the redness histogram, which adapts within about ten frames."""
 FINE_BINS, FINE_REACH = 4500, 4.5
 """Number and range (±) of fine bins of a frame's redness, more than bytes can resolve."""
 OTHER_SCENE = 0.7
-"""Difference of a frame's distribution (0..2, sum of absolute differences) from which another scene starts."""
+"""Distance between a frame's redness histogram and the running one (sum of absolute differences, 0 to 2) above which another scene
+has started.
+"""
 EXPECTED_VALLEY, VALLEY_SPREAD, HIGHEST_VALLEY = 0.15, 0.3, 0.33
-"""Mean and standard deviation of the expected threshold, and its upper bound. With correct white
-balance grey is at 0 and pale tissue at 0.3.
+"""Mean and standard deviation of the expected redness threshold between tools and tissue, and its upper bound. With correct
+white balance the redness of grey is 0 and that of pale tissue 0.3.
 """
 NO_VALLEY, SHARPER_EDGE = 0.25, 0.8
-"""Threshold without a valley, which includes pale tissue, and the sharper outline then required of tools."""
+"""Redness threshold if the histogram has no valley, which includes pale tissue, and the sharper outline then required of
+tools.
+"""
 CLEAR_VALLEY = 1.15
 """Smallest ratio of both neighbouring peaks of the redness distribution to the valley between them."""
 SMALLEST_SHARE = 0.003
 """Share of a picture's pixels that must be lit, and that must be greyer than the threshold, for tools to be found."""
 HELD_FRAMES = 3
-"""Number of frames for which tools that disappear suddenly (glare, blur) are kept."""
+"""Largest number of frames for which the previous tool mask is kept if tools disappear suddenly, as by glare or blur."""
 BIN_EDGES = np.linspace(LOWEST, HIGHEST, BINS + 1)
 BIN_CENTRES = 0.5 * (BIN_EDGES[1:] + BIN_EDGES[:-1])
 FINE_EDGES = np.linspace(-FINE_REACH, FINE_REACH, FINE_BINS + 1)
 EXPECTATION = np.exp(-0.5 * ((BIN_CENTRES - EXPECTED_VALLEY) / VALLEY_SPREAD) ** 2)
 LEVELS = np.arange(256, dtype=np.float32)
 RED_OVER_OTHERS = np.array([[1, -0.25, -0.25, -0.5]], np.float32)
-"""Weights of log red, green, blue and the smaller of green and blue in the redness."""
+"""Weights of log red, log green, log blue and the log of the smaller of green and blue in the redness of a pixel."""
 
 
 @dataclass(frozen=True)

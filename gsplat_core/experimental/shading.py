@@ -79,7 +79,7 @@ class Shading(Cells):
     glints: NDArray[np.float64]
     """Share of each cell's pixels that are specular highlights on tissue, [h, w]."""
     wet_share: NDArray[np.float64]
-    """Share of each cell's pixels in which highlights are detectable, [h, w]."""
+    """Share of each cell's pixels that count for `glints`: lit tissue away from tool edges, [h, w]."""
     diffuse: Cells | None = None
     """Brightness of the diffuse part (`log_diffuse`), whose errors differ from those of the
     mixture. None if no cell has any.

@@ -37,7 +37,7 @@ def hat(vector: Tensor) -> Tensor:
 
 
 def exp(twist: Tensor) -> Tensor:
-    """Return the pose [..., 4, 4] of a twist [..., 6]."""
+    """Return the pose [..., 4, 4] of a twist [..., 6], translation first (exponential map of SE(3))."""
     along, turn = twist[..., :3], twist[..., 3:]
     squared = (turn * turn).sum(-1)[..., None, None]
     cross = hat(turn)
@@ -51,7 +51,7 @@ def exp(twist: Tensor) -> Tensor:
 
 
 def log(pose: Tensor) -> Tensor:
-    """Return the twist [..., 6] of a pose [..., 4, 4] with a rotation of less than 180 degrees."""
+    """Return the twist [..., 6], translation first, of a pose [..., 4, 4] with a rotation of less than 180 degrees."""
     rotation, shift = pose[..., :3, :3], pose[..., :3, 3]
     trace = rotation.diagonal(dim1=-2, dim2=-1).sum(-1)
     off = rotation - rotation.transpose(-1, -2)

@@ -165,7 +165,7 @@ class Camera:
         return hash(self._key())
 
     def _key(self) -> tuple[bytes, bytes, int, int, str]:
-        # Adding 0.0 gives -0.0 and 0.0 identical bytes.
+        # Adding 0.0 turns -0.0 into 0.0, so that equal poses have equal bytes.
         pose = self.world_to_camera + 0.0
         return (self.K + 0.0).tobytes(), pose.tobytes(), self.width_px, self.height_px, self.model
 
@@ -204,7 +204,7 @@ def pixels_of(camera: Camera, points: Points) -> Points:
 
 
 def at_pixels(plane: NDArray[Any], pixels: Points) -> NDArray[Any]:
-    """Sample a plane at the pixels [...] containing the positions [..., 2]; 0 outside the picture."""
+    """Return the values [...] of a plane [H, W] at the pixels that contain the positions [..., 2]; 0 outside the picture."""
     height, width = plane.shape[:2]
     inside = np.isfinite(pixels).all(axis=-1)
     column, row = (np.floor(np.where(inside, pixels[..., k], -1)).astype(np.int64) for k in (0, 1))
@@ -214,7 +214,7 @@ def at_pixels(plane: NDArray[Any], pixels: Points) -> NDArray[Any]:
 
 
 MOST_DEG = 75.0
-"""Maximum rotation in degrees; beyond it, surfaces are seen edge-on."""
+"""Maximum azimuth or elevation of an orbit in degrees; beyond it, surfaces are seen edge-on."""
 LEAST_ZOOM, MOST_ZOOM = 0.25, 4.0
 
 

@@ -81,7 +81,7 @@ def rotated_harmonics(sh: Tensor, rotation: Tensor) -> Tensor:
 LABELS = "semantics"
 """Name of the extra tensor [N, classes] whose largest logit is the label."""
 MOST_ROTATION_ERROR = 1e-4
-"""Largest difference of `rotation @ rotation.T` from the identity."""
+"""Largest element of `rotation @ rotation.T` minus the identity for a matrix that is accepted as a rotation."""
 
 Point = Sequence[float] | Tensor
 

@@ -29,7 +29,9 @@ FTHETA_PIXEL_CENTRE = 0.5
 
 
 class FThetaPolynomialType(Enum):
-    """Polynomial that defines an f-theta camera exactly; the other one is an approximate inverse."""
+    """Polynomial (pixel distance to angle, or angle to pixel distance) that defines an f-theta camera exactly. The other one is an
+    approximate inverse.
+    """
 
     PIXELDIST_TO_ANGLE = 0
     ANGLE_TO_PIXELDIST = 1
@@ -271,7 +273,7 @@ class Lens:
         return torch.stack([across, down], -1)
 
     def _slopes(self, flat: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return the derivatives of `_distort`: (dx'/dx, dx'/dy, dy'/dx, dy'/dy), each [..., C, M]."""
+        """Return the derivatives (dx'/dx, dx'/dy, dy'/dx, dy'/dy) of distorted by undistorted coordinates, each [..., C, M]."""
         x, y = flat.unbind(-1)
         r2 = x * x + y * y
         scale, slope = (torch.ones_like(x), torch.zeros_like(x)) if self.radial is None else _ratio(self.radial, r2)
@@ -290,7 +292,7 @@ class Lens:
         return xx, xy, yx, yy
 
     def _undistort(self, bent: Tensor) -> tuple[Tensor, Tensor]:
-        """Return pinhole coordinates at z = 1 [..., C, M, 2], and the mask of those that exist."""
+        """Invert `_distort`: return pinhole coordinates at z = 1 [..., C, M, 2], and a mask that is True where a solution exists."""
         with torch.no_grad():
             target = bent.detach()
             radius, outward = _polar(target)
@@ -340,7 +342,7 @@ def _focal(Ks: Tensor) -> Tensor:
 
 
 def _polar(points: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the distance to the axis and the unit vector away from it; (0, 0) on the axis itself."""
+    """Return the distance of points to the optical axis, and the unit vector (x, y) from the axis to them; (0, 0) on the axis."""
     across = points[..., :2]
     squared = (across * across).sum(-1)
     on_axis = squared == 0
@@ -375,7 +377,7 @@ def _fisheye_slope(radial: Tensor | None, angle: Tensor) -> Tensor:
 
 
 def _pinhole_limit(radial: Tensor | None, like: Tensor) -> Tensor:
-    """Return the radius [..., C, 1] at z = 1 up to which the distorted radius grows."""
+    """Return the undistorted radius [..., C, 1] at z = 1 up to which the distorted radius grows with it."""
     if radial is None:
         return like.new_full((1,), math.tan(WIDEST_PINHOLE_RAD))
 
@@ -389,7 +391,7 @@ def _pinhole_limit(radial: Tensor | None, like: Tensor) -> Tensor:
 
 
 def _fisheye_limit(radial: Tensor | None, like: Tensor) -> Tensor:
-    """Return the angle [..., C, 1] to the axis up to which the distorted radius grows."""
+    """Return the angle [..., C, 1] of rays to the axis in radians up to which the distorted radius grows with it."""
     if radial is None:
         return like.new_full((1,), math.pi)
     return _first_failure(lambda angle: _fisheye_slope(radial, angle) > 0, radial, math.pi)
@@ -409,7 +411,11 @@ def _first_failure(holds: Callable[[Tensor], Tensor], radial: Tensor, most: floa
 
 @torch.no_grad()
 def _inverse(rises: Callable[[Tensor], Tensor], target: Tensor, most: Tensor) -> tuple[Tensor, Tensor]:
-    """Solve rises(x) = target for x in 0 to `most` roughly, by bisection; returns x and the mask of targets in reach."""
+    """Solve rises(x) = target for an increasing function approximately, by bisection of 0 to `most`.
+
+    Returns:
+        x, and a mask that is True where the target is at most rises(`most`).
+    """
     low, high = torch.zeros_like(target), most.expand_as(target).clone()
     found = target <= rises(high)
     for _ in range(_BISECTIONS):
@@ -424,7 +430,7 @@ def _tolerance(distance: Tensor) -> Tensor:
 
 
 def _solve(slopes: tuple[Tensor, Tensor, Tensor, Tensor], right: Tensor) -> Tensor:
-    """Solve [[xx, xy], [yx, yy]] step = right [..., 2]."""
+    """Solve the 2x2 linear systems [[xx, xy], [yx, yy]] step = right; return `step` [..., 2]. `slopes` is (xx, xy, yx, yy)."""
     xx, xy, yx, yy = slopes
     x, y = right.unbind(-1)
     return torch.stack([yy * x - xy * y, xx * y - yx * x], -1) / (xx * yy - xy * yx)[..., None]
@@ -438,7 +444,11 @@ def _horner(coefficients: Sequence[float], x: Tensor) -> Tensor:
 
 
 def _newton_inverse(exact: Sequence[float], approximate: Sequence[float], target: Tensor) -> tuple[Tensor, Tensor]:
-    """Solve exact(x) = target from the start approximate(target); returns x and the mask of solutions found."""
+    """Solve exact(x) = target by Newton's method from x = approximate(target); both are polynomials by their coefficients.
+
+    Returns:
+        x, and a mask that is True where a solution was found.
+    """
     slopes = [power * each for power, each in enumerate(exact)][1:]
     with torch.no_grad():
         x = _horner(approximate, target)

@@ -16,7 +16,7 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.range_sensors import RangeScan, resized_scan
 
 BELIEVED = 0.5
-"""Confidence from which a depth is used, in steps that either use or reject it."""
+"""Smallest confidence of a depth value that is used, in code that either uses a value fully or ignores it."""
 
 
 @dataclass(frozen=True)
@@ -54,9 +54,11 @@ class DepthOrigin:
     surroundings.
     """
     edge_margin_px: int = 0
-    """Margin around unknown pixels within which the depth is not trained on. Half of it applies to start values."""
+    """Margin in pixels around unknown depth within which the depth is not trained on. Half of it applies to start values of
+    new Gaussians.
+    """
     tool_margin_px: int = 0
-    """Margin around tools within which the depth may belong to the tool."""
+    """Margin in pixels around tools within which the depth may belong to the tool and starts no Gaussians."""
     surface: str | None = None
     """Import path of a function (frame, camera) -> frame, called before training on a complete recording. The function
     replaces the depth by a smooth surface. None to keep the depth.
@@ -96,7 +98,7 @@ UNKNOWN_ERROR = 0.3
 
 
 class FrameStatus(Enum):
-    """Origin of a frame's picture."""
+    """Source (live or replay) or defect (stale or damaged) of a frame's picture."""
 
     LIVE = "live"
     REPLAY = "replay"
@@ -253,7 +255,7 @@ def resized_frame(frame: Frame, width_px: int, height_px: int) -> Frame:
 
 
 def resize_area(image: NDArray[np.uint8], width_px: int, height_px: int) -> NDArray[np.uint8]:
-    """Resize an image; area-averaged when reduced."""
+    """Resize an image [H, W, C], by area averaging if it becomes smaller."""
     import cv2  # here, because the control plane passes frames on without OpenCV
 
     shrinks = width_px <= image.shape[1] and height_px <= image.shape[0]

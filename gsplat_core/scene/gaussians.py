@@ -212,7 +212,7 @@ OPACITY = slice(13, 14)
 
 
 def width_of(*groups: slice) -> int:
-    """Return the total number of columns of the groups."""
+    """Return the total number of columns of groups of raw parameters, such as `POSITION` and `ROTATION`."""
     return sum(group.stop - group.start for group in groups)
 
 
@@ -273,14 +273,14 @@ class GaussianRows:
         if gaussians.count > capacity:
             raise InvalidInput(f"{gaussians.count} Gaussians do not fit into {capacity} rows")
         self.all = inert_gaussians(gaussians, capacity)
-        """All rows, as read and changed by captured graphs."""
+        """Gaussians in all rows up to the capacity; CUDA graphs hold the addresses of these tensors."""
         self.used = self.all
-        """Views of the rows in use."""
+        """Gaussians in the rows in use, as views of the tensors of `all`."""
         self.replace(gaussians)
 
     @property
     def capacity(self) -> int:
-        """Capacity in Gaussians."""
+        """Largest number of Gaussians that the tensors can hold."""
         return self.all.count
 
     def replace(self, gaussians: Gaussians) -> None:

@@ -36,7 +36,7 @@ class RangeSensor:
     """`column` for one histogram for each column of the picture, `image` for a single one."""
 
     name: ClassVar[str]
-    """Name in `SENSORS`."""
+    """Name under which `SENSORS` registers the sensor."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.nearest < self.farthest < math.inf:

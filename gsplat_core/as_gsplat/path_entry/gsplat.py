@@ -1,4 +1,4 @@
-"""Module `gsplat` of a spawned process, which gives way to that of the import hook."""
+"""Placeholder for the module `gsplat` in spawned processes. It installs the import hook, whose module replaces it."""
 
 from gsplat_core.as_gsplat import take_over
 
