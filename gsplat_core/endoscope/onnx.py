@@ -167,7 +167,7 @@ class PictureSettings(BaseModel):
     white: Positive = 1.0
     """Value of a white pixel before normalisation by `mean` and `std`, usually 1 or 255."""
     mean: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
-    """Mean per channel, red first."""
+    """Mean that is subtracted from each channel after scaling to `white`, red first."""
     std: tuple[Positive, Positive, Positive] = (1.0, 1.0, 1.0)
     channels: Literal["rgb", "bgr"] = "rgb"
     """Channel order of the network's input."""

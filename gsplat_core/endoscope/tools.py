@@ -314,7 +314,7 @@ def whole_tools(view: Regions, found: Bytes) -> Bytes:
     own = cv2.mean(view.redness, found)[0]
     seen = view.redness if view.whole else np.where(view.inside.view(np.bool_), view.redness, np.float32(-1))
     around = cv2.dilate(seen, neighbourhood(9), dst=np.empty_like(seen))
-    # Add pixels whose redness is closer to that of the tool than to that of its surroundings.
+    # Add pixels on the tool's side of its edge: with a redness below own + EDGE_AT * (surroundings - own).
     like_tool = _less(cv2.scaleAdd(around, -EDGE_AT, view.redness, dst=around), (1 - EDGE_AT) * own)
     if not view.whole:
         like_tool &= view.inside

@@ -85,11 +85,11 @@ def _moved(image: NDArray[np.uint8], flow: NDArray[np.float32], share: float) ->
 
 
 AGES = (1, 2, 3, 5, 8)
-"""Ages of the copies on the frame-hold curve, in frames."""
+"""Ages in frames of the copies of earlier frames that are scored for the frame-hold curve (PSNR of a copy by its age)."""
 PREVIOUS_FRAME, NEIGHBOUR_MEAN, TRAIN_MEAN = "previous_frame", "neighbour_mean", "train_mean"
 HALF_VELOCITY, HALF_WAY = "half_velocity_flow", "half_way_flow"
 SEES_THE_FUTURE = frozenset({NEIGHBOUR_MEAN, HALF_WAY})
-"""Baselines computed from the frame after the scored one, which a live system does not have yet."""
+"""Names of the baselines that use the frame after the scored one, which a live system does not have yet."""
 _MAX_THREADS = 4
 
 
@@ -98,9 +98,9 @@ class Baselines:
     """Scores of each baseline over tissue pixels of the scored frames."""
 
     copies: Mapping[int, BaselineScore] = field(default_factory=dict)
-    """Scores by age in frames of the copy that is shown instead of each frame."""
+    """Scores of copies of an earlier frame, shown in place of each frame, by the copy's age in frames."""
     every: Mapping[str, BaselineScore] = field(default_factory=dict)
-    """Scores by baseline name over every frame that has the baseline: `half_velocity_flow`."""
+    """Scores by baseline name over all frames, not only held-out ones. The only such baseline is `half_velocity_flow`."""
     heldout: Mapping[str, BaselineScore] = field(default_factory=dict)
     """Scores by baseline name over the held-out frames.
 
@@ -312,7 +312,7 @@ class _Pool:
 
 
 class _TrainMean:
-    """Running mean of images, exact in integers: 2^24 frames fit."""
+    """Running mean of images. Sums are exact 32-bit integers, which do not overflow up to 2^24 frames."""
 
     def __init__(self) -> None:
         self._sum: NDArray[np.uint32] | None = None

@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 MOST_STEPS = 100
 """Largest number of Levenberg-Marquardt steps of a plane fit from each start; the fit converges in about ten."""
 CONVERGED = 1e-10
-"""Relative decrease of the squared error that ends the iteration."""
+"""Relative decrease of the squared error by a step of a plane fit, below which the fit ends."""
 STEEPEST_RATIO = 1e-6
 """Lower limit of a fitted plane's inverse depth at a pixel, as a share of the mean inverse depth.
 
@@ -32,7 +32,7 @@ Keeps the plane in front of the camera.
 
 
 class FlatDepths(NamedTuple):
-    """Depth z [N] of the baselines at the pixels that were given."""
+    """Depths z [N] of the two trivial baselines of a frame at its compared pixels."""
 
     level: Array
     """Median true depth at every pixel: a plane perpendicular to the optical axis."""
@@ -81,7 +81,7 @@ def best_plane(rays: Array, z: Array) -> Array | None:
 
 
 def _descended(plane: Array, rays: Array, z: Array) -> tuple[Array, float]:
-    """Return the plane found by descent from `plane`, and its squared error."""
+    """Return the plane found by Levenberg-Marquardt steps from the start value `plane`, and its squared error in z."""
     found = 1 / (rays @ plane)
     error, damping = float(np.square(found - z).sum()), 1e-3
     for _ in range(MOST_STEPS):
@@ -184,23 +184,23 @@ MOST_DEPTH_PIXELS = 8192
 
 @dataclass(frozen=True)
 class DepthShare:
-    """Errors over all compared pixels of all frames.
+    """Depth errors over all compared pixels of all frames of a sequence, with flat planes as baselines.
 
     Compared are tissue pixels with known depth at which the model has depth.
     """
 
     rmse_share: float
-    """RMSE divided by the median true depth."""
+    """Root mean square depth error over all compared pixels, divided by the median true depth."""
     scaled_rmse_share: float
-    """RMSE share after scaling the model's depth by `scale`; measures the shape alone."""
+    """`rmse_share` after the model's depth is multiplied by `scale`; measures the shape alone."""
     plane_rmse_share: float
-    """RMSE share of each frame's best-fit plane (`FlatDepths.plane`), a baseline fitted to the truth."""
+    """Baseline: `rmse_share` of the plane that fits each frame's true depth best (`FlatDepths.plane`)."""
     level_rmse_share: float
-    """RMSE share of each frame's level plane (`FlatDepths.level`), a baseline fitted to the truth."""
+    """Baseline: `rmse_share` of the level plane at each frame's median true depth (`FlatDepths.level`)."""
     median_share: float
-    """Median of the absolute error after `scale`, divided by the true depth."""
+    """Median over the compared pixels of the absolute error divided by the true depth, after scaling by `scale`."""
     rmse: float
-    """`rmse_share` in the unit of the recording's depth."""
+    """Root mean square depth error over all compared pixels, in the unit of the recording's depth."""
     scale: float
     """Scale factor of the whole sequence: the median of true depth over model depth."""
     median_depth: float
@@ -263,7 +263,7 @@ class NormalErrors:
     plane_mean_deg: float
     """Baseline: mean angular error of a flat plane that is fitted to the true depth of each frame (`best_plane`)."""
     level_mean_deg: float
-    """Error of the normal of a level plane: along the optical axis, towards the camera."""
+    """Baseline: mean angular error in degrees of a level plane, whose normal is along the optical axis, towards the camera."""
     frames: int
 
 

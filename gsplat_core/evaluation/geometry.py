@@ -58,20 +58,20 @@ Poses = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class TrajectoryErrors:
-    """RMS position error divided by the length of the true path."""
+    """Errors of an estimated scope trajectory (ATE), with the error of a static scope as baseline."""
 
     rigid_share: float
-    """Position error as a share of the true path, after a rigid alignment; for estimates with metric scale."""
+    """RMS position error divided by the length of the true path, after a rigid alignment; for estimates with metric scale."""
     similarity_share: float
-    """Position error as a share of the true path, after a similarity alignment; for the shape of the path alone."""
+    """RMS position error divided by the length of the true path, after a similarity alignment; for the shape of the path alone."""
     still_share: float
     """Baseline: `rigid_share` of a static scope at the mean of the true positions."""
     rigid_rmse: float
-    """`rigid_share` in the unit of the true path."""
+    """Root mean square position error after the rigid alignment, in the unit of the true path."""
     rotation_deg: float
     """Mean angle in degrees between true and estimated orientations, after the rotation of the alignment."""
     scale: float
-    """Scale factor of the similarity alignment."""
+    """Scale factor by which the similarity alignment multiplies the estimated positions."""
     path: float
     """Length of the true path, in its unit."""
     frames: int
@@ -134,9 +134,9 @@ PARTS: dict[str, tuple[str, ...]] = {
     COLOUR: ("sh",),
     SIZE: ("log_scales", "logit_opacities"),
 }
-"""Tensors of `Gaussians` deformed by each part."""
+"""Parts into which the deformation is divided: the tensors of `Gaussians` that each part changes over time, by the part's name."""
 PART_FRAMES = 8
-"""Number of evaluated frames; each is rendered eight times."""
+"""Number of frames from which the shares of motion, colour and size are computed; each is rendered eight times."""
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,7 @@ class PartShares:
     size: float
     """Share of the squared error that the changes of sizes and opacities remove."""
     explained: float
-    """Sum of the three shares. The rest is the error of the complete model."""
+    """Sum of the shares of motion, colour and size. The rest of the squared error remains in the complete model."""
     reference_s: float
     frames: int
 
@@ -191,7 +191,7 @@ class PartSums:
 
     @property
     def shares(self) -> PartShares | None:
-        """Shares over all compared frames; None without frames, or if the frozen model has no error."""
+        """Shares of motion, colour and size over all added frames; None without frames, or if the frozen model has no error."""
         whole = self._errors[frozenset()]
         if not self._frames or whole <= 0:
             return None
@@ -336,7 +336,7 @@ def _known(frame: Frame, true: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 
 def _trajectory(ways: list[tuple[Pose, Pose]]) -> TrajectoryErrors | None:
-    """Compare the model's poses with the recording's; None if they are equal, or for fewer than three frames."""
+    """Compare pairs of the model's and the recording's pose of each frame; None if they are equal, or for fewer than three frames."""
     if len(ways) < 3 or all(found is true or np.array_equal(found, true) for found, true in ways):
         return None
     return evaluate_trajectory(np.stack([found for found, _ in ways]), np.stack([true for _, true in ways]))

@@ -105,7 +105,7 @@ class Tracking:
 
 
 class TrackSums:
-    """Error accumulator for positions in left-camera coordinates [P, 3] and pixels [P, 2]."""
+    """Accumulator of tracking errors: of positions in left-camera coordinates [P, 3] and of pixels [P, 2]."""
 
     def __init__(self) -> None:
         self._mm: list[Points] = []
@@ -124,7 +124,7 @@ class TrackSums:
 
     @property
     def errors(self) -> TrackErrors | None:
-        """Error statistics; None if nothing was compared."""
+        """Statistics of all tracking errors added so far; None if no position was compared."""
         if not self.count:
             return None
         mm, px = np.concatenate(self._mm), np.concatenate(self._px)
@@ -245,7 +245,7 @@ class FlowErrors:
 
 @dataclass(frozen=True)
 class _Started:
-    """Compared pixels of a frame, kept until the next frame arrives."""
+    """Pixels of a frame whose motion will be compared when the next frame arrives, with their positions in the model."""
 
     seq: int
     time_s: float
@@ -269,9 +269,9 @@ class FlowSums:
         self._model, self._camera, self._files = model, camera, files
         self._started: _Started | None = None
         self._px: list[Values] = []
-        """Errors of the model and of the static baseline for each compared frame, [2, P]."""
+        """End-point errors in pixels for each compared frame: of the model (row 0) and of no motion (row 1), [2, P]."""
         self._mm: list[tuple[Values, Values]] = []
-        """Motion of the model and true motion [P, 3], in left-camera axes."""
+        """For each compared frame, the 3D motion of its pixels' surface points in the model and the true one, [P, 3], in left-camera axes."""
 
     def begin(self, frame: Frame, own: Camera, shown: NDArray[Any], tissue: NDArray[np.bool_]) -> None:
         """Sample a frame for comparison with the next one, if its true motion is known at any pixel of `tissue`.

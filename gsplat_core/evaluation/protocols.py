@@ -177,7 +177,7 @@ class Learner(Protocol):
 
 
 def published(learner: Learner, frame: Frame) -> Model | Snapshot:
-    """Return the model before it has seen `frame`.
+    """Return the learner's current model, which has not been trained on `frame`, to predict it.
 
     The caller renders it at the frame's time, to which the model extrapolates its motion.
     """
@@ -243,7 +243,9 @@ def _score(frame: Frame, picture: Picture, sums: ScoreSums, record: Record | Non
 
 
 NEAR_SHARE = 0.05
-"""Distance below which two positions count as the same place, as a share of the largest pairwise distance."""
+"""Distance below which two positions of the scope count as the same place, as a share of the largest distance between any two
+positions.
+"""
 NEAR_DEGREES = 10.0
 AWAY = 3.0
 """Smallest distance of the scope from a place between two stays, in multiples of the distance below which positions
@@ -252,14 +254,14 @@ count as the same place.
 The distance is the larger of the position and the angle measure of `_distances`.
 """
 MAX_POSES = 2048
-"""Maximum number of stored poses; longer streams are subsampled by powers of two."""
+"""Maximum number of poses that `PlaceFinder` stores; longer streams are subsampled by powers of two."""
 Range = tuple[float, float]
 """First and last time, in seconds."""
 
 
 @dataclass(frozen=True)
 class Visits:
-    """Two stays of the scope at the same place, with an absence between them."""
+    """Two stays of the scope at the same place, with an absence between them, as ranges of time."""
 
     first: Range
     again: Range

@@ -113,7 +113,7 @@ class ScoreSums:
 
     @property
     def score(self) -> Score:
-        """Mean scores of all frames so far."""
+        """Mean scores of all frames added so far."""
         worst = None if self._worst_seq is None else self._worst
         means = self._quality.means()
         return Score(
@@ -136,7 +136,7 @@ def finite(value: float | None) -> float | None:
 
 
 def number(entry: Entry, name: str) -> float | None:
-    """Return a named figure of an entry, or None if missing."""
+    """Return the measure `name` of a log entry as a number, or None if the entry does not have it."""
     value = entry.get(name)
     return None if value is None or isinstance(value, str) else float(value)
 
@@ -162,7 +162,7 @@ class Ages:
 
 
 class AgeHistogram:
-    """Histogram of ages in logarithmic buckets of 1 %."""
+    """Histogram of picture ages in logarithmic buckets, each 1 % wide."""
 
     def __init__(self) -> None:
         self._counts = [0] * _BUCKETS
@@ -193,18 +193,18 @@ class AgeHistogram:
 
 
 MOST_BEHIND = 8
-"""Largest lateness in frames with its own counter. Later pictures are counted with it."""
+"""Largest lateness, in frames, that is counted separately. Pictures that are later are counted with it."""
 NOTHING_SHOWN = "nothing shown yet"
 _MAX_STATES = 16
 
 
 @dataclass(frozen=True)
 class Live:
-    """Image quality and latency of the pictures that a viewer saw."""
+    """Image quality and latency of the pictures that were displayed in a live run."""
 
     score: Score
     settled: Score
-    """Score without the start-up time `SETTLING_S`."""
+    """Score over the frames after the first `SETTLING_S` seconds, without the start-up of training."""
     previous: BaselineScore
     """Baseline for `score`: the previous raw frame, over the same frames and pixels."""
     settled_previous: BaselineScore
@@ -218,7 +218,7 @@ class Live:
     in_time: int
     """Number of frames whose own picture was on the screen when the next frame arrived."""
     behind: Mapping[int, int]
-    """Number of frames by lateness of the displayed picture, in frames.
+    """Number of frames by the lateness in frames of the picture that was on the screen when the next frame arrived.
 
     Key `MOST_BEHIND` includes all greater latenesses.
     """
@@ -287,7 +287,7 @@ class LiveSums:
 
     @property
     def live(self) -> Live:
-        """Results of all frames so far."""
+        """Scores and latencies of all frames and displayed pictures added so far."""
         return Live(
             score=self._score.score,
             settled=self._settled.score,

@@ -31,7 +31,7 @@ from gsplat_core.training.observations import right_tissue, typical_shift
 SAME_DEPTH = 0.02
 """Relative depth tolerance within which two cameras see the same point."""
 LEAST_SEEN = 0.05
-"""Minimum share of a view in common with the training view; other frames are excluded."""
+"""Smallest share of a view's pixels whose tissue the training camera sees; frames with less are not scored."""
 
 
 @dataclass(frozen=True)
@@ -48,11 +48,11 @@ class NovelView:
     For a right eye this is a shift by the median disparity.
     """
     seen: float
-    """Share of the view's pixels that count in the scores."""
+    """Mean share of the view's pixels that are scored, because training has observed their tissue."""
 
 
 class NovelViewSums:
-    """Accumulator for the frames of one view."""
+    """Accumulator of the scores of one novel view over the frames of a recording."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -67,7 +67,7 @@ class NovelViewSums:
             view: frame of the novel view's camera.
             seen: bool [H, W], pixels whose tissue training has observed.
             picture: picture rendered by the model [H, W, 3].
-            left: baseline: the left picture seen by the view's camera.
+            left: baseline: the left picture resampled to the view's intrinsics, without a change of pose.
             shifted: baseline: the left picture reprojected at one typical distance.
         """
         share = float(seen.mean())
@@ -207,9 +207,11 @@ Proportionally less in smaller pictures.
 """
 BORDER_OF_PX = 360
 BEYOND_TYPICAL = 1.3
-"""Width of the columns visible only to one eye, in multiples of the typical disparity, used if no width is given."""
+"""Width of the unscored columns at the right edge, which only the right eye sees, in multiples of the typical disparity. Used if
+no width is given.
+"""
 SEARCHED = 0.07
-"""Search range of semi-global matching around the typical disparity, as a share of the width."""
+"""Largest difference from the typical disparity that semi-global matching searches, as a share of the picture's width."""
 MODEL = "model"
 SHIFTED, MATCHED, RIGHT_BEFORE = "left_shifted", "semi_global_matching", "previous_right"
 
@@ -290,7 +292,7 @@ def evaluate_second_eye(
 
 
 class _Sums:
-    """Means of the model and its baselines over the scored frames."""
+    """Accumulator of the mean PSNR of the model's right view and of each baseline over the scored frames."""
 
     def __init__(self) -> None:
         self._means: dict[str, ScoredMean] = {}
@@ -350,7 +352,7 @@ def warped_by_disparity(left: NDArray[np.uint8], disparity: NDArray[np.float32])
 
 
 def _counted(frame: Frame, camera: Camera, eye: Camera, disparity_px: float, left_out_px: int) -> NDArray[np.bool_]:
-    """Return the mask [H, W] of compared pixels in the right picture."""
+    """Return the mask [H, W] of the right picture's pixels that are scored: tissue that the left eye sees, without the border."""
     counted = right_tissue(frame, camera, eye, disparity_px) > 0
     border = round(BORDER_PX * min(1.0, frame.width_px / BORDER_OF_PX))
     inner = np.zeros_like(counted)

@@ -1,1 +1,4 @@
-"""Methods that do not beat their trivial baseline on all real recordings. Only registries name them; no default uses them."""
+"""Experimental methods, which do not beat their trivial baseline on all real recordings.
+
+Users select them by name through the registries; no default uses them.
+"""

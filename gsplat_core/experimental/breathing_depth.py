@@ -43,7 +43,7 @@ SPREAD_PX = 0.7
 """Cauchy scale in pixels of the points' deviations."""
 ROUNDS = 8
 HEAD_ON = 0.05
-"""Regularising sine of the angle between motion and line of sight; limits the estimate for motion seen head-on."""
+"""Sine of the angle between pull and line of sight, added as regularisation; limits the estimate for motion seen head-on."""
 LEAST_TOLD = 15.0
 """Smallest ratio of the second smallest to the smallest generalised eigenvalue; below it the direction of the pull is
 ambiguous.
@@ -95,12 +95,12 @@ def pull_of(rays: list[Array], off: list[Array], turns: list[Array], focal_px: f
     rows, unturned, where = [], [], []
     for ray, each, chosen, turn in zip(rays, off, moved, turns, strict=True):
         r, d = ray[chosen], each[chosen] * focal_px
-        # Each point gives the constraint d x (p - r p_z) = 0 on the direction p.
+        # A point with the ray r and the deviation d constrains the direction p of the pull: d x (p - r p_z) = 0.
         rows.append(np.stack([-d[:, 1], d[:, 0], d[:, 1] * r[:, 0] - d[:, 0] * r[:, 1]], 1) @ turn.T)
         unturned.append(np.repeat(turn[None], len(r), 0))
         where.append(r)
     c, turn, ray = np.concatenate(rows), np.concatenate(unturned), np.concatenate(where)
-    # Derivative of each constraint with respect to noise of the observed ray.
+    # Derivative of each point's constraint with respect to noise of its observed ray.
     reach = np.stack([np.tile([1.0, 0.0], (len(ray), 1)), np.tile([0.0, 1.0], (len(ray), 1)), -ray], 2) @ turn.swapaxes(
         1, 2
     )
@@ -123,7 +123,7 @@ WINDOW_S = 8.0
 recordings overlap by at least half.
 """
 RATE_HZ = 12.5
-"""Largest number of frames used per second; several per heart beat."""
+"""Largest number of frames per second that are used; it suffices for several frames per heartbeat."""
 KEY_EVERY_S = 1.2
 SHORTEST_S = 1.0
 LEAST_CYCLES = 1.0
@@ -134,7 +134,7 @@ MOST_ERROR = 0.04
 MOST_OFF_PX = 1.0
 """Median error in pixels of the fitted motion above which it is rejected."""
 OWN_MOTION = 3.0
-"""Factor from a point's error across its ray to its assumed error along the ray."""
+"""Ratio of a point's assumed error along its line of sight to its measured error across it."""
 PULL_FRAMES = 3
 """Number of frames before a frame, and from it on, at the sampled rate, in which a tool's pull is assumed to have one
 direction.
@@ -150,7 +150,7 @@ TOO_FEW = "too few points of the tissue can be tracked"
 
 @dataclass(frozen=True)
 class _Window:
-    """Tracks and fitted motion of one time window of a recording."""
+    """Point tracks and fitted periodic motion in one time window of a recording."""
 
     middle_s: float
     tracks: GridTracks
@@ -211,7 +211,7 @@ class MovingTissue:
 def _windows(
     frames: Sequence[Frame], cameras: Sequence[Camera], times_s: Array
 ) -> list[tuple[list[TexturedPicture], Array]]:
-    """Return the sampled pictures and their times for each window."""
+    """Divide a recording into overlapping time windows; return the sampled pictures and their times in seconds of each."""
     length_s = float(times_s[-1] - times_s[0])
     count = 1 if length_s <= WINDOW_S else int(np.ceil(2 * length_s / WINDOW_S)) - 1
     starts = times_s[0] + np.linspace(0, max(0.0, length_s - WINDOW_S), count)
@@ -230,7 +230,7 @@ def _windows(
 
 
 def _found(pictures: list[TexturedPicture], times_s: Array) -> _Window | str:
-    """Fit the motion of one window, or return the reason for rejecting it."""
+    """Fit the periodic motion of one time window, or return the reason for rejecting the window as a sentence."""
     length_s = float(times_s[-1] - times_s[0])
     if length_s < SHORTEST_S:
         return TOO_SHORT
@@ -253,13 +253,13 @@ def _found(pictures: list[TexturedPicture], times_s: Array) -> _Window | str:
 
 
 def _share(window: _Window, time_s: float) -> float:
-    """Return the weight of a window at a time: 1 in its middle, falling linearly to 0.02 at its ends and beyond."""
+    """Return the weight of a window's depth at a time: 1 in the window's middle, falling linearly to 0.02 at its ends and beyond."""
     half = 0.5 * float(np.ptp(window.tracks.times_s))
     return max(0.02, 1 - abs(time_s - window.middle_s) / half)
 
 
 def _surface(window: _Window, camera: Camera, time_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return depth and confidence [h, w] of a frame from the points of one window."""
+    """Return depth and confidence, both [h, w], of the frame at `time_s` from the moving points of one window."""
     tracks = window.tracks
     after = int(np.clip(np.searchsorted(tracks.times_s, time_s), 1, len(tracks.times_s) - 1))
     share = (time_s - tracks.times_s[after - 1]) / (tracks.times_s[after] - tracks.times_s[after - 1])

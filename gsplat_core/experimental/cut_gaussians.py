@@ -22,10 +22,10 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import SH_C0, Gaussians, rotations
 
 CURVES = "curves"
-"""Name of the control points in `Gaussians.extra`."""
+"""Key in `Gaussians.extra` of the control points of the splats' Bézier curves."""
 BINOMIALS = (1.0, 3.0, 3.0, 1.0)
 PAIRS = ((3, 2), (3, 1), (3, 0), (2, 1), (2, 0), (1, 0))
-"""Pairs i, j of control points whose terms l_ij make up the implicit form."""
+"""Pairs (i, j) of control points whose terms l_ij are the elements of the determinant in `implicit_form`."""
 FARTHEST_FLIP = 0.5
 """Largest shift of a control point, in standard deviations of the splat, that is assumed to move a pixel to the other
 side of the curve (a flip).
@@ -33,7 +33,7 @@ side of the curve (a flip).
 SMALLEST_FLIP = 0.15
 """Smallest shift to a flip with which the gradient is computed, since it is inversely proportional to the shift."""
 BEND = 1.0
-"""Bend of a first curve in standard deviations. Nearly straight curves have an ill-conditioned implicit form."""
+"""Initial bend of a curve in standard deviations of the splat. Nearly straight curves have an ill-conditioned implicit form."""
 TILE_SIZE, MAX_ALPHA, LEAST_ALPHA = 16, 0.99, 1 / 255
 
 
@@ -41,9 +41,9 @@ class Implicit(NamedTuple):
     """Implicit form of cubic Bézier curves at points, and its derivatives."""
 
     value: Tensor
-    """f [...]; 0 on the curve, with different signs on both sides."""
+    """Value f [...] of the implicit form; 0 on the curve, with different signs on both sides."""
     slopes: Tensor
-    """∂f / ∂(control point) [..., 4, 2]."""
+    """Derivatives ∂f / ∂(control point) of the implicit form by the four control points, [..., 4, 2]."""
 
 
 def implicit_form(points: Tensor, curves: Tensor) -> Implicit:
@@ -87,7 +87,7 @@ class _Side(torch.autograd.Function):
     def forward(ctx: Any, points: Tensor, curves: Tensor) -> Tensor:
         value, slopes = implicit_form(points, curves)
         inside = value > 0
-        # Smallest shift to first order of one coordinate of one control point that moves the curve to the point.
+        # To first order, the smallest shift of one coordinate of one control point by which the curve reaches the pixel.
         flat = slopes.flatten(-2)
         largest, which = flat.abs().max(-1)
         shift = torch.where(largest > 0, -value / flat.gather(-1, which[..., None])[..., 0], torch.inf)
@@ -100,7 +100,7 @@ class _Side(torch.autograd.Function):
         inside, which, shift = ctx.saved_tensors
         near = (shift.abs() <= FARTHEST_FLIP) & shift.isfinite()
         size = shift.abs().clamp(min=SMALLEST_FLIP)
-        # Crossing the curve changes the result by 1 - 2 inside, at the cost of the shift.
+        # A pixel that crosses the curve changes the result by 1 - 2 inside; divided by the shift this is the gradient.
         change = torch.where(inside, -gradient, gradient)
         slope = torch.where(near, change * torch.where(shift < 0, -1.0, 1.0) / size, 0)
         full = slope.new_zeros(*slope.shape, 8).scatter_(-1, which[..., None], slope[..., None])
@@ -117,14 +117,14 @@ def side(points: Tensor, curves: Tensor) -> Tensor:
 
 
 class GaussianKernel:
-    """Falloff of a Gaussian without cuts."""
+    """Falloff of an ordinary Gaussian splat, not cut by curves."""
 
     name = "gaussian"
     extra: tuple[str, ...] = ()
-    """Further tensors of `Gaussians.extra` that the kernel needs."""
+    """Names of the tensors in `Gaussians.extra` that the kernel needs."""
 
     def factors(self, offsets: Tensor, curves: Tensor | None) -> Tensor | None:
-        """Return the factors of alpha at offsets [T, P, L, 2] from the splats' means; None for 1."""
+        """Return the factors by which a splat's alpha is multiplied at offsets [T, P, L, 2] from its mean; None for 1 everywhere."""
         return None
 
 

@@ -43,13 +43,13 @@ class SharesSettings:
     """
 
     at_first: tuple[float, ...]
-    """Mixing weights used before any observation."""
+    """Mixing weights, one per prediction, that are used before any observation."""
     decay: float
-    """Weight of accumulated sums at each new frame; about 1 / (1 - decay) frames are remembered."""
+    """Factor on the accumulated sums at each new frame, so that about the last 1 / (1 - decay) frames count."""
     around_cells: float
-    """Standard deviation of a cell's neighbourhood, in cells."""
+    """Standard deviation of the Gaussian over which the sums of neighbouring cells are averaged, in cells."""
     pull: float
-    """Strength with which a cell's shares are pulled to those of the whole picture."""
+    """Weight of the regularisation that pulls a cell's mixing weights to those of the whole picture."""
     ridge: float
     """Weight of ridge regression that pulls each prediction's share over the whole picture to its initial value."""
 
@@ -123,11 +123,11 @@ REMEMBERED = 256
 SOONEST = 6
 """Distance in frames that a compared moment must exceed, because neighbouring frames are always similar."""
 EARLIER_COUNTS = 0.64
-"""Weight of the preceding moments in the dissimilarity of two moments."""
+"""Weight of the dissimilarity of the two preceding moments in the dissimilarity of two moments."""
 FOLLOWED = 6
 """Number of most similar moments whose next motion is averaged."""
 Weighted: TypeAlias = tuple[float, Flow]
-"""Weight of a motion, and the motion as a flow."""
+"""Possible motion: its weight in a mean, and the motion as a flow."""
 
 
 class SimilarMoments:
@@ -140,7 +140,7 @@ class SimilarMoments:
 
     def _begin(self, shape: tuple[int, ...]) -> None:
         self._motions = np.zeros((REMEMBERED, *shape), np.float16)
-        """Motion from frame k to k + 1 in row k modulo the ring size."""
+        """Ring buffer of motions; entry k modulo the buffer's size is the motion from frame k to frame k + 1."""
         columns, rows = cells_for(shape)
         self._coarse = np.zeros((REMEMBERED, rows * columns * 2), np.float32)
         self._unlike = np.full(REMEMBERED, np.inf)
@@ -156,7 +156,7 @@ class SimilarMoments:
         self._motions[row] = motion
         self._coarse[row] = cv2.resize(motion, cells_for(motion.shape), interpolation=cv2.INTER_AREA).ravel()
         apart = np.square(self._coarse - self._coarse[row]).mean(axis=1, dtype=np.float64)
-        # The dissimilarity of two moments combines that of their last motions and that of the moments before.
+        # The dissimilarity of two moments is that of their last motions plus a share of that of the two moments before.
         of_moments_before = np.roll(self._unlike, 1)
         of_moments_before[np.isinf(of_moments_before)] = 0.0
         self._unlike = apart + EARLIER_COUNTS * of_moments_before
@@ -189,12 +189,12 @@ def weighted_mean(parts: Sequence[Weighted]) -> Field:
 
 
 FOLLOWS = 0.2
-"""Weight of the newest picture in the moving mean of earlier pictures."""
+"""Weight of the newest picture in the exponential moving mean of earlier pictures."""
 BLUR_PX = 1.5
 """Standard deviation of the blurred picture in pixels."""
 PICTURE_SHARES = SharesSettings(at_first=(0.0, 0.0, 0.0, 0.0), decay=0.95, around_cells=3.0, pull=200.0, ridge=30.0)
-"""Settings for the shares of the unmoved newest picture, the mean, the blurred picture, and the
-mean over other motions. Units are squared grey levels, 0 to 255.
+"""Settings of the mixing weights of the alternatives to the moved newest picture: the unmoved newest picture, the mean of earlier
+ones, the blurred picture, and the mean over other motions. Units are squared grey levels, 0 to 255.
 """
 INVERSE_STEPS = 2
 """Fixed-point iterations for inverting a flow."""
@@ -209,7 +209,7 @@ class _Guesses:
 
 
 class ExpectedPicture:
-    """Mixture of predictions of the next picture with learned shares."""
+    """Prediction of the next picture's colours as a mixture of simple predictions with learned weights."""
 
     def __init__(self) -> None:
         self._shares = LocalShares(PICTURE_SHARES)
@@ -295,16 +295,16 @@ def _looked_up(field: Field, back: Field) -> Field:
 
 
 REFERENCE_S = 1 / 30
-"""Unit interval of stored motions in seconds."""
+"""Time in seconds to which stored motions are scaled, so that motions of unequal frame intervals are comparable."""
 MOTION_SHARES = SharesSettings(at_first=(AT_FIRST, 0.0), decay=0.97, around_cells=3.0, pull=4.0, ridge=0.2)
-"""Settings for the shares of the last motion and of motions after similar moments, in squared pixels."""
+"""Settings of the mixing weights of the last motion and of the motions after similar moments. Units are squared pixels."""
 COLOUR_STEPS = 16
 """Iterations of the colour fit of moved Gaussians to the expected picture."""
 
 
 @dataclass(frozen=True)
 class Expectation:
-    """Expected next frame, on the device."""
+    """Predicted colours of the next frame, on the device of the Gaussians."""
 
     motion: SurfaceMotion
     picture: Tensor
@@ -329,7 +329,7 @@ class LearnedPrior(FlowPrior):
         self._shares = LocalShares(MOTION_SHARES)
         self._picture = ExpectedPicture()
         self._guesses: list[Flow] = []
-        """Predictions of the next motion."""
+        """Predictions of the next motion that `LocalShares` mixes: the last motion, and the mean after similar moments."""
         self._expected: Expectation | None = None
 
     @property
@@ -370,8 +370,10 @@ class LearnedPrior(FlowPrior):
             self._expected = Expectation(there, tensor_of(picture / 255, device), tensor_of(tissue, device))
 
     def _next_motion(self, flow: Flow, guesses: list[Flow]) -> tuple[Flow, list[Weighted]]:
-        """Learn from the newest motion and predict the next one. Returns the prediction and the
-        weighted motions after similar moments, in pixels per interval.
+        """Learn mixing weights from the newest motion and predict the next one.
+
+        Returns:
+            The predicted motion, and the weighted motions that followed similar moments, in pixels per frame interval.
         """
         scale = np.float32(self._interval_s / REFERENCE_S)
         motion = np.asarray(flow / scale, np.float32)
@@ -380,7 +382,7 @@ class LearnedPrior(FlowPrior):
         self._moments.take(motion)
         similar = [(weight, np.asarray(each * scale, np.float32)) for weight, each in self._moments.next_motions()]
         of_similar = weighted_mean(similar) if similar else np.zeros_like(flow)
-        # Predictions are stored in the unit of the learned motions.
+        # Store the predictions as motion per `REFERENCE_S`, like the motions that they will be compared with.
         self._guesses = [np.asarray(each / scale, np.float32) for each in (moved(flow, flow), of_similar)]
         shares = self._shares.local(motion.shape)
         ahead = np.zeros_like(motion)

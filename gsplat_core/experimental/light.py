@@ -110,9 +110,9 @@ NEWEST = 0.2
 averaged equally.
 """
 LEAST_SEEN = 0.25
-"""Share of cells with enough well-exposed tissue below which a picture gives no depth."""
+"""Share of grid cells with enough well-exposed tissue below which a picture gives no depth."""
 ERROR = 0.05
-"""Standard deviation of log brightness caused by pigment and model errors."""
+"""Assumed standard deviation of a picture's log brightness that is caused by pigment and model errors instead of distance."""
 REACH = 0.05
 """Distance from usable cells at which the confidence halves, as a share of the picture's longer side."""
 UNSEEN = "too little of the picture is well exposed tissue for depth by shading"
@@ -216,7 +216,7 @@ def share_of_distance(grid: Grid, reliefs: Array) -> float:
 
 
 def shown(grid: Grid, relief: Array, share: float, look: Look, size: tuple[int, int]) -> DepthMap:
-    """Return the depth map of size [H, W] for a relief. `share` is the confidence in the relief as a whole, 0 to 1."""
+    """Return the depth map of height and width `size` for a relief. `share` is the confidence in the relief as a whole, 0 to 1."""
     logarithm = (Places.at(grid, *grid.middles()).value @ relief).reshape(grid.height, grid.width)
     return DepthMap(
         _enlarged(RELATIVE_DISTANCE * np.exp(logarithm), size),
@@ -227,7 +227,7 @@ def shown(grid: Grid, relief: Array, share: float, look: Look, size: tuple[int, 
 
 
 def _near_seen(shading: Shading) -> Array:
-    """Return weights [h, w]: 1 in observed cells, decaying to 0 with the distance from them."""
+    """Return confidence weights [h, w]: 1 in cells with usable pixels, decaying to 0 with the distance from them."""
     seen = shading.known.astype(np.uint8)
     away = cv2.distanceTransform(1 - seen, cv2.DIST_L2, cv2.DIST_MASK_PRECISE).astype(np.float64)
     return np.asarray(np.exp2(-away / (REACH * max(seen.shape))))
@@ -285,22 +285,22 @@ class Grid:
         return np.array([count for _, _, count in self.waves])
 
     def middles(self) -> tuple[Array, Array]:
-        """Return columns and rows of the cell centres [h, w], in cells."""
+        """Return the column and the row coordinates of all cell centres, both [h, w], in cells."""
         column, row = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)
         return column, row
 
 
 @dataclass(frozen=True)
 class Places:
-    """Positions in a picture with the values and derivatives of the cosines there."""
+    """Positions in a picture with the values and derivatives of the relief's cosine basis at them."""
 
     x: Array
     """Ray coordinate x / z at each position, [places]."""
     y: Array
     value: Array
-    """Values of the cosines, [places, cosines]."""
+    """Value of each basis cosine at each position, [places, cosines]."""
     by_x: Array
-    """Derivatives of the cosines by x, [places, cosines]."""
+    """Derivative of each basis cosine by the ray coordinate x at each position, [places, cosines]."""
     by_y: Array
 
     @classmethod
@@ -383,9 +383,11 @@ FINER_HALF_WAVES)²) ** (-FINER_POWER / 2).
 PIGMENT = 0.5
 """Prior standard deviation of the coarse cosines of remaining pigment, in units of `Shading.detail`."""
 PIGMENT_HALF_WAVES = 2.0
-"""Number of half waves beyond which the pigment's prior falls quadratically."""
+"""Number of half waves of a cosine beyond which the prior standard deviation of its pigment falls quadratically."""
 FALL_OFF, FALL_OFF_DEVIATION = 1.0, 0.5
-"""Prior mean and standard deviation of the vignetting exponent; 1 is a flat lamp."""
+"""Prior mean and standard deviation of the vignetting exponent: the power of the cosine of a ray's angle to the axis by which
+brightness falls off. 1 for a flat (Lambertian) lamp.
+"""
 CHANGE_ERROR = 0.02
 """Standard deviation of a cell's change of log brightness that motion does not explain."""
 CHANGES_TELL = 0.3
@@ -393,28 +395,30 @@ CHANGES_TELL = 0.3
 are correlated and carry no relief information.
 """
 RARER, RARER_DEVIATION = 12.0, 0.4
-"""Prior of the decay rate of highlights with the angle, per radian, and the standard deviation of its logarithm."""
+"""Prior median of the rate, per radian, at which highlights become rarer with the surface's angle to the lamp, and the prior
+standard deviation of the rate's logarithm.
+"""
 GLINT_LOOKS = 4.0
 """Effective number of independent highlight pictures; slowly moving tissue repeats highlights at the same positions."""
 GLINT_CELL_SHARE = 1 / 64
-"""Size of one highlight as a share of a cell."""
+"""Assumed size of one highlight as a share of a grid cell, by which shares of pixels are converted to numbers of highlights."""
 FEWEST_GLINTS = 0.3
 """Value added to the variance of a cell's number of highlights, so that it is not near 0."""
 BRIGHTNESS_LOOKS = 5
-"""Number of evenly spaced pictures whose brightness is used."""
+"""Number of pictures, evenly spaced in the window, whose brightness is used as a cue."""
 ROUNDS = 16
 ROUNDS_OF_CHANGE = 4
 ROUNDS_TO_SLOPES = 4
-"""Number of rounds over which the cosine term is faded in. The dependence on distance alone is linear in the unknowns,
-so the fit starts with it. Highlights are used after these rounds.
+"""Number of Gauss-Newton rounds over which the cosine of the incidence angle is faded into the brightness model. Brightness by
+distance alone is linear in the unknowns, so the fit starts with it. Highlights are used after these rounds.
 """
 DAMPING = 0.6
-"""Step size once highlights are used, because they make the problem strongly non-linear."""
+"""Factor on the Gauss-Newton steps once highlights are used, because they make the problem strongly non-linear."""
 
 
 @dataclass(frozen=True)
 class Reliefs:
-    """Relief at the key time, the reference of a window, and its change at all other times."""
+    """Reliefs of a window: cosine coefficients of log depth at the key time (the reference), and their change at other times."""
 
     key: Array
     """Coefficients at the key time, [cosines]."""
@@ -450,12 +454,12 @@ class Equations:
         self.pull = tell * (relief.T @ (weight * off) - gain @ self._right)
 
     def own_step(self, step: Array) -> Array:
-        """Return the step of the cue's own unknowns [M], given a step of the relief's coefficients [cosines]."""
+        """Return the Gauss-Newton step of the cue's own unknowns [M] for a step of the relief's coefficients [cosines]."""
         return np.asarray(self.inverse @ (self._right - self._mixed @ step))
 
 
 class Brightness:
-    """Brightness cue of several pictures with common pigment and light."""
+    """Cue from the brightness of several pictures, which have pigment and light in common."""
 
     def __init__(self, grid: Grid, shadings: Sequence[Cells], times: Sequence[int], counts: float) -> None:
         """Set up the brightness cue.
@@ -516,7 +520,7 @@ class Followed:
         self._finer, self._width, self._light = _finer(grid), CHANGE, 0.0
 
     def equations(self, key: Array, change: Array, slopes: float = 1.0) -> Equations:
-        """Return the linearised equations at the current relief and its change."""
+        """Return the cue's normal equations, linearised at the current relief `key` and its `change`."""
         before, after = appearance(self._before, key, slopes), appearance(self._after, key + change, slopes)
         off = self._brighter - (after.lit - before.lit) - self._light
         weight = self._weight / np.sqrt(1 + (off / CHANGE_ERROR) ** 2)

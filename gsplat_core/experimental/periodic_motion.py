@@ -52,7 +52,7 @@ NODES = 9, 8
 OUTSIDE = 0.15
 """Extension of the grid beyond the picture, as a share of its side."""
 AMPLITUDE = 0.04
-"""Prior standard deviation of the motion, relative to the tissue's distance."""
+"""Prior standard deviation of the motion's amplitudes, relative to the tissue's distance."""
 BEND = 0.008
 """Prior standard deviation of a node's vector from the mean of its neighbours, relative to the distance."""
 RELIEF = 0.5
@@ -62,7 +62,7 @@ SPREAD_PX = 0.5
 TRACK_PX = 0.35
 """Standard deviation of a tracked position in pixels."""
 TOGETHER = 3.0
-"""Number of consecutive observations that count as one, because errors of neighbouring times are correlated."""
+"""Number of consecutive observations of a point that count as one, because tracking errors of neighbouring times are correlated."""
 ALIKE = 3.0
 """Factor by which depth errors exceed those of independent points. Light that moves with the scope
 shifts neighbouring points alike.
@@ -73,15 +73,15 @@ NEAREST, FARTHEST = 0.25, 4.0
 
 @dataclass(frozen=True)
 class PeriodicMotion:
-    """Fitted motion of N points."""
+    """Fitted periodic motion of N tissue points: rest positions and a Fourier series of displacements."""
 
     frequencies_hz: tuple[float, ...]
     terms: Array
     """Rest position, then cosine and sine coefficients of each frequency, in the world [N, 3, 1 + 2 F]."""
     error: Array
-    """Relative standard deviation of each point's distance [N]."""
+    """Standard deviation of each point's distance, relative to the distance, [N]."""
     cost: float
-    """Mean robust cost; smaller is better."""
+    """Mean robust (Cauchy) cost of the reprojection errors; smaller is better."""
 
     def at(self, times_s: Array) -> Array:
         """Return the positions at times [T] in seconds, [T, N, 3]."""
@@ -126,7 +126,7 @@ def fitted(
 
 
 class _Fit:
-    """State of one Gauss-Newton fit of periodic motion."""
+    """Current estimate and precomputed terms of one Gauss-Newton fit of periodic motion."""
 
     def __init__(
         self, tracks: GridTracks, frequencies_hz: tuple[float, ...], begin: Array | None, nodes: tuple[int, int]
@@ -185,7 +185,7 @@ class _Fit:
         self._solve(H, g, errors)
 
     def _solve(self, H: Array, g: Array, errors: bool) -> None:
-        """Minimise the quadratic form (H, g) plus the priors."""
+        """Update the estimate to the minimum of the quadratic form with Hessian `H` and right side `g`, plus the priors."""
         pose = self._tracks.poses[self._middle]
         axis, count = pose[2, :3], len(H)
         known = 1 / (RELIEF * self._distance) ** 2
@@ -271,7 +271,7 @@ def _at_one_distance(tracks: GridTracks) -> Array:
     rotation = tracks.poses[:, :3, :3]
     turned = np.einsum("tij,nj->tni", rotation, along)
     moved = np.einsum("tij,nj->tni", rotation, centre) + tracks.poses[:, None, :3, 3]
-    # A point at the distance 1 / w along its first ray is at the observed pixel where c w = d.
+    # A point with the inverse depth w on its first observed ray projects to a later observed pixel if c w = d.
     c = moved[..., :2] - tracks.rays * moved[..., 2:]
     d = tracks.rays * turned[..., 2:] - turned[..., :2]
     c, d = c[tracks.seen], d[tracks.seen]
@@ -297,7 +297,7 @@ ROBUST_ROUNDS = 2
 
 
 def fitted_undisturbed(tracks: GridTracks, motion: PeriodicMotion) -> PeriodicMotion:
-    """Refit a motion without disturbed observations."""
+    """Refit a motion without observations whose neighbours deviate on average, such as those of tissue pulled by a tool."""
     for _ in range(ROBUST_ROUNDS):
         disturbed = together_px(off_px(motion.at(tracks.times_s), tracks), tracks) > SPREAD_PX
         left = tracks.seen & ~disturbed

@@ -42,9 +42,9 @@ x)) / SHOULDER. It differs between cameras.
 BESIDE_TOOLS = 0.07
 """Margin around tools excluded because of shadows, as a share of the longer side."""
 LEAST_KNOWN = 0.3
-"""Smallest share of usable pixels (tissue that is neither under- nor overexposed) of a known cell."""
+"""Smallest share of usable pixels (tissue that is neither under- nor overexposed) at which a grid cell counts as known."""
 LEAST_DETAIL = 0.01
-"""Lower bound of `Shading.detail`, the least noise of any picture."""
+"""Lower bound of `Cells.detail`: no picture has less noise of log brightness between neighbouring cells."""
 LEAST_RED = 0.1
 """Smallest excess of red over green and blue, relative to red, for the diffuse part to be usable."""
 GLINT = 0.35
@@ -137,7 +137,7 @@ def shading_in(picture: SmallPicture) -> Shading:
 
 
 def _steps(cells: NDArray[np.float64], share: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return differences of neighbouring known cells, [N] or [N, channels]."""
+    """Return the differences between horizontally and vertically neighbouring known cells, [N] or [N, channels]."""
     known = share >= LEAST_KNOWN
     across = (cells[:, 1:] - cells[:, :-1])[known[:, 1:] & known[:, :-1]]
     return np.concatenate([across, (cells[1:] - cells[:-1])[known[1:] & known[:-1]]])
@@ -200,7 +200,9 @@ def _shrunk(tissue: NDArray[np.uint8], margin_px: float) -> NDArray[np.uint8]:
 
 
 def _log_light() -> NDArray[np.float32]:
-    """Return the log light of each level [256]: inverse sRGB curve (IEC 61966-2-1), then inverse shoulder."""
+    """Return the logarithm of linear light for each 8-bit level [256]: inverse sRGB curve (IEC 61966-2-1), then the inverse of the
+    camera's highlight compression (`SHOULDER`).
+    """
     level = np.arange(256) / 255
     linear = np.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4)
     return np.log(np.maximum(-np.log1p(-SHOULDER * linear) / SHOULDER, 1e-4)).astype(np.float32)
@@ -210,7 +212,7 @@ _LOG_LIGHT = _log_light()
 RETURN_PX = 1.0
 """Largest accepted forward-backward error of the flow, in pixels."""
 MOST = 0.5
-"""Largest accepted change of a pixel's log brightness; larger changes are errors or shadows."""
+"""Largest change of a tracked pixel's log brightness that is used; larger changes are tracking errors or shadows."""
 LEAST_FOUND = 0.6
 """Smallest share of the key picture's tissue pixels that must be tracked for a usable comparison of two pictures."""
 WIDEST = 0.15

@@ -1,1 +1,1 @@
-"""Point tracks, surfaces, meshes, measurements and registration."""
+"""Geometry of pictures and models: point tracks through video, surface meshes, measurements, and registration to other surfaces."""

@@ -22,9 +22,9 @@ from gsplat_core.scene.frames import Frame
 LONGEST_PX = 320
 """Longest side of the compared pictures, in pixels."""
 SPACING_PX = 10
-"""Spacing of the grid, in pixels."""
+"""Distance between neighbouring points of the tracked grid, in pixels of the reduced picture."""
 DARK = 8
-"""Grey levels added before the logarithm, so that black regions have no texture."""
+"""Value added to grey levels (0 to 255) before the logarithm, so that noise in black regions is not texture."""
 BROAD_PX, CONTRAST_PX = 5.0, 10.0
 """Standard deviations in pixels of the high-pass filter that removes illumination, and of the
 window for the local contrast.
@@ -67,7 +67,7 @@ class GridTracks:
     focal_px: float
     """Focal length in pixels; converts ray errors to pixels."""
     extent: tuple[float, float]
-    """Half the picture's width and height, as rays."""
+    """Half the picture's width and height, in units of the focal length as `rays`."""
 
     def of(self, points: NDArray[Any] | slice, times: NDArray[Any] | slice = slice(None)) -> GridTracks:
         """Return the tracks of selected points, optionally at selected times only."""

@@ -23,17 +23,17 @@ from gsplat_core.scene.frames import UNKNOWN_ERROR
 from gsplat_core.transfers import HostCopy
 
 MOST_STEPS = 4096
-"""Largest number of steps into which a length along the surface is divided."""
+"""Largest number of straight pieces into which a path along the surface is divided."""
 STEP_PX = 2.0
-"""Length in pixels of the steps along the surface."""
+"""Distance in pixels between the sampled points of a path along the surface."""
 COMMON = 0.5
-"""Share of the variance of the depth source's error that is common to the whole scene."""
+"""Share of the variance of the depth source's error that is a scale error common to the whole scene."""
 SMOOTHED_SPLATS = 3.0
 """Standard deviation of the filter of depths along a path, in distances between neighbouring splats. Neighbouring splats
 have independent depth errors, which lengthen a path.
 """
 ROUGH_SHARE = 0.2
-"""Standard error of a length because of the filter, as a share of the length that the filter removed."""
+"""Additional standard error of a path's length, as a share of the length that the smoothing of its depths removed."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class SurfacePoint:
     opacity: float
     confidence: float
     along_ray: tuple[float, float, float]
-    """Derivative of the world position by z."""
+    """Derivative of the point's world position by its depth z, along the pixel's ray."""
 
     @property
     def position_error(self) -> float:

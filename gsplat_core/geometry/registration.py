@@ -141,12 +141,12 @@ def _middles(n: int) -> Array:
 
 
 TRIM = 0.8
-"""Share of the pairs of closest points that the registration uses, closest first."""
+"""Default share of the pairs of closest points that the registration uses; the most distant pairs are left out."""
 MOST_ROUNDS = 60
 SETTLED = 1e-6
 """Largest displacement of a point in one round, as a share of the surface's extent, below which the iteration ends."""
 MOST_POINTS = 5000
-"""Largest number of points used; larger sets are subsampled."""
+"""Largest number of points that the registration uses; larger sets are subsampled."""
 
 
 @dataclass(frozen=True)
@@ -252,7 +252,7 @@ def register(points: Array, surface: ClosestPoints, initial: Array | None = None
 
 
 def _step(here: Array, normals: Array, gaps: Array) -> Array:
-    """Return the small rigid motion that minimises point-to-plane distances."""
+    """Return the small rigid motion [4, 4] of points `here` that minimises their distances `gaps` along `normals`, to first order."""
     import cv2
 
     centre = here.mean(0)

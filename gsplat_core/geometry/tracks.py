@@ -250,7 +250,7 @@ class SmallPicture:
         )
 
     def shows(self, pixels: Points) -> NDArray[np.bool_]:
-        """Return which positions are inside the picture and trackable [N]."""
+        """Return a bool mask [N], True for pixel positions that are inside the picture and usable for tracking."""
         height, width = self.grey.shape
         column, row = (np.rint(np.nan_to_num(pixels[:, axis], nan=-1.0)).astype(np.int64) for axis in (0, 1))
         inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
@@ -311,7 +311,7 @@ class StreamTracks:
         self.numbers: Numbers = np.zeros(0, np.int64)
         """Numbers of the points, ascending."""
         self.first: Points = np.zeros((0, 2), np.float32)
-        """Positions where each point was first detected [N, 2]."""
+        """Pixel position at which each tracked point was first detected, [N, 2]."""
         self._next = 0
 
     def begin(self, picture: SmallPicture) -> None:
@@ -330,12 +330,12 @@ class StreamTracks:
         return self.numbers[trusted], moved[trusted]
 
     def go_on(self, picture: SmallPicture, numbers: Numbers, pixels: Points) -> None:
-        """Replace the tracker's state by a picture and the points found in it."""
+        """Make `picture`, with the points found in it, the last tracked picture; other points are dropped."""
         self.first = self.first[np.searchsorted(self.numbers, numbers)]
         self.picture, self.numbers, self.pixels = picture, numbers, pixels
 
     def keep(self, kept: NDArray[np.bool_]) -> None:
-        """Keep only the marked points."""
+        """Keep only the points marked True in `kept` [N]."""
         self.numbers, self.pixels, self.first = self.numbers[kept], self.pixels[kept], self.first[kept]
 
     def take_up(self) -> Numbers:
@@ -352,7 +352,7 @@ class StreamTracks:
         return new
 
     def adopt(self, numbers: Numbers, pixels: Points) -> None:
-        """Track known points as well, replacing tracked points at nearly the same position."""
+        """Continue with points known from earlier as well. Tracked points at nearly the same position are dropped."""
         near = np.linalg.norm(self.pixels[:, None] - pixels[None], axis=2).min(1, initial=np.inf) < SAME_PX
         self.keep(~near & ~np.isin(self.numbers, numbers))
         self._add(numbers, pixels)
@@ -365,36 +365,38 @@ class StreamTracks:
 
 
 EVERY = 20
-"""Number of pictures from one reference to the next."""
+"""Number of pictures from one reference picture to the next."""
 RENEWED = 0.4
-"""Share of found corners of the newest reference below which a new one starts earlier."""
+"""Share of the newest reference picture's corners that must be found; with fewer, the next reference starts earlier."""
 MOST_REFERENCES = 5
-"""Largest number of references that are tracked at once. The oldest one is dropped first."""
+"""Largest number of reference pictures whose corners are searched in each picture. The oldest one is dropped first."""
 MOST_CORNERS = 250
-"""Largest number of corners of a reference."""
+"""Largest number of corners detected in a reference picture."""
 LONGEST_SIDE = 640
 """Larger pictures are reduced to this longer side in pixels."""
 SMALLEST_SHARE = 0.7
-"""Smallest usable share of a tracked patch."""
+"""Smallest share of usable pixels in the patch around a tracked corner."""
 HALO_PX = 5
-"""Side of the square by which unusable areas are grown, in pixels."""
+"""Side in pixels of the square structuring element by which unusable areas are dilated."""
 REFERENCE_LEVELS = 2
 REFERENCE_RETURN_PX = 0.3
 """Largest accepted error of a point tracked forward and back, in pixels."""
 OFF_PX, OFF_MEDIANS = 1.0, 3.0
 """Distance from the smooth map from which a match is wrong: in pixels, and as a multiple of the median distance."""
 LEAST_FOUND = 24
-"""Fewest corners of a reference that must be found in a picture."""
+"""Fewest corners of a reference picture that must be found in another picture for the result to be used."""
 MOST_MISSES = 15
 """Largest number of consecutive pictures in which a reference is not found. After that it is dropped."""
 NODES = 16
-"""Number of nodes of the smooth map along each side."""
+"""Number of nodes, along each side of the picture, of the smooth map from a reference picture to another one."""
 REACH = 0.12
-"""Standard deviation of the map's smoothing kernel, as a share of the picture's longer side."""
+"""Standard deviation of the Gaussian that smooths the residuals of that map, as a share of the picture's longer side."""
 HELD = 0.5
-"""Weight of a residual of 0 in the mean of the residuals at a node; a match at the node has the weight 1."""
+"""Weight of zero in the weighted mean of matches' residuals at a node of the map, which pulls it to zero where matches are sparse. A
+match at the node has the weight 1.
+"""
 FLOOR = 0.02
-"""Contrast, as the standard deviation of logarithmic brightness, that is regarded as noise."""
+"""Local contrast (standard deviation of logarithmic brightness) below which structure counts as noise and is not amplified."""
 
 
 def local_contrast(grey: NDArray[np.uint8], usable: NDArray[np.bool_]) -> NDArray[np.uint8]:
@@ -473,7 +475,7 @@ class ReferenceTracks:
 
 
 class _Reference:
-    """Reference picture, its corners, and the map from it to the latest picture."""
+    """Reference picture with its corners and the smooth map of its pixels to the latest picture in which it was found."""
 
     def __init__(self, picture: NDArray[np.uint8], usable: NDArray[np.uint8], first: int) -> None:
         height, width = picture.shape
@@ -535,7 +537,7 @@ class _Reference:
         return self.numbers[kept], at[kept]
 
     def advance(self) -> None:
-        """Replace the map by the one to the picture of the last call of `found`."""
+        """Keep the map to the picture of the last call of `found` as the start for the next picture."""
         self._map = self._ahead
 
     def _at(self, values: NDArray[np.float32]) -> Points:
@@ -560,13 +562,13 @@ class _Reference:
 
 
 def _warped(values: NDArray[Any], at: NDArray[np.float32], interpolation: int) -> NDArray[Any]:
-    """Return values [H, W, ...] at the positions of a map [H, W, 2]."""
+    """Sample values [H, W, ...] at the pixel positions (x, y) of a map [H, W, 2]."""
     x, y = (np.ascontiguousarray(at[:, :, axis]) for axis in (0, 1))
     return np.asarray(cv2.remap(values, x, y, interpolation, borderMode=cv2.BORDER_REPLICATE))
 
 
 def _sampled(values: NDArray[np.float32], at: Points) -> Points:
-    """Return values [H, W, 2] interpolated at positions [N, 2]."""
+    """Return the values [N, 2] of a field [H, W, 2], interpolated linearly at pixel positions (x, y) [N, 2]."""
     if not len(at):
         return at
     x, y = (np.ascontiguousarray(at[:, axis : axis + 1], np.float32) for axis in (0, 1))
@@ -574,7 +576,9 @@ def _sampled(values: NDArray[np.float32], at: Points) -> Points:
 
 
 def _usable(inside: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return uint8 [H, W], 0 near the border, near unusable pixels, and where a patch has many of them."""
+    """Return a mask uint8 [H, W] of possible corners: 255, or 0 near the border, near unusable pixels and where the patch around a pixel
+    has many of them.
+    """
     usable = np.zeros(inside.shape, np.uint8)
     usable[BORDER_PX:-BORDER_PX, BORDER_PX:-BORDER_PX] = 255
     share = cv2.boxFilter(inside.astype(np.float32), -1, (PATCH_PX, PATCH_PX))

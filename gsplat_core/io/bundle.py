@@ -124,7 +124,7 @@ def load_bundle(folder: str | Path) -> Model:
     """
     folder = Path(folder)
     path = folder / TENSORS
-    if os.path.isfile(folder):  # False for impossible names, which the open below reports
+    if os.path.isfile(folder):  # False for names that the system does not support; opening the file below reports them
         raise BundleError(
             f"{folder} is a file, and a model is a folder with {TENSORS} and {MANIFEST}; give that folder"
         )
@@ -133,7 +133,7 @@ def load_bundle(folder: str | Path) -> Model:
             size = os.fstat(file.fileno()).st_size
             manifest = _manifest_for(folder, size)
             _check_size(path, _expected_tensors(path, manifest), file.read(8), size)
-            check_memory(path, 2 * size)  # the file's bytes, and the tensors made from them
+            check_memory(path, 2 * size)  # memory for the file's bytes, and for the tensors made from them
             file.seek(0)
             payload = file.read(size)
     except OSError as error:
@@ -271,7 +271,7 @@ def _check_tensors(path: Path, tensors: dict[str, Tensor], expected: dict[str, T
 
 def _check_finite(tensors: dict[str, Tensor], consequence: str) -> None:
     for name, tensor in tensors.items():
-        # A sum is finite only if all terms are, unless it overflows. Check the terms in that case.
+        # A sum is finite only if all terms are. Check the terms of a non-finite sum, because finite terms can overflow.
         if not bool(torch.isfinite(tensor.sum())):
             bad = int((~torch.isfinite(tensor)).sum())
             if bad:
@@ -290,27 +290,27 @@ COUNT = IntegerIn(0, 50_000_000)
 SH_DEGREE = IntegerIn(0, MAX_SH_DEGREE)
 TIME_S = NumberIn(-1e10, 1e10)
 LONGEST_WINDOW_S = LONGEST_RECORDING_S
-"""Longest time window of a model."""
+"""Longest accepted time window of a model, in seconds."""
 LONGEST_FIELD_WINDOW_S = 4 * LONGEST_WINDOW_S
-"""Longest time window of a deformation field, which may extend beyond the observed window."""
+"""Longest accepted time window of a deformation field in seconds; it may extend beyond the observed window."""
 SIDE_PX = IntegerIn(1, 16_384)
 MOST_PIXELS = 1 << 26
 FOCAL_PX = NumberIn(MIN_FOCAL_PX, MAX_INTRINSICS_PX)
 INTRINSICS_PX = NumberIn(-MAX_INTRINSICS_PX, MAX_INTRINSICS_PX)
 POSE = NumberIn(-1e9, 1e9)
 ROTATION_TOLERANCE = 2e-3
-"""Tolerance of the pose's R Rᵀ from the identity (per entry) and of its determinant from 1."""
+"""Largest deviation of R Rᵀ from the identity (per element), and of the determinant from 1, for the rotation R of a pose."""
 TENSOR_BYTES = IntegerIn(0, 1 << 40)
 PARAMETERS = IntegerIn(0, 1 << 38)
 DEPTH_ERROR, MOST_DEPTH_ERRORS = NumberIn(0, 1), 1024
 EXTRA_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
 MOST_EXTRA = 16
-"""Largest number of extra tensors."""
+"""Largest number of extra tensors (`Gaussians.extra`) in a bundle."""
 EXTRA_SIDE = IntegerIn(1, 1024)
 EXTRA_SIDES = 3
-"""Largest number of dimensions of an extra tensor after the first."""
+"""Largest number of dimensions of an extra tensor, not counting the dimension of the Gaussians."""
 RENDERER_VALUE = NumberIn(0.0, 1e30)
-"""Range of a value that a renderer has for the whole scene."""
+"""Accepted range of a renderer parameter that applies to the whole scene (`TrainedBy.values`)."""
 UNITS = {"length": ("mm",), "time": ("s",)}
 
 
@@ -333,7 +333,7 @@ class Manifest:
     """True if the Gaussians have separate colours for the right eye."""
     trained_by: TrainedBy = dataclass_field(default_factory=TrainedBy)
     extra: Mapping[str, tuple[int, ...]] = dataclass_field(default_factory=dict)
-    """Shapes of the extra tensors of a Gaussian by name."""
+    """Shapes of the extra tensors (`Gaussians.extra`) by name, without the dimension of the Gaussians."""
 
     def skeleton(self) -> tuple[Gaussians, DeformationField | None]:
         """Return Gaussians and field of the described shapes on the meta device, without memory."""

@@ -41,7 +41,7 @@ INTRINSICS = {"fx": FOCAL_PX, "fy": FOCAL_PX, "cx": CENTRE_PX, "cy": CENTRE_PX}
 
 @dataclass(frozen=True, eq=False)
 class Waypoint:
-    """Camera pose at a time."""
+    """Camera pose at a time of the path, optionally with intrinsics."""
 
     time_s: float
     camera_to_world: NDArray[np.float64]
@@ -172,6 +172,6 @@ def _turned(first: NDArray[np.float64], second: NDArray[np.float64], share: floa
 
     between, _ = cv2.Rodrigues(first.T @ second)
     part, _ = cv2.Rodrigues(share * between)
-    # Re-orthonormalise the product of rounded rotations.
+    # Orthonormalise the product again, because rounded rotations are not exactly orthogonal.
     u, _, v = np.linalg.svd(first @ part)
     return np.asarray(u @ v)

@@ -95,7 +95,7 @@ _RENAME_EXCHANGE = 2
 _AT_FDCWD = -100
 _NO_HARD_LINKS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK)
 _unfinished: set[Path] = set()
-"""Temporary files and folders of this process that are not yet renamed."""
+"""Temporary files and folders that this process has not yet renamed to their final name."""
 
 
 def remove_unfinished() -> None:
@@ -164,7 +164,9 @@ class PartialFile:
         """Remove the temporary file unless it is finished."""
         if self.path not in _unfinished:
             return
-        with contextlib.suppress(OSError):  # buffered bytes of a full disk are discarded anyway
+        with contextlib.suppress(
+            OSError
+        ):  # closing writes buffered bytes, which fails on a full disk; the file is discarded anyway
             self.file.close()
         self.path.unlink(missing_ok=True)
         _unfinished.discard(self.path)
@@ -246,7 +248,7 @@ def write_durably(path: Path, pieces: Iterable[bytes | memoryview]) -> None:
 
 
 def replace_durably(source: Path, target: Path) -> None:
-    """Rename over the target and sync the folder entry to disk."""
+    """Rename `source` to `target`, replacing an existing file, and sync the folder entry to disk."""
     os.replace(source, target)
     sync_folder(target.parent)
 
@@ -283,7 +285,7 @@ def _rename_to_new(source: Path, target: Path) -> None:
 
 
 def _exchanged(first: Path, second: Path) -> bool:
-    """Exchange two names atomically (Linux renameat2); False if unsupported."""
+    """Exchange the names of two files or folders atomically (Linux renameat2). Return False if the system does not support it."""
     try:
         renameat2 = ctypes.CDLL(None, use_errno=True).renameat2
     except (OSError, AttributeError, TypeError):

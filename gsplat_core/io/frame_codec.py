@@ -56,10 +56,10 @@ class ArrayFormat(NamedTuple):
     kind: str
     """Data type of the values, little-endian."""
     values: int
-    """Values per pixel; 0 for a matrix [4, 4]."""
+    """Number of values per pixel; 0 for the pose, which is a matrix [4, 4] and not a picture."""
 
     def shape(self, height_px: int, width_px: int) -> tuple[int, ...]:
-        """Return the shape in a frame of this size."""
+        """Return the array's shape in a frame of this size."""
         if self.values == 0:
             return 4, 4
         return (height_px, width_px) if self.values == 1 else (height_px, width_px, self.values)
@@ -143,7 +143,7 @@ class FrameFields(Record):
     right_camera: CameraRecord | None = None
     """Camera of the right eye; its pose maps left-camera coordinates to its own."""
     depth_origin: Origin | None = None
-    """None if the frame has no depth, or in recordings of earlier versions."""
+    """Origin of the depth, such as `stereo` or `learned`; None if the frame has no depth, or in recordings of earlier versions."""
     depth_error: NotNegative | None = None
     """Relative standard error of the depth; None if unknown, or in recordings of earlier versions."""
     arrived_ns: Nanoseconds | None = None
@@ -185,7 +185,7 @@ def arrays_of(frame: Frame, names: Iterable[_Name]) -> dict[_Name, NDArray[Any]]
 
 
 def fields_of(frame: Frame) -> dict[str, Any]:
-    """Return the values of `FrameFields` for a frame. Long texts are cut."""
+    """Return the values of a frame for the fields of `FrameFields`, by name. Long texts are cut."""
     return {
         "status": frame.status,
         "damage": short(frame.damage),
@@ -204,7 +204,7 @@ def short(text: str | None) -> str | None:
 
 
 def frame_from(seq: int, pts_ns: int, fields: FrameFields, arrays: Mapping[str, NDArray[Any]], **changes: Any) -> Frame:
-    """Create a frame from its parts.
+    """Create a frame from its fields and arrays.
 
     Args:
         seq: sequence number.
@@ -332,7 +332,7 @@ def _packed(
 
 
 _Announced = list[tuple[str, tuple[int, ...], int]]
-"""Name, shape and size in bytes of each array that a header announces."""
+"""Field name, shape and size in bytes of each array of a message, according to the message's header."""
 
 
 def _announced(data: memoryview, names: Iterable[str], max_pixels: int) -> tuple[int, int, int, _Announced]:

@@ -60,7 +60,7 @@ def check_memory(path: Path, needed: int) -> None:
 
 
 BLOCK_BYTES = 4 << 20
-"""Size of the blocks in which rows are read and written."""
+"""Size in bytes of the blocks in which rows of Gaussians are read and written."""
 MOST_THREADS = 8
 
 
@@ -127,10 +127,10 @@ def gaussians_of(
 
 
 LEAST_OPACITY = 1e-4
-"""Opacity of the byte 0; 1 minus this value is the opacity of 255, so that both have finite logits."""
+"""Opacity to which the stored byte 0 is converted. The byte 255 becomes 1 minus this value, so that both have finite logits."""
 
 
 def logit_of_bytes(opacities: NDArray[np.integer[Any]]) -> NDArray[np.float32]:
-    """Convert opacities of 0 to 255 to logits."""
+    """Convert opacities stored as bytes 0 to 255 to logits."""
     share = np.clip(np.arange(256) / 255.0, LEAST_OPACITY, 1 - LEAST_OPACITY)
     return np.log(share / (1 - share)).astype(np.float32)[opacities]

@@ -23,15 +23,15 @@ WIDTH_PX, HEIGHT_PX = 640, 512
 FIELD_OF_VIEW = 0.9
 """Height of the area that the default camera of a splat file sees at a distance, divided by that distance."""
 SHOWN_SHARE = 0.9
-"""Share of the Gaussians inside the sphere that sets the default camera's distance. The picture is as high as the sphere
-at the distance of its centre.
+"""Share of the Gaussians inside the sphere that determines the default camera's distance; the others are outliers. The sphere fills
+the height of the picture.
 """
 WINDOW_S = (0.0, 4.0)
-"""Time window in seconds of a splat file: one turn of an orbit."""
+"""Time window in seconds that a splat file, which has no time, gets as a model: the duration of one turn of an orbit."""
 LEAST_RADIUS = 0.02
 """Smallest displayable scene radius, in the file's unit, because of the near plane of the rasterizer."""
 MOST_PLACED = 1_000_000
-"""Largest number of Gaussians from which the default camera is computed; of more, every k-th is used."""
+"""Largest number of Gaussians from which the default camera is computed. In a larger file, only every k-th Gaussian is used."""
 MOST_COORDINATE = 1e9
 MOST_LOG_SCALE = 20.0
 
@@ -75,11 +75,11 @@ def load_splat(path: Path) -> Gaussians:
 
 
 READERS: Mapping[str, Callable[[Path], Gaussians]] = {".ply": load_ply, ".splat": load_splat, ".spz": load_spz}
-"""Readers of splat files by suffix."""
+"""Function that reads the Gaussians of a splat file, by the suffix of the file name."""
 
 
 def is_scene_file(path: Path) -> bool:
-    """Return True for the suffix of a splat file, which has neither camera nor time."""
+    """Return True if the path has the suffix of a splat file, which has Gaussians but neither camera nor time."""
     return path.suffix.lower() in READERS and not path.is_dir()
 
 

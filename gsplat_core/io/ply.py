@@ -139,7 +139,7 @@ def _columns(names: Sequence[str], wanted: Sequence[str]) -> slice | list[int]:
 
 
 def _float_table(rows: NDArray[np.void]) -> NDArray[np.float32]:
-    """Return all properties as columns [N, P], without a copy if all are float32."""
+    """Return all properties of N rows as the columns of a table [N, P], without a copy if all are float32."""
     names = rows.dtype.names or ()
     if all(rows.dtype[name] == np.dtype("<f4") for name in names):
         return rows.view("<f4").reshape(len(rows), len(names))
@@ -163,14 +163,14 @@ def _check_finite(
 
 
 CHUNK = 256
-"""Number of Gaussians with common bounds."""
+"""Number of consecutive Gaussians of a compressed file that share the bounds of their values."""
 BOUNDS = [
     *(f"{end}_{axis}" for end in ("min", "max") for axis in "xyz"),
     *(f"{end}_scale_{axis}" for end in ("min", "max") for axis in "xyz"),
     *(f"{end}_{channel}" for end in ("min", "max") for channel in "rgb"),
 ]
 WITHOUT_COLOUR = 12
-"""Number of bounds in files without colour bounds."""
+"""Number of bounds per chunk in early compressed files, which have none for colours: those of position and log-scale."""
 PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
 COMPRESSED_REST_COUNTS = REST_COUNTS[1:4]
 """Numbers of `sh` properties of SH degrees 1 to 3."""
@@ -198,7 +198,7 @@ def read_compressed(descriptor: int, path: Path, elements: list[Element], start:
     count, rest = vertices.count, 0 if harmonics is None else len(harmonics.names)
     check_memory(path, count * 4 * (14 + rest) + chunks.nbytes)
     bounds = np.zeros((chunks.count, len(BOUNDS)), np.float32)
-    bounds[:, 15:18] = 1  # colours of files without colour bounds
+    bounds[:, 15:18] = 1  # maximum of colours in early files without colour bounds; the minimum is 0
 
     def take_bounds(first: int, rows: NDArray[np.void]) -> None:
         for i, name in enumerate(chunks.names):
@@ -265,7 +265,7 @@ def _all(element: Element, kind: str) -> bool:
 
 
 def _between(bounds: NDArray[np.float32], share: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Interpolate between minima (first three columns) and maxima of each chunk."""
+    """Return values at the share (0 to 1) between the minima (first three columns of `bounds`) and the maxima of their chunks."""
     return np.asarray(bounds[:, :3] * (1 - share) + bounds[:, 3:] * share, np.float32)
 
 
@@ -381,7 +381,7 @@ SCALAR_TYPES = {
     **dict.fromkeys(("double", "float64"), "<f8"),
 }
 FOLLOWING = {None: ("vertex", "chunk"), "chunk": ("vertex",), "vertex": ("sh",)}
-"""Names of the elements that may follow an element; None stands for the start of the file."""
+"""Names of the PLY elements that may follow an element, by that element's name; None stands for the start of the file."""
 
 
 @dataclass(frozen=True)
@@ -417,7 +417,7 @@ def header_lines(elements: list[tuple[str, int, list[str]]]) -> list[str]:
 
 
 def read_header(file: BinaryIO, path: Path) -> list[Element]:
-    """Parse the header and leave the file at the first row.
+    """Parse the header of a PLY file and leave the file position at the first row.
 
     Returns:
         One element (`vertex`), or two to three (`chunk`, `vertex`, `sh`). Further elements are not read.

@@ -32,9 +32,9 @@ CLUSTERS = 1 << 16
 CENTROID_BITS = 6
 KMEANS_STEPS = 5
 COARSE = 256
-"""Number of clusters of the first k-means step, each of which is divided further."""
+"""Number of clusters in the first level of the two-level k-means; each of them is divided further."""
 KMEANS_ROWS = 1 << 24
-"""Bound of the number of distances computed at a time."""
+"""Largest number of distances between rows and centroids that k-means computes at a time, to bound memory."""
 _PICTURES = {"means": 16, "scales": 8, "quats": 8, "opacities": 8, "sh0": 8}
 """Bits per value of the tensors that are stored as pictures."""
 _CLUSTERED = "shN"
@@ -218,6 +218,6 @@ def _read_png(path: Path) -> NDArray[np.uint8]:
 
 
 def _swapped(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Exchange red and blue, which OpenCV stores in the other order."""
+    """Exchange the red and blue channels, because OpenCV reads and writes pictures as BGR."""
     order = [2, 1, 0, 3][: picture.shape[-1]]
     return np.ascontiguousarray(picture[..., order])

@@ -113,10 +113,12 @@ class ZstdStream:
 
 MAGIC = b"NGSP"
 VERSIONS = (2, 3)
-"""Versions of the format that are stored in a gzip stream."""
+"""Versions of the `.spz` format that are stored in a gzip stream; these are also written."""
 ZSTD_VERSION = 4
 HEADER_4 = struct.Struct("<4sIIBBBBI12x")
-"""Magic, version, count, degree of the harmonics, fractional bits, flags, number of streams, offset of their table."""
+"""Header of version 4: magic, version, count, degree of the harmonics, fractional bits, flags, number of streams and offset of
+their table.
+"""
 MOST_ZSTD = 20_000
 """Largest plausible ratio of decompressed to compressed size of a Zstandard stream. Equal bytes are compressed by more
 than 1,000.
@@ -129,7 +131,9 @@ GZIP_START = b"\x1f\x8b\x08\x10" + bytes(4) + b"\x00\xff" + MARK + b"\0"
 MOST_DEFLATED = 1032
 """Largest ratio of decompressed to compressed size of the deflate algorithm."""
 MOST_EXTENSIONS = 1 << 24
-"""Largest size in bytes of data after the arrays that is checked."""
+"""Largest number of bytes after the arrays (extensions) that are skipped to reach the stream's checksum; beyond it, the checksum is
+not verified.
+"""
 COLOUR_SCALE = 0.15
 MOST_FRACTIONAL_BITS = 23
 HALF_TURN = np.array([1.0, -1.0, -1.0], np.float32)

@@ -101,7 +101,7 @@ def _read_stl(data: bytes) -> TriangleMesh:
         corners = np.array([[float(word) for word in words[k + 1 : k + 4]] for k in at], np.float64).reshape(-1, 3)
     if len(corners) % 3 or not len(corners):
         raise ValueError(f"it has {len(corners)} corners, which are no triangles")
-    # STL repeats corners per triangle. Merge corners at the same position.
+    # STL stores the corners of each triangle separately. Merge corners at the same position to one vertex.
     vertices, numbers = np.unique(corners, axis=0, return_inverse=True)
     return TriangleMesh(vertices, numbers.reshape(-1, 3).astype(np.int64))
 

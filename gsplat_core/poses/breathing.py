@@ -43,14 +43,14 @@ from gsplat_core.poses.se3 import exp, inverse, log
 
 BREATHING_HZ, HEART_HZ = (0.1, 0.8), (0.8, 3.0)
 LEAST_CYCLES, FEWEST_TRIED = 1.5, 0.5
-"""Breathing cycles that the recording must contain for a frequency to be accepted, and to be tried. A smooth scope
+"""Fewest breathing cycles in the recording for a frequency to be accepted, and for it to be tried. A smooth scope
 trajectory explains a motion of less than `LEAST_CYCLES` equally well. Slower frequencies are still tried, because
 otherwise twice their value would be selected.
 """
 STEP_CYCLES = 0.25
 """Spacing of the tried breathing frequencies, in cycles over the recording; twice that for the heart."""
 SPREAD = 0.007
-"""Scale of the robust loss of ray errors (x / z) in the search of frequencies."""
+"""Scale of the robust loss of ray errors (tangents x / z) in the search of frequencies."""
 ROUNDS = 3
 BREATHES, BEATS = 0.75, 0.94
 """Largest accepted ratio of the cost with all frequencies to that of the static model, and of the cost with a heart
@@ -60,7 +60,7 @@ frequency to the median over all tried heart frequencies, because any extra freq
 
 @dataclass(frozen=True)
 class _Try:
-    """Bundle adjusted with one set of frequencies, and its cost."""
+    """Candidate in the search of frequencies: a bundle adjusted with motion of these frequencies, and its robust cost."""
 
     hz: tuple[float, ...]
     bundle: MovingBundle
@@ -110,7 +110,7 @@ def frequencies_of(start: MovingBundle, times_s: Tensor, fastest_hz: float = HEA
 
 
 def _tried(start: MovingBundle, times_s: Tensor, hz: tuple[float, ...], rounds: int) -> _Try:
-    """Adjust a bundle with the frequencies `hz`. The start bundle contains all of their waves, or all but the last."""
+    """Adjust a bundle with motion of the frequencies `hz`. `start` has motion of the same frequencies, or of all but the last."""
     return _Try(hz, *adjust(with_waves(start, waves(times_s, hz)), SPREAD, rounds))
 
 
@@ -125,8 +125,8 @@ def _breath_of(breaths: Sequence[_Try], length_s: float) -> _Try | None:
 
 
 def _local_minima(tries: Sequence[_Try]) -> list[_Try]:
-    """Return the tries with a lower cost than both neighbours. A minimum at the end of the band
-    belongs to a frequency outside it.
+    """Return the candidates whose cost is not higher than that of both neighbouring frequencies. The ends of the band are left out,
+    because a minimum there belongs to a frequency outside it.
     """
     inner = zip(tries, tries[1:], tries[2:], strict=False)
     return [each for before, each, after in inner if each.cost <= min(before.cost, after.cost)]
@@ -186,11 +186,11 @@ def _line(prior: TrajectoryPrior, swings: Tensor, y: Tensor, axis: int) -> Tenso
 
 
 EVERY_S = 0.2
-"""Average time between the frames that are used, in seconds; longer if they would be more than `MOST_FRAMES`."""
+"""Average time in seconds between the frames that are adjusted; longer if there would be more than `MOST_FRAMES` of them."""
 FEWEST_FRAMES, MOST_FRAMES = 40, 150
 LONGEST_S = 60.0
 POINTS, LEAST_SEEN = 400, 5
-"""Number of points used, most often observed first, and the least number of observations of each."""
+"""Largest number of points that are adjusted, those with the most observations, and the least number of observations of each."""
 FEWEST_POINTS = 60
 NEAREST, FARTHEST = 0.5, 2.0
 """Range of accepted initial depths relative to the median depth. Points outside it start at the median depth."""
@@ -204,7 +204,7 @@ FEW_POINTS, FEW_FRAMES, FEW_NODES = 200, 100, 16
 aliasing at their rate resembles a heartbeat.
 """
 SAMPLED = 0.4
-"""Highest frequency searched, as a share of the frame rate."""
+"""Highest frequency of tissue motion that is searched, as a share of the frame rate, to avoid aliasing."""
 LEAST_SHARED, PLACE_ROUNDS = 24, 10
 """Fewest observations of moving points for refining the pose of an intermediate frame, and the number of adjustment
 steps for it.

@@ -25,10 +25,10 @@ from gsplat_core.poses.se3 import exp
 
 State = TypeVar("State")
 DONE = 1e-6
-"""Relative decrease of the cost below which the iteration ends."""
+"""Decrease of the cost by a step of `descend`, relative to the cost, below which the iteration ends."""
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-9, 1e4
 EASIER, HARDER = 5, 8
-"""Divisor of the damping after a successful step, and its factor after a rejected one."""
+"""Divisor of the Levenberg-Marquardt damping after a successful step, and factor on it after a rejected step."""
 
 
 def descend(
@@ -38,7 +38,7 @@ def descend(
     rounds: int,
     damping: float = FIRST_DAMPING,
 ) -> tuple[State, float]:
-    """Minimise a cost with damped steps.
+    """Minimise a cost with damped steps (Levenberg-Marquardt): a step that does not lower the cost is rejected.
 
     Args:
         start: start state.
@@ -93,10 +93,10 @@ def diagonal_of(blocks: Tensor) -> Tensor:
 
 
 SPREAD_PX = 1.0
-"""Smallest Cauchy scale in pixels, used in the last rounds."""
+"""Smallest Cauchy scale of reprojection errors in pixels in `placed`, used in its last rounds."""
 ROUNDS, LAST_ROUNDS = 8, 3
 PLACEMENT_DONE = 1e-5
-"""Step length, in radians plus translation relative to the median depth, below which the iteration ends."""
+"""Length of a pose step below which `placed` ends: rotation in radians plus translation relative to the median depth."""
 Array = NDArray[np.float64]
 
 
@@ -177,7 +177,7 @@ behind the camera are clamped to it.
 
 @dataclass(frozen=True)
 class Bundle:
-    """Cameras, points and observations; all float64."""
+    """Bundle adjustment problem: camera poses, points and observations; floating-point tensors are float64."""
 
     poses: Tensor
     """World-to-camera poses [C, 4, 4]."""

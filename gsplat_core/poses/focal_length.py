@@ -30,7 +30,7 @@ SHORTEST, LONGEST = 0.6, 1.6
 CANDIDATES = 8
 """Number of focal lengths tried between the bounds, in equal ratios, before the refinement."""
 REFINEMENTS = 4
-"""Number of focal lengths evaluated by the golden-section search, two per step."""
+"""Number of focal lengths that the golden-section search tries after the candidates, two per step."""
 NEARLY_AS_WELL = 0.01
 """Relative increase of the error up to which a focal length is as plausible as the best one. Tissue motion alone
 changes the error by this much.
@@ -39,7 +39,7 @@ WIDEST = 1.5
 """Largest ratio of the plausible range's ends for the focal length to count as known."""
 KEY_FRAMES = 20
 LEAST_SEEN = 3
-"""Fewest key frames in which a point must be observed."""
+"""Fewest key frames in which a point must be observed to be used for the focal length."""
 LEAST_POINTS = 50
 ROUNDS = 60
 OUTLIER_PX = (4.0, 3.0)
@@ -109,7 +109,7 @@ def with_focal_length(camera: Camera, focal_px: float) -> Camera:
 
 @dataclass(frozen=True)
 class _Try:
-    """Adjusted scene for one focal length with its robust cost."""
+    """Candidate focal length: the scene adjusted with it, and the robust cost."""
 
     bundle: Bundle
     cost: float

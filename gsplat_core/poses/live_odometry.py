@@ -90,9 +90,9 @@ FEWEST_POINTS = 20
 recognised.
 """
 FITS_PX = 4.0
-"""Largest reprojection error of a point that fits, in pixels."""
+"""Largest reprojection error, in pixels, at which a point counts as fitting the estimated pose."""
 FITTING = 0.4
-"""Share of the points that must fit for a frame to be placed."""
+"""Share of the tracked points that must fit the estimated pose (`FITS_PX`) for a frame to be placed."""
 GIVEN_UP_PX = 8.0
 """Reprojection error in pixels above which a point is no longer tracked."""
 MOVED_PX = 16.0
@@ -122,7 +122,7 @@ MATCHED_KEYS, NEAR_KEYS = 2, 12
 MATCHED_WHEN_LOST = 5
 """Number of key frames matched by features when a frame could not be placed."""
 MOST_LEFT = 2
-"""Number of earlier maps whose key frames are kept for recognition."""
+"""Number of earlier maps, abandoned when tracking was lost, whose key frames are kept for recognition."""
 CORRECTED_PX = 1.0
 """Median error of a recognised key frame's points from which the poses since then are corrected, in
 pixels. Bundle adjustment handles smaller errors.
@@ -343,7 +343,7 @@ class LiveOdometry:
 WINDOW = 12
 """Number of newest key frames whose poses are adjusted."""
 ANCHORS = 5
-"""Number of earlier key frames sharing points with the window that are kept fixed."""
+"""Number of earlier key frames sharing points with the newest ones whose poses are fixed in the adjustment."""
 MOST_KEY_FRAMES = 40
 """Largest number of key frames. Beyond it, the key frame whose camera is nearest to that of another one is removed. The
 first key frame and the newest `WINDOW` are kept.
@@ -351,9 +351,9 @@ first key frame and the newest `WINDOW` are kept.
 NEIGHBOURS = 5
 """Number of known points around a new point whose median depth initialises it."""
 MOST_SIGHTINGS = 1500
-"""Number of observations whose adjustment takes one step; fewer are adjusted in several, up to `MOST_ROUNDS`."""
+"""Number of observations with which a bundle adjustment does a single step. Fewer observations get more steps, up to `MOST_ROUNDS`."""
 MOST_ROUNDS = 5
-"""Largest number of steps of an adjustment."""
+"""Largest number of Levenberg-Marquardt steps of one bundle adjustment of the newest key frames."""
 
 
 @dataclass
@@ -393,7 +393,7 @@ class LocalMap:
         return self._points[torch.from_numpy(np.searchsorted(self._numbers, numbers))]
 
     def knows(self, numbers: Numbers) -> NDArray[np.bool_]:
-        """Return which of the points are in the map, bool [N]."""
+        """Return a bool mask [N], True for the point numbers that are in the map."""
         return np.isin(numbers, self._numbers)
 
     def add_points(self, numbers: Numbers, places: Tensor) -> None:
@@ -493,7 +493,7 @@ class LocalMap:
             self._rescale(chosen[0], float(before / self._depth_of(chosen[0])))
 
     def _anchors(self, window: list[KeyFrame]) -> list[KeyFrame]:
-        """Return the key frames before the window that share the most points with it."""
+        """Return the key frames, older than the `window` of newest ones, that share the most points with it."""
         seen = np.unique(np.concatenate([key.numbers for key in window]))
         before = self.keys[: -len(window)]
         shared = [int(np.isin(key.numbers, seen).sum()) for key in before]

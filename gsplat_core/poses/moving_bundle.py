@@ -32,11 +32,11 @@ from gsplat_core.poses.bundle import FIRST_DAMPING, descend, diagonal_of, ray_de
 from gsplat_core.poses.se3 import exp, hat, log
 
 LENGTHS_S = (0.6, 0.8, 1.0, 1.3, 1.7, 2.2, 2.8, 3.6, 4.6, 6.0, 8.0, 12.0)
-"""Candidate kernel lengths in seconds."""
+"""Candidates for the correlation length in seconds of the Gaussian process of the trajectory (Matérn kernel)."""
 NOISES = (0.003, 0.01, 0.03, 0.1)
-"""Candidate noise levels relative to the amplitude of the trajectory."""
+"""Candidates for the noise of the trajectory's Gaussian process, relative to its amplitude."""
 PLACES, TURNS = slice(0, 3), slice(3, 6)
-"""Slices of the coordinates that share a kernel: positions and rotations."""
+"""Slices of the six camera coordinates, positions and rotations; each group has one kernel of the trajectory's Gaussian process."""
 
 
 @dataclass(frozen=True)
@@ -134,10 +134,13 @@ class _Smoothness:
     triangle: Tensor
     """Triangular QR factor of the columns [1, waves], whitened by `factor`, [1 + B, 1 + B]."""
     scale: Tensor
-    """Variance of each pose coordinate in the trajectory prior, [6]."""
+    """Variance of each camera coordinate in the trajectory prior, by which the kernel matrix is multiplied, [6]."""
 
     def precision(self, one: Tensor) -> Tensor:
-        """Return the precision matrices [6, C, C] with a free constant offset."""
+        """Return the precision matrices [6, C, C] of the camera coordinates, for which a constant offset costs nothing.
+
+        `one` is a column of ones [C, 1].
+        """
         inverse = torch.cholesky_inverse(self.factor)
         inverse = inverse - (inverse @ one) @ (one.T @ inverse) / inverse.sum()
         return inverse / self.scale[:, None, None]
@@ -160,20 +163,22 @@ LOCAL = 0.03
 LENGTH = 0.3
 """Correlation length of the local part of the motion field, in units of the median depth."""
 APART = 0.13
-"""Smallest distance between nodes; larger if it would give more than `MOST_NODES`."""
+"""Smallest distance between nodes of the motion field, in units of the median depth. Larger if there would be more than
+`MOST_NODES` nodes.
+"""
 MOST_NODES = 32
 JITTER = 1e-6
-"""Diagonal regularisation as a share of the mean variance."""
+"""Share of the mean variance that is added to the diagonal of the nodes' covariance, so that it can be inverted."""
 
 
 @dataclass(frozen=True)
 class SurfaceField:
-    """Nodes on the tissue surface that carry a smooth vector field, and the prior of the field."""
+    """Nodes on the tissue surface at which a smooth field of motion vectors is given, and the prior of the field."""
 
     nodes: Tensor
     """Positions of the field's nodes, [M, 3]."""
     middle: Tensor
-    """Median position of the points [3]."""
+    """Median of the point positions from which the nodes were selected, [3]."""
     stiffness: Tensor
     """Inverse covariance [M, M]; v' stiffness v / 2 is the negative log prior of values v at the nodes."""
 
@@ -202,7 +207,7 @@ def _settled(covariance: Tensor) -> Tensor:
 
 
 def _spread(points: Tensor, middle: Tensor, most: int) -> Tensor:
-    """Return points selected by farthest-point sampling, starting nearest to the middle."""
+    """Return at most `most` points selected by farthest-point sampling, starting with the one nearest to `middle`."""
     chosen = [int((points - middle).norm(dim=1).argmin())]
     away = (points - points[chosen[0]]).norm(dim=1)
     while len(chosen) < most and float(away.max()) > APART:
@@ -226,7 +231,9 @@ if there is no trajectory prior.
 
 
 RATE, RATE_PERIODS = (0.5, 0.03), (1 / 6, 2.0)
-"""Breathing and heart: relative standard deviation of the rate, and its correlation time in mean periods."""
+"""Prior of the changing breathing rate and heart rate (in this order): standard deviation relative to the mean rate, and correlation
+time in mean periods.
+"""
 PHASE = 1.0
 """Prior standard deviation of the phases from those of a constant rate, in radians."""
 OFFSET = 0.05
@@ -240,7 +247,7 @@ class Rhythm:
     """Phases of the waves, and their Gaussian prior: a random walk around the phase of a constant rate."""
 
     phases: Tensor
-    """Phases in radians [C, F]."""
+    """Estimated phase of each frequency at each camera's time, in radians, [C, F]."""
     expected: Tensor
     """Phases of a constant rate in radians [C, F]."""
     precision: Tensor
@@ -271,7 +278,7 @@ class Rhythm:
 
     @property
     def slopes(self) -> Tensor:
-        """Derivatives of the waves by their phase, [C, F, 2]."""
+        """Derivatives of the waves (cosine and sine of a phase) by the phase, [C, F, 2]."""
         return torch.stack([-self.phases.sin(), self.phases.cos()], 2)
 
     def pull(self) -> Tensor:
@@ -283,7 +290,7 @@ class Rhythm:
         return 0.5 * float(((self.phases - self.expected) * self.pull()).sum())
 
     def moved(self, change: Tensor) -> Rhythm:
-        """Change the phases [C, F] by at most `MOST_TURN`."""
+        """Return the rhythm with its phases changed by `change` [C, F], limited to `MOST_TURN` radians."""
         return replace(self, phases=self.phases + change.clamp(-MOST_TURN, MOST_TURN))
 
 
@@ -302,7 +309,7 @@ MOST_TURN = 0.7
 
 @dataclass(frozen=True)
 class MovingBundle:
-    """Cameras, moving points and observations; all float64."""
+    """Bundle adjustment problem: camera poses, periodically moving points and their observations; all float64."""
 
     poses: Tensor
     """World-to-camera poses [C, 4, 4]; the first one is fixed."""
@@ -379,7 +386,7 @@ def _cost(bundle: MovingBundle, spread: float, prior: TrajectoryPrior | None) ->
 
 
 def _in_unit(bundle: MovingBundle) -> MovingBundle:
-    """Rescale to the median depth of the rest positions as the unit of length."""
+    """Return the bundle with lengths divided by the median depth of the rest positions, which becomes the unit."""
     unit = bundle.rest[:, 2].median().abs()
     poses = bundle.poses.clone()
     poses[:, :3, 3] /= unit
@@ -397,7 +404,7 @@ def _residuals(bundle: MovingBundle) -> tuple[Tensor, Tensor, Tensor]:
 
 @dataclass(frozen=True)
 class _Places:
-    """Blocks of the normal equations for eliminating the rest positions."""
+    """Blocks of the normal equations with which the points' rest positions are eliminated (Schur complement)."""
 
     inverse: Tensor
     """Inverses of the diagonal blocks of the rest positions, [P, 3, 3]."""

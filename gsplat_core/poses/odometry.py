@@ -70,7 +70,7 @@ POSE_ROUNDS, ROUNDS = 10, 25
 FLAT_PX = 33.0
 """Prior for similar depths of all points: a deviation of 100 % from the median costs as much as this error in pixels."""
 GROWTH = 1.3
-"""Growth factor of the number of key frames from one bundle adjustment to the next."""
+"""Factor by which the number of key frames must have grown since the last bundle adjustment for the next one."""
 
 
 @dataclass(frozen=True)
@@ -185,7 +185,7 @@ class _Odometry:
         return runs[errors.index(min(errors))]._completed(separate_breathing)
 
     def _completed(self, separate_breathing: bool) -> Trajectory:
-        """Return the estimate. Lost frames get the pose of the frame before."""
+        """Return the trajectory with all results. Frames that could not be placed get the pose of the frame before."""
         moving = self._refined_for_breathing() if separate_breathing else None
         if moving is not None:
             self._poses = moving.poses
@@ -223,7 +223,7 @@ class _Odometry:
         return float(torch.log1p(errors_px(self._whole()).square()).sum())
 
     def _whole(self) -> Bundle:
-        """Return the bundle of all frames and their known points."""
+        """Return the bundle adjustment problem of all frames and the points of known position."""
         chosen = self._known[self._point]
         return Bundle(
             self._poses, self._points, self._frame[chosen], self._point[chosen], self._rays[chosen], self._focal
@@ -233,7 +233,7 @@ class _Odometry:
         return slice(int(self._bounds[frame]), int(self._bounds[frame + 1]))
 
     def _place(self, frame: int) -> bool:
-        """Optimise a frame's pose with the known points. Returns False if there are too few."""
+        """Optimise a frame's pose with the points of known position. Returns False if the frame observes too few of them."""
         here = self._of(frame)
         known = self._known[self._point[here]]
         if int(known.sum()) < LEAST_POINTS:
@@ -381,7 +381,11 @@ class MotionTest:
 
 
 def _share(pairs: Collection[tuple[float, float]]) -> float | None:
-    """Return the median share of pairs of median motion and rest; None if the pictures hardly move."""
+    """Return the median over pairs of frames of the share of squared motion that a homography explains.
+
+    None if the pictures hardly move. Each pair has the median motion of its corners and the median motion that remains
+    (`_compared`), in pixels.
+    """
     if not pairs or median(motion for motion, _ in pairs) < LEAST_MOTION * LONGEST_PX:
         return None
     return median(1 - (rest / max(motion, 1e-9)) ** 2 for motion, rest in pairs)
@@ -432,7 +436,7 @@ class CameraPath:
     poses: NDArray[np.float64]
     """World-to-camera poses [N, 4, 4]."""
     trajectory: Trajectory
-    """Estimate from which the path was made."""
+    """Odometry result (`trajectory_of`) from which the path was made."""
 
     def at(self, time_s: float) -> NDArray[np.float64]:
         """Return the pose at a time, constant before the first and after the last pose."""

@@ -142,7 +142,7 @@ class CameraCorrections(torch.nn.Module):
     sigmas: Tensor
     """Expected errors [6] of a twist: of the translation in the scene's unit, of the rotation in radians."""
     free: Tensor
-    """Factors [count, 1]: 0 for fixed cameras, else 1."""
+    """Factors [count, 1] on the twists: 0 for fixed cameras, which get no correction, else 1."""
 
     def __init__(
         self, count: int, *, translation_sigma: float, rotation_sigma: float, fixed: Sequence[int] = (0,)
@@ -254,7 +254,7 @@ class Shutter:
 
     @property
     def rolls(self) -> bool:
-        """True if rows or columns have different times."""
+        """True for a rolling shutter, whose rows or columns are read at different times."""
         return self.turn is not None
 
     def times(self, pixels: Tensor, width: int, height: int) -> Tensor:

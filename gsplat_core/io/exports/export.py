@@ -132,7 +132,7 @@ def with_unit_rotations(gaussians: Gaussians) -> Gaussians:
 
 
 def _write_sequence(model: Model, file: BinaryIO, times_s: list[float]) -> None:
-    """Write a zip archive time by time, holding only one time in memory."""
+    """Write a zip archive with the model's Gaussians at several times, holding those of only one time in memory."""
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
         names = [f"{index:04d}.ply" for index in range(len(times_s))]
         said = {"time_window_s": list(model.time_window_s), "files": dict(zip(names, times_s, strict=True))}
@@ -147,7 +147,7 @@ def _write_sequence(model: Model, file: BinaryIO, times_s: list[float]) -> None:
 
 SplatFormat = Literal["ply", "splat", "ply_compressed"]
 LEAST_OPACITY = 1 / 255
-"""Splats of a lower opacity are left out of compressed files, as in gsplat."""
+"""Opacity below which splats are left out of compressed `.ply` files, as in gsplat."""
 
 
 @torch.no_grad()

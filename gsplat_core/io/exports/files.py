@@ -25,7 +25,7 @@ Array = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Rows:
-    """N Gaussians on the host, float32."""
+    """Activated values of N Gaussians as float32 arrays on the host: standard deviations and opacities, not logarithms and logits."""
 
     means: Array
     """Centres [N, 3] in world units."""
@@ -132,7 +132,7 @@ def packed(document: dict[str, Any], arrays: list[NDArray[Any]]) -> Iterator[byt
 
 
 def _attributes(rows: Rows) -> Iterator[tuple[str, NDArray[Any]]]:
-    """Yield the vertex attributes by glTF semantic; the size of a row is a multiple of four bytes."""
+    """Yield the glTF vertex attributes of Gaussians: semantic name and array, whose rows are multiples of four bytes."""
     count = len(rows.means)
     if count == 0:
         raise ExportError("the model has no Gaussians; glTF cannot hold an empty one")
@@ -232,7 +232,7 @@ def mesh_glb_pieces(mesh: Mesh, name: str, time_s: float, unit: str) -> Iterator
     Raises:
         ExportError: if the file would be too large.
     """
-    colours = np.full((len(mesh.colours), 4), 65535, "<u2")  # the fourth is opacity
+    colours = np.full((len(mesh.colours), 4), 65535, "<u2")  # red, green, blue and opacity, which is 1
     colours[:, :3] = np.round(linear((mesh.colours / np.float32(255)).astype(np.float32)) * 65535)
     attributes = {"POSITION": mesh.vertices, "NORMAL": mesh.normals, "COLOR_0": colours}
     arrays: list[NDArray[Any]] = [*attributes.values(), mesh.triangles.astype("<u4").ravel()]

@@ -15,7 +15,7 @@ DEFAULT_TIMES = 30
 
 @dataclass(frozen=True)
 class ExportFormat:
-    """Export format with its name and content."""
+    """File format of an export: its name, file suffix and kind of content."""
 
     name: str
     suffix: str

@@ -41,7 +41,7 @@ from gsplat_core.io.sessions.segments import FIELDS, SegmentPictures, SegmentRea
 from gsplat_core.scene.frames import DEPTH_ORIGINS, Frame, FrameStatus
 
 MOST_ARRIVED = 64
-"""Maximum number of received frames that may still be prepared for training."""
+"""Maximum number of received frames kept while reading, until the log has their lines as prepared for training."""
 _SEGMENT = re.compile(r"\d{6,9}")
 
 
@@ -151,7 +151,7 @@ class SessionReader:
                         yield late_depth_of(line, pictures) if segment.there(line) else None
 
     def digests(self) -> Iterator[ShownLine]:
-        """Yield the newly displayed pictures in order."""
+        """Yield the log lines of newly displayed pictures, which have digests, in order."""
         return (line for _, line in self.lines() if isinstance(line, ShownLine) and line.sha256 is not None)
 
     @property
@@ -189,7 +189,7 @@ class SessionReader:
 
 
 def _of(segment: SegmentReader) -> Iterator[FrameLine]:
-    """Yield the lines of a segment's readable frames, ignoring lines that repeat a number."""
+    """Yield the log lines of a segment's readable frames; lines that repeat a sequence number are skipped."""
     wanted = iter(segment.seqs)
     due = next(wanted, None)
     for line in segment.lines():
@@ -223,7 +223,7 @@ def prepared_of(line: PreparedLine, arrived: Frame, pictures: SegmentPictures) -
 
 
 def late_depth_of(line: DepthTaken, pictures: SegmentPictures) -> dict[str, Any] | None:
-    """Return the depth fields of a line that arrived after their frame; None if they cannot be decoded completely."""
+    """Return the fields of a depth map that arrived after its frame, from its log line; None if it cannot be decoded completely."""
     planes, damage = pictures.of(line)
     if damage is not None or "depth" not in planes:
         return None
@@ -237,7 +237,7 @@ def _frame(line: FrameLine | PreparedLine, planes: dict[str, NDArray[Any]], dama
         return None
     status = FrameStatus.REPLAY if line.status is FrameStatus.LIVE else line.status
     if damage is not None and damage != line.damage:
-        # Damaged after recording, so no pixel is known to be tissue.
+        # The pictures were damaged after they were recorded, so no pixel is known to be tissue.
         status, planes = FrameStatus.DAMAGED, {**planes, "mask": mask_of_nothing(*image.shape[:2])}
     if line.pose is not None:
         planes = {**planes, "pose": np.array(line.pose).reshape(4, 4)}
@@ -266,7 +266,7 @@ _ADVICE = "What can be read is played"
 
 @dataclass(frozen=True)
 class SessionImages:
-    """Number and size of a session's frames."""
+    """Number of a session's frames, and their picture size."""
 
     frame_count: int
     width_px: int

@@ -114,7 +114,7 @@ class ShownLine(Record):
 
 
 class LostLine(Record):
-    """Marker for a record that was not written.
+    """Log line in place of a record that was not written.
 
     Reasons are writing that was too slow, or a record that does not fit into a line.
     """

@@ -43,7 +43,7 @@ from gsplat_core.io.sessions.records import (
 )
 
 Stage = Literal["", "prepared_", "late_"]
-"""Name prefix of track files: frames as received, as prepared for training, or fields that arrived late.
+"""Name prefix of a track file that states at which stage of the pipeline its pictures were recorded.
 
 "" marks received and displayed pictures, "prepared_" those passed to training, and "late_" depth
 passed to training later.
@@ -89,7 +89,10 @@ class SegmentWriter:
         return len(self._tracks) >= MOST_FILES
 
     def picture(self, stage: Stage, track: str, picture: NDArray[Any], pts_ns: int) -> int:
-        """Append a picture to a track and return its timestamp in the file in milliseconds."""
+        """Append a picture to a track and return its timestamp in the file in milliseconds.
+
+        `stage` is the name prefix of the track's file: received or displayed (""), prepared for training, or late.
+        """
         if self._start_ns is None:
             self._start_ns = pts_ns
         height, width = picture.shape[:2]
@@ -150,7 +153,7 @@ class SegmentReader:
         self.ends: SegmentEnds | None = None
         """Last line of the log; None if the log is truncated or still being written."""
         self.named = 0
-        """Number of frames that the log mentions, readable or not."""
+        """Number of received frames in the log, whether or not their pictures are readable."""
         self.seqs = array("q")
         """Sequence numbers of the readable frames, in order."""
         self.first: FrameLine | None = None
@@ -181,11 +184,11 @@ class SegmentReader:
         return SegmentPictures(self._indices, self.folder)
 
     def files(self) -> list[Path]:
-        """Return the files of this segment that are read."""
+        """Return the paths of the segment's log and track files that are read."""
         return sorted([self.folder / LOG_FILE, *(index.path for index in self._indices.values() if index is not None)])
 
     def _look(self, after_seq: int) -> None:
-        """Read the log once to find its first and last line, its track files and its complete frames."""
+        """Read the log once to find its last line, its track files, and the frames whose pictures are complete."""
         lines = self.lines()
         first = next(lines, None)
         if not isinstance(first, SegmentBegins):
@@ -205,7 +208,7 @@ class SegmentReader:
         self.ends = last if isinstance(last, SegmentEnds) else None
         for name in sorted(named)[:MOST_OPEN]:
             try:
-                # Check the sums only of an incomplete segment. A complete segment was synced to disk before its last line.
+                # Verify checksums only in an incomplete segment. A complete one was synced to disk before its last log line.
                 self._indices[name] = TrackIndex(self.folder / name, check_sums=self.ends is None)
             except (UnreadableFile, OSError):
                 self._indices[name] = None
@@ -216,7 +219,7 @@ class SegmentReader:
             if line.seq <= after_seq or "image" not in line.tracks or line.height_px * line.width_px > MAX_PIXELS:
                 continue
             if not self.there(line):
-                break  # later pictures are incomplete as well
+                break  # the pictures of later frames are incomplete as well
             after_seq = line.seq
             self.seqs.append(line.seq)
             self.first = self.first or line
@@ -293,7 +296,7 @@ CODINGS: Mapping[str, Coding] = {
     "depth_confidence": "float",
     "shown": "vp9",
 }
-"""Video coding of the pictures of each track."""
+"""Video coding of a track's pictures, by track: the name of a picture field of `Frame`, or `shown` for displayed pictures."""
 PIXEL_FORMATS: Mapping[Coding, str] = {"colour": "bgr0", "grey": "gray", "float": "gray", "vp9": "yuv420p"}
 ENCODERS: Mapping[Coding, str] = {"colour": "ffv1", "grey": "ffv1", "float": "ffv1", "vp9": "libvpx-vp9"}
 _VP9 = {
@@ -609,7 +612,7 @@ def _packets(container: av.container.InputContainer, stream: av.VideoStream) -> 
 
 
 class _Beginning(io.RawIOBase):
-    """Prefix of a file, presented as if the file ended there."""
+    """File object that presents the first `end` bytes of a file as if the file ended there."""
 
     def __init__(self, file: io.BufferedIOBase | Any, end: int) -> None:
         self._file, self._end, self._at = file, end, 0

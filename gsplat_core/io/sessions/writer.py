@@ -43,14 +43,14 @@ _NAMED_AFTER_ITS_TIME = re.compile(r"\d{8}T\d{6}Z(-\d+)?")
 
 @dataclass(frozen=True)
 class KeptPart:
-    """Part that retention deletes as a whole: a complete segment, or an earlier session."""
+    """Part of the recordings that is deleted as a whole: a complete segment of the present session, or an earlier session."""
 
     folder: Path
     bytes: int
     ended_ns: int
-    """End of the part in nanoseconds on the writer's clock."""
+    """Time at which the recording of the part ended, in nanoseconds on the writer's clock."""
     segment: int | None = None
-    """Segment number; None for an entire session."""
+    """Number of the segment; None if the part is an entire earlier session."""
 
 
 class Retention:
@@ -69,12 +69,12 @@ class Retention:
 
     @property
     def bytes(self) -> int:
-        """Total size of all parts."""
+        """Total size in bytes of all parts: complete segments and earlier sessions."""
         return sum(part.bytes for part in self._parts)
 
     @property
     def segment_bytes(self) -> int:
-        """Total size of the parts that are segments."""
+        """Total size in bytes of the complete segments of the present session."""
         return sum(part.bytes for part in self._parts if part.segment is not None)
 
     def add(self, part: KeptPart) -> None:
@@ -82,7 +82,7 @@ class Retention:
         self._parts.append(part)
 
     def give_up(self, now_ns: int) -> Iterator[tuple[KeptPart, str | None]]:
-        """Delete parts until the limits hold.
+        """Delete the oldest parts until the recordings are within the size and age limits.
 
         Failure to delete an earlier session does not end the recording; failure to delete a segment raises.
 
@@ -155,7 +155,7 @@ class WriterOptions:
 
     segment_bytes: int = 256 * 2**20
     segment_s: float = 60.0
-    """Limits of a segment's size in bytes and of its duration in seconds."""
+    """Duration in seconds after which a new segment is started; `segment_bytes` is the size in bytes after which this happens."""
     keep_bytes: int | None = None
     """Size limit in bytes beyond which the oldest segments are deleted; None for no limit."""
     keep_s: float | None = None
@@ -176,12 +176,12 @@ class WriterOptions:
 
 @dataclass(frozen=True)
 class Shown:
-    """Displayed picture with its metadata."""
+    """Picture displayed to the viewer, to be recorded: with its frame, status and latency."""
 
     frame: Frame
     """Frame whose content the picture shows."""
     rendered: NDArray[np.uint8]
-    """RGB uint8 [H, W, 3], as rendered."""
+    """Picture as rendered, RGB uint8 [H, W, 3], without status overlay."""
     model_version: int
     on_screen: NDArray[np.uint8] | None = None
     """Picture with its status overlay; None if displayed as rendered."""
