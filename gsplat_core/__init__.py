@@ -171,7 +171,7 @@ _HOME = {
     "spherical_harmonics": "ops.spherical_harmonics",
     "world_to_cam": "ops.plain_torch",
 }
-"""Import path of the module that defines each public name."""
+"""Module that defines each public name, relative to this package. `__getattr__` imports it when the name is first used."""
 
 
 def __getattr__(name: str) -> Any:

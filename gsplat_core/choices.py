@@ -147,7 +147,7 @@ SENSORS: Registry[type[RangeSensor]] = Registry(
 """Range sensors by name. The loss `range` compares their recorded scans with the scene."""
 
 Eyes = Literal["left", "both"]
-"""Eyes of a stereo scope whose pictures are trained on."""
+"""Eyes of a stereo scope whose pictures are used for training: the left one alone, or both."""
 
 
 STANDARD = ("image", "alpha", "depth")

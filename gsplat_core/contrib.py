@@ -430,11 +430,11 @@ class HexPlaneField(torch.nn.Module):
         return [planes[place][0].permute(1, 2, 0).contiguous() for place in ORDER]
 
     def spatial_planes(self) -> list[Tensor]:
-        """Return the planes xy, xz and yz of all levels."""
+        """Return the planes without time (xy, xz and yz) of all resolution levels."""
         return self._chosen(SPACE)
 
     def temporal_planes(self) -> list[Tensor]:
-        """Return the planes xt, yt and zt of all levels."""
+        """Return the planes with time (xt, yt and zt) of all resolution levels."""
         return self._chosen(TIME)
 
     def _chosen(self, places: Sequence[int]) -> list[Tensor]:
@@ -583,7 +583,7 @@ def hexplane_regularization(
     lambda_time_smooth: float = 1.0,
     lambda_time_l1: float = 1.0,
 ) -> Tensor:
-    """Return the weighted sum of the three regularisers over the planes of a field."""
+    """Return the weighted sum of `plane_smoothness`, `time_smoothness` and `time_l1` over the planes of a field."""
     space, time = field.spatial_planes(), field.temporal_planes()
     return (
         lambda_plane_smooth * plane_smoothness(space)

@@ -95,7 +95,7 @@ def use_one_thread() -> None:
     torch stores the number per thread, and as the default of threads that have not computed yet.
     Another thread restores that default.
     """
-    import torch  # here, because the control plane asks for memory without torch
+    import torch  # imported only here, because the control plane uses this module without torch
 
     before = torch.get_num_threads()
     torch.set_num_threads(1)

@@ -44,7 +44,7 @@ class TrainedBy:
     """Renderer whose pictures trained a model. Other renderers may be unable to show the model."""
 
     renderer: str = "alpha"
-    """Name in `RENDERERS`."""
+    """Name of the renderer, a key of `RENDERERS`."""
     values: Mapping[str, float] = dataclasses.field(default_factory=dict)
     """Parameters of the renderer that apply to the whole scene, by name; learned, or fixed at the start of training."""
 
@@ -62,7 +62,7 @@ class Model:
     version: int
     """Version number; increases with every snapshot, from 1."""
     gaussians: Gaussians
-    """Canonical Gaussians."""
+    """Canonical Gaussians, which the field deforms."""
     field: DeformationField | None
     """Deformation field; None for a static scene."""
     camera: Camera
@@ -111,7 +111,7 @@ class Model:
 
     @property
     def parameter_count(self) -> int:
-        """Total number of parameters."""
+        """Total number of values in the tensors of the Gaussians and the field."""
         return sum(tensor.numel() for tensor in self.tensors().values())
 
     def to(self, device: torch.device | str) -> Model:
@@ -275,7 +275,7 @@ class SnapshotSlot:
 
     @property
     def parameter_count(self) -> int:
-        """Number of parameters last written, without spare capacity."""
+        """Number of parameters of the scene last written into the slot, without spare capacity."""
         own = sum(tensor[:1].numel() for tensor in self.gaussians.tensors().values()) * self._count
         return own + (0 if self._field is None else self._field.parameter_count)
 

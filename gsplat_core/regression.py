@@ -185,7 +185,7 @@ class FitOptions:
 
 @dataclass(frozen=True)
 class Fit:
-    """Result of `fit`."""
+    """Result of `fit`: the fitted splats and the course of the loss."""
 
     splats: Splats
     losses: Tensor

@@ -29,7 +29,7 @@ def tensor_of(array: NDArray, device: torch.device | str = "cpu") -> Tensor:
 
 
 def copy_each(to: list[Tensor], values: list[Tensor]) -> None:
-    """Copy each tensor to its counterpart with as few launches as possible."""
+    """Copy each tensor of `values` into the tensor of `to` at the same index, with as few kernel launches as possible."""
     torch._foreach_copy_(to, values, non_blocking=True)
 
 

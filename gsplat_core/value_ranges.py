@@ -110,7 +110,7 @@ def plain_float(text: str) -> float:
 
 
 MAX_NESTING = 16
-"""Maximum nesting depth of objects and lists."""
+"""Maximum nesting depth of objects and lists in accepted JSON."""
 
 
 class JsonObject:
@@ -140,7 +140,7 @@ class JsonObject:
         return JsonObject(self.values.get(key), f"{self.name}: {key}")
 
     def integer(self, key: str, wanted: IntegerIn) -> int:
-        """Return an integer in the range `wanted`."""
+        """Return the integer stored under a key, in the range `wanted`."""
         return int(self._checked(key, wanted))
 
     def number(self, key: str, wanted: NumberIn) -> float:
@@ -148,11 +148,11 @@ class JsonObject:
         return float(self._checked(key, wanted))
 
     def matrix(self, key: str, size: int, wanted: NumberIn) -> list[list[float]]:
-        """Return a square matrix: `size` rows of `size` numbers."""
+        """Return the square matrix stored under a key: `size` rows of `size` numbers, each in the range `wanted`."""
         return self._matrix(key, self.values.get(key), size, wanted)
 
     def matrices(self, key: str, size: int, wanted: NumberIn, most: int) -> list[list[list[float]]]:
-        """Return a list of 1 to `most` square matrices."""
+        """Return the list of 1 to `most` square matrices stored under a key, each `size` rows of `size` numbers."""
         listed = self.values.get(key)
         if not isinstance(listed, list) or not 1 <= len(listed) <= most:
             raise BundleCorrupt(f"{self.name}: {key} must be a list of 1 to {most} matrices, got {shortened(listed)}")
@@ -184,7 +184,7 @@ class JsonObject:
         return start, end
 
     def choice(self, key: str, choices: tuple[str, ...]) -> str:
-        """Return a string value, restricted to `choices`."""
+        """Return the string stored under a key, which must be one of `choices`."""
         value = self.values.get(key)
         if not isinstance(value, str) or value not in choices:
             raise BundleCorrupt(f"{self.name}: {key} must be one of {', '.join(choices)}, got {shortened(value)}")
@@ -198,7 +198,7 @@ class JsonObject:
         return value
 
     def digest(self, key: str) -> str:
-        """Return a SHA-256 digest in hexadecimal."""
+        """Return the SHA-256 digest stored under a key, in hexadecimal."""
         value = self.values.get(key)
         if not isinstance(value, str) or len(value) != 64 or set(value) - set("0123456789abcdef"):
             raise BundleCorrupt(

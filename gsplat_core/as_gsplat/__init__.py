@@ -268,7 +268,7 @@ _EXTENSION = "gsplat.csrc"
 _OF_0_1 = (
     "_torch_impl", "cuda_legacy", "nd_rasterize", "project_gaussians", "rasterize", "rasterize_gaussians", "sh",
 )  # fmt: skip
-"""Modules and functions of gsplat 0.1 that 1.5.3 does not have."""
+"""Names of modules and functions of gsplat 0.1 that 1.5.3 does not have; their import error advises to use the newer API."""
 
 
 def _absent(fullname: str) -> ModuleNotFoundError:
@@ -321,13 +321,13 @@ class Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
             return None
         # `from gsplat.exporter import name` asks this finder about missing names of packages only, so all modules are such.
         spec = importlib.machinery.ModuleSpec(fullname, self, origin=__file__, is_package=True)
-        spec.has_location = True  # gives the module its `__file__`
+        spec.has_location = True  # makes the import system set the module's `__file__`
         return spec
 
     def find_distributions(
         self, context: importlib.metadata.DistributionFinder.Context | None = None
     ) -> Iterator[importlib.metadata.Distribution]:
-        """Yield the metadata of gsplat if they are asked for by name."""
+        """Yield the metadata of the package `gsplat` if it is asked for by name; no metadata for other packages."""
         if context is not None and context.name == "gsplat":
             yield _Distribution()
 

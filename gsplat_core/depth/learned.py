@@ -45,12 +45,12 @@ class Affine(NamedTuple):
     """Weighted correlation of network output and reference depth, -1 to 1. It has the sign of the fitted scale."""
 
     def of(self, values: Plane) -> Plane:
-        """Apply the map to values of any shape."""
+        """Return `factor` · `values` + `summand` for values of any shape."""
         return self.factor * values + self.summand
 
 
 def is_constant(values: Plane) -> bool:
-    """Return True if values [N] are effectively constant."""
+    """Return True if values [N] are constant except for noise (`CONSTANT`)."""
     low, high = np.percentile(values, ENDS)
     return bool(high - low <= CONSTANT * max(abs(low), abs(high), 1e-30))
 
@@ -141,7 +141,7 @@ EVERY_S = 0.3
 ALIKE = 0.6
 """Smallest correlation of a network's output with a reference depth at which both count as showing the same scene."""
 LEAST_SEEN = 0.05
-"""Share of tissue in the picture below which the depth is rejected."""
+"""Share of the picture that must be visible tissue; with less, the network's depth is rejected."""
 UNSEEN = "too little of the picture is tissue for a depth network"
 NOT_FINITE = "the depth network gave values that are not finite"
 FLAT = "the depth network returned the same depth for the whole picture"

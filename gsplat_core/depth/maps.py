@@ -70,7 +70,7 @@ class DepthMap:
 
     @property
     def believed(self) -> NDArray[np.float32]:
-        """Depth where its confidence is at least `BELIEVED`, 0 elsewhere."""
+        """Depth map [H, W] with 0 where the confidence is below `BELIEVED`."""
         return np.where(self.confidence >= BELIEVED, self.depth, np.float32(0))
 
     @property
@@ -113,7 +113,7 @@ class Estimator(ABC):
 
 
 class RecordingDepth(NamedTuple):
-    """Depth of a complete recording."""
+    """Depth estimated from all frames of a recording together."""
 
     frames: list[Frame]
     """Frames; some have depth in the unit of the camera positions. Depth without confidence is an extrapolation."""
@@ -305,7 +305,7 @@ class DepthFinder:
             if isinstance(estimator, OnDevice):
                 estimator.work_on(device)
         self.doubts, self.remarks = Sentences(), Sentences()
-        """Reasons for rejected depth maps, and remarks about used ones."""
+        """Counters of the reasons for rejected depth maps, and of the remarks about used depth maps."""
 
     def seeks_in(self, frame: Frame) -> bool:
         """Return True if any source other than the frame's own depth applies to a frame."""
@@ -346,7 +346,7 @@ class DepthFinder:
         if found is None:
             return frame.with_fields(depth=None, depth_confidence=None, depth_origin=None, depth_error=None)
         if found.depth is frame.depth:
-            # A second plane is stored only if some known depth is rejected.
+            # Store a confidence plane only if it rejects some known depth; None means full confidence.
             doubts = bool(np.any((found.confidence == 0) & (frame.depth > 0)))
             return frame.with_fields(depth_confidence=found.confidence) if doubts else frame
         return frame.with_fields(
@@ -448,11 +448,11 @@ def _inner(where: NDArray[np.bool_], margin_px: int) -> NDArray[np.bool_]:
 
 
 LONGEST_PX = 160
-"""Longest side of the compared depth maps, in pixels."""
+"""Longest side, in pixels, to which depth maps are reduced before two of them are compared (`agree`)."""
 MOST_DISAGREEMENT = 0.25
 """Largest accepted median difference of two depth maps, as a share of their median relief."""
 LEAST_SHARED = 0.1
-"""Share of the picture that both depth maps must cover."""
+"""Smallest share of the picture that two depth maps must both cover to be compared."""
 UNCONFIRMED = "two depth maps by parallax disagree about the relief, so a level plane may be as accurate"
 """Rejection reason of a parallax depth map that a second one of the same tissue contradicts."""
 

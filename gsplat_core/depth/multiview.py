@@ -31,7 +31,7 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import BELIEVED, PARALLAX, Frame
 
 WINDOW_PX = 7
-"""Side of the correlation window in pixels."""
+"""Side in pixels of the square window in which two pictures are correlated."""
 NOISE_GREY = 2.0
 """Standard deviation of image noise in grey levels, added to variances so that patches without
 contrast do not correlate.
@@ -49,7 +49,7 @@ class View:
     grey: NDArray[np.float32]
     """Grey levels 0 to 255, float32 [H, W]."""
     tissue: NDArray[np.uint8]
-    """Validity uint8 [H, W]; 1 on tissue that can be tracked."""
+    """Mask uint8 [H, W]: 1 on tissue that can be tracked, 0 elsewhere."""
     camera: Camera
 
 
@@ -220,7 +220,7 @@ class Parallax:
     inverse_depths: Array
     """Inverse depths of the corners that agree with the poses, [n]."""
     plane: float
-    """Inverse depth of the best-fitting fronto-parallel plane."""
+    """Inverse depth of the fronto-parallel plane that fits the corners best."""
     views: tuple[int, ...]
     """Indices of the views that agree with their poses."""
     parallax_px: float
@@ -353,7 +353,7 @@ def _off_px(c: Array, d: Array, focal: float, inverse: Array) -> Array:
 WORKING_PX = 320
 """Longest side in pixels of the compared pictures when there is no real-time limit."""
 MOST_VIEWS = 6
-"""Largest number of other views compared with one picture."""
+"""Largest number of other pictures with which one picture is compared."""
 SHORTEST_BASELINE = 0.1
 """Share of the longest baseline below which a view is ignored because it adds noise."""
 WIDEST_TURN = 0.7
@@ -361,7 +361,7 @@ WIDEST_TURN = 0.7
 LABEL_PX = 0.75
 """Parallax between neighbouring distances of the sweep, in pixels of the view with the most parallax."""
 LABELS = 24, 96
-"""Smallest and largest number of distances in a sweep."""
+"""Smallest and largest number of distances that a plane sweep tests."""
 MARGIN = 1.6
 """Factor by which the sweep extends the range of the corners' distances at both ends."""
 WORST_COST, BEST_COST = 0.35, 0.15
@@ -377,7 +377,7 @@ this share and decreases linearly between the two.
 DEFORMS = "the tissue moves too much relative to the scope for depth by parallax"
 """Reason for rejecting a map without any confident depth, which moving tissue usually causes."""
 FILLED = 0.2
-"""Confidence of extrapolated depth."""
+"""Largest confidence of depth that is extrapolated from its surroundings, and confidence of small isolated patches."""
 
 
 def view_of(frame: Frame, camera: Camera, longest_px: int = WORKING_PX) -> View:
@@ -442,7 +442,7 @@ def depth_of_view(reference: View, candidates: Sequence[View], size: tuple[int, 
     costs = np.take_along_axis(cost, nearest, 2)[..., 0]
     agreeing = np.take_along_axis(votes, nearest, 2)[..., 0]
     confidence = np.minimum((WORST_COST - costs) / (WORST_COST - BEST_COST), unique / UNIQUE)
-    # The first and last labels also collect all pixels beyond the swept range.
+    # Exclude the first and last distances, which also collect all pixels beyond the swept range.
     inside = (nearest[..., 0] > 0) & (nearest[..., 0] < len(inverse_depths) - 1)
     confidence = np.clip(confidence, 0, 1) * float(np.clip(2 - 2 * found.own_motion / MOST_OWN_MOTION, 0, 1))
     confidence = confidence * inside * (reference.tissue != 0) * (agreeing >= min(2, len(found.views)))
@@ -582,7 +582,7 @@ class ParallaxDepth(Estimator):
             self._kept.pop(int(np.argmin(self._gaps())))
 
     def _gaps(self) -> list[float]:
-        """Return the distance of each key frame to its nearest neighbour."""
+        """Return the distance of each key frame's camera to the nearest camera of another key frame."""
         views = [view for _, view in self._kept]
         return [min(_apart(one, other) for other in views if other is not one) for one in views]
 

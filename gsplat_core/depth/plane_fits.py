@@ -63,7 +63,7 @@ def at_middles(sums: tuple[Sums, ...], x: Sums, y: Sums, level: Sums | float, re
 
 Array = NDArray[np.float64]
 SURFACE_CELL_PX = 2
-"""Side of the cells in which points are accumulated, in pixels."""
+"""Side in pixels of the grid cells in which scattered points are accumulated before planes are fitted."""
 NEAR_PX, FAR_PX = 9.0, 24.0
 """Standard deviations in pixels of the fit's window, where points are dense and where they are sparse."""
 ENOUGH = 1.5
@@ -71,7 +71,7 @@ ENOUGH = 1.5
 points, the wide window's weight grows linearly to 1.
 """
 FLOOR = 0.005
-"""Relative error added to every point so that none dominates."""
+"""Relative depth error added to that of every point, so that no single point dominates a fit."""
 LEVEL = 1e-3
 """Regularisation of slopes as a share of the weights, so that two points do not define a plane."""
 
@@ -103,7 +103,7 @@ def surface_through(pixels: Array, depth: Array, error: Array, size: tuple[int, 
         np.float64
     )
     near, far = (_blurred(sums, sigma / SURFACE_CELL_PX) for sigma in (NEAR_PX, FAR_PX))
-    # Blend to the wide window where the narrow one contains few points.
+    # Blend from the narrow to the wide window where the narrow one contains few points.
     count = near[..., 9] * 2 * np.pi * (NEAR_PX / SURFACE_CELL_PX) ** 2
     few = np.clip(1 - count / ENOUGH, 0.02, 1)[..., None]
     both = (1 - few) * near + few * far

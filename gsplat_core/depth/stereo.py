@@ -55,7 +55,7 @@ class Disparity:
     px: Tensor
     """Disparity in pixels, float32 [H, W]; 0 where unknown."""
     known: Tensor
-    """Validity of the disparities, bool [H, W]."""
+    """Bool mask [H, W], True where the disparity is known."""
     error_px: Tensor
     """Standard deviation in pixels estimated from the pictures, float32 [H, W]; infinite where unknown."""
 
@@ -69,7 +69,7 @@ class Span:
 
     @classmethod
     def around(cls, low: float, high: float) -> Span:
-        """Return the smallest range that contains `low` to `high`, in pixels."""
+        """Return the smallest search range that contains the disparities `low` to `high` in pixels."""
         lowest = int(np.floor(low))
         return cls(lowest, COUNT_STEP * max(1, int(np.ceil((high - lowest + 1) / COUNT_STEP))))
 
@@ -156,7 +156,7 @@ SATURATED = 250
 BACK_PX = 0.5
 """Largest accepted forward-backward error of the flow, in pixels."""
 LEAST_POINTS = 24
-"""Fewest points from which a pair is judged."""
+"""Fewest points found in both eyes with which a stereo pair can be checked."""
 LEAST_SHARE = 0.2
 """Smallest share of the corners that must be found in the other eye, and of the found corners that must fit the common
 row offset.
@@ -407,7 +407,7 @@ class StereoDepth(Estimator):
         found = self._as_depth(planes, frame, camera, parallel_px)
         widened = self._span_of(frame.width_px)
         if is_first and found.doubt is None and span != widened and widened.count <= MOST_DISPARITIES:
-            # Match the first frame of a scene with the same range as the following ones.
+            # Match the first frame of a scene again with its extended range, which the following frames use, too.
             planes = self._planes(left, right, frame, camera, widened, parallel_px)
             found = self._as_depth(planes, frame, camera, parallel_px)
         why = None if look is None or found.doubt is not None else _why_wrong(found, look, frame, camera, parallel_px)
@@ -491,7 +491,9 @@ class StereoDepth(Estimator):
             variance = (found.error_px.square() + off_px.square()) / (HALF_BELIEVED_PX * shrink) ** 2
             depth = torch.where(known, reach_of(frame, camera) / torch.where(known, shift, 1), 0)
             planes = HostCopy(torch.stack([depth, torch.where(known, 1 / (1 + variance), 0)]))
-        both = planes.numpy().copy()  # frames may be kept for long, and page-locked memory is scarce
+        both = (
+            planes.numpy().copy()
+        )  # copy out of page-locked memory, which is scarce, because frames may be kept for long
         both[1] *= _has_company(both[1], shrink)
         return both
 
@@ -634,7 +636,7 @@ HALF_OF_90 = 1.645
 MOST_OUTSIDE = 0.1
 """Largest accepted share of points at which two ways of matching differ by more than the 90 % interval."""
 ONE_PERCENT = 2.33
-"""Standard deviations that a normal value exceeds with a probability of 1 %."""
+"""Number of standard deviations that a normally distributed value exceeds with a probability of 1 %."""
 
 
 def _depth_error(

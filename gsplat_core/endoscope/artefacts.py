@@ -75,7 +75,7 @@ class FieldOfView:
         self._outline: Outline | None = None
         self._reduced: NDArray[np.bool_] = np.zeros((0, 0), bool)
         self._extremes: tuple[NDArray[np.uint8], NDArray[np.uint8]] | None = None
-        """Brightest and darkest level of each pixel in the current window."""
+        """Brightest and darkest level of each reduced pixel over the frames of the current window."""
         self._frames = 0
         self._candidates: list[Outline | None] = []
 
@@ -175,7 +175,7 @@ def find_outline(brightest: NDArray[np.uint8], darkest: NDArray[np.uint8]) -> Ou
     limit = level + SURROUND_RANGE
     dark = (brightest <= limit) & (brightest - darkest <= SURROUND_RANGE)
     lit = cv2.morphologyEx((~dark).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    # The largest lit region is the field. Text and logos form separate regions.
+    # The largest lit region is the field of view. Text and logos form separate regions.
     count, labels, statistics, _ = cv2.connectedComponentsWithStats(lit, connectivity=4)
     if count < 2:
         return None
@@ -220,7 +220,7 @@ def _as_ellipse(hull: Outline, shape: tuple[int, int]) -> Outline:
 
 
 def _up_to_the_edge(outline: Outline, shape: tuple[int, int]) -> Outline:
-    """Extend the outline to the picture's edge where it nearly reaches it."""
+    """Move points of the outline that nearly reach the picture's edge onto the edge."""
     last = np.array([shape[1], shape[0]]) - 1.0
     outline = np.where(outline <= 1.0, -0.5, outline)
     return np.where(outline >= last - 1.0, last + 0.5, outline)
@@ -367,7 +367,7 @@ class _Band:
         return np.rot90(plane, self._turns)[-self._depth_px :]
 
     def add(self, image: NDArray[np.uint8]) -> None:
-        """Update the temporal means of the band's gradients with a frame."""
+        """Update the temporal mean and deviation of the band's brightness gradients with a frame."""
         grey = luma(np.ascontiguousarray(self._of(image))).astype(np.float32)
         gradient = np.zeros((2, *grey.shape), np.float32)
         gradient[0, 1:] = grey[1:] - grey[:-1]
@@ -382,7 +382,7 @@ class _Band:
         self._deviation += share * (np.abs(difference) - self._deviation)
 
     def mark(self, drawn: NDArray[np.bool_]) -> None:
-        """Mark drawn pixels near this border in a plane [H, W]."""
+        """Set the pixels of detected strips and text near this border to True in the mask `drawn` [H, W]."""
         if self._mean is None:
             return
         strength = np.abs(self._mean)
@@ -466,7 +466,7 @@ class Deinterlacer:
 
 
 def comb_share(image: NDArray[np.uint8]) -> float:
-    """Return the share of combed blocks; 0 for a picture smaller than a few blocks."""
+    """Return the share of a picture's blocks that show interlacing combs; 0 for a picture smaller than a few blocks."""
     some = np.ascontiguousarray(image[:, ::COLUMN_STEP, 1])
     rows, columns = (some.shape[0] - 2) // BLOCK_ROWS, some.shape[1] // BLOCK_COLUMNS
     if rows < 2 or columns < 2:

@@ -208,7 +208,7 @@ RATE_FRAMES = 15
 
 @dataclass(frozen=True)
 class SceneVerdict:
-    """Classification of a frame relative to earlier ones."""
+    """Result of the cut detector for a frame: new scene, in doubt, or (by default) the same scene."""
 
     new_scene: str | None = None
     """Reason why a new scene starts with the frame: "cut", "resized" or "frame rate". None for the same scene."""
@@ -236,7 +236,7 @@ class CutDetector:
         self._rate = FrameRate()
 
     def skip(self) -> None:
-        """Record that a frame of the stream could not be used."""
+        """Record that a frame of the stream was unusable and is not passed to `observe`."""
         self._gap = True
 
     def observe(self, image: NDArray[np.uint8], seq: int, pts_ns: int) -> SceneVerdict:
@@ -354,23 +354,23 @@ RECENT_FRAMES = 5
 frames pass.
 """
 CLEAR_FRAMES = 300
-"""Number of good frames for the usual contrast, saturation and haze (medians)."""
+"""Number of newest good frames whose medians are the usual contrast, saturation and haze."""
 
 
 @dataclass(frozen=True)
 class Appearance:
-    """Sharpness and clarity measures of a picture."""
+    """Measures of a picture's sharpness (`rows`, `columns`) and of its freedom from smoke."""
 
     rows: float
     """Mean difference of neighbouring rows over that of rows `APART_PX` apart, typically 0.3 to 0.5; large in a sharp
     picture.
     """
     columns: float
-    """`rows` for neighbouring columns in place of rows."""
+    """Mean difference of neighbouring columns over that of columns `APART_PX` apart; large in a sharp picture."""
     contrast: float
-    """Standard deviation of log brightness."""
+    """Standard deviation of the pixels' log brightness; smoke lowers it."""
     saturation: float
-    """Median of 1 - darkest channel / brightest channel."""
+    """Median over the pixels of 1 - darkest channel / brightest channel; smoke lowers it."""
     haze: float
     """10th percentile over the pixels of the darkest channel, 0 to 255; smoke raises it."""
 

@@ -77,9 +77,9 @@ class Evidence:
     """Colour and light measures of a picture. Shares are 0..1 of the lit, unclipped pixels unless stated otherwise."""
 
     cool: float
-    """Share of pixels in which red hardly exceeds green and blue."""
+    """Share of cool pixels, in which red hardly exceeds both green and blue (`COOL`)."""
     cold: float
-    """Share of pixels in which red does not exceed green and blue."""
+    """Share of cold pixels, in which red practically does not exceed both green and blue (`COLD`)."""
     redness: float
     """Upper quartile over the pixels of the logarithm of red over green."""
     even: float
@@ -102,7 +102,7 @@ class Evidence:
 
     @property
     def tissue(self) -> bool:
-        """True for clear tissue: few cool pixels, and a quarter as red as blood."""
+        """True for clear tissue: few pixels are cool, and at least a quarter of the pixels are as red as blood."""
         return self.cool < LITTLE_COOL and self.redness >= REDNESS
 
 
@@ -175,7 +175,7 @@ class BodyGate:
 
     @property
     def inside(self) -> bool:
-        """True if the gate is open."""
+        """True if the gate is open, that is, if the scope counts as inside the body."""
         return self._inside
 
     def judge(self, image: NDArray[np.uint8]) -> str | None:
@@ -209,7 +209,7 @@ class BodyGate:
         return None if self._inside else "not yet certain again"
 
     def close(self) -> None:
-        """Close the gate, as after a picture from outside."""
+        """Close the gate without judging a picture, as if pictures from outside had recurred."""
         self._inside = False
         self._tissue = self._without = 0
 
@@ -255,7 +255,7 @@ def _gradient(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """Return derivatives along x and y and the gradient's magnitude, by the Sobel kernel times `scale`."""
     across, down = (np.asarray(cv2.Sobel(plane, cv2.CV_32F, x, 1 - x, scale=scale), np.float32) for x in (1, 0))
-    # cv2.magnitude rounds differently at other addresses of its arguments.
+    # cv2.magnitude is not used, because its rounding depends on the memory addresses of its arguments.
     return across, down, np.sqrt(across * across + down * down)
 
 

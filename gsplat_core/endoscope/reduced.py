@@ -55,7 +55,7 @@ def averaged(image: NDArray[np.uint8], size: tuple[int, int], samples: int = 2) 
     """
     samples = min(samples, image.shape[1] // size[0], image.shape[0] // size[1])
     if samples > 1:
-        # Averaging by an integer factor is many times faster.
+        # Subsample to an integer multiple of the size first: averaging by an integer factor is many times faster.
         image = _resized(image, samples * size[0], samples * size[1], cv2.INTER_NEAREST)
     return _resized(image, *size, cv2.INTER_AREA)
 
@@ -72,7 +72,7 @@ def enlarged(plane: NDArray[np.uint8], width_px: int, height_px: int) -> NDArray
 
 
 def sampled_mask(mask: NDArray[np.generic], step: int) -> NDArray[np.uint8]:
-    """Return 1 where the sampled pixels of a mask [H, W] are not 0."""
+    """Subsample a mask [H, W] by `step` and return uint8, 1 where the mask is not 0, else 0."""
     # Compare only sampled pixels if the mask consists of bytes.
     plane = mask.view(np.uint8) if mask.dtype in (np.uint8, np.bool_) else (mask != 0).view(np.uint8)
     return (sampled(plane, step) != 0).view(np.uint8)

@@ -45,7 +45,7 @@ AVERAGED_PX = 4
 SAME_LEVELS = 2
 """Largest difference, in levels of 255, at which pixels of two pictures count as equal; re-encoding causes such differences."""
 SAME_SHARE = 0.9995
-"""Share of equal pixels from which a picture repeats the previous one."""
+"""Share of equal pixels from which a picture counts as a repetition of the previous one."""
 FROZEN_S = 0.25
 """Seconds without a new picture after which the stream is frozen. Earlier repetitions count as duplicates."""
 FROZEN_FRAMES = 8
@@ -75,7 +75,7 @@ class SequenceCheck:
         self._new_since_ns = 0
         self._same_run = 0
         self._row_moves: NDArray[np.float64] = np.zeros(0)
-        """Recent frequency of changes of each row, 0..1."""
+        """Share of recent frames in which each row of the reduced picture changed, 0..1."""
         self._frames_seen = 0
         self._torn_run = 0
 
@@ -105,7 +105,7 @@ class SequenceCheck:
         if self._torn_run > TORN_FRAMES:
             torn, self._torn_run, self._frames_seen = False, 0, 0
         if not torn:
-            # Adapt quickly at first, then average over about the last 50 frames.
+            # Update the frequency of row changes quickly at first, then as an average over about the last 50 frames.
             self._frames_seen += 1
             self._row_moves += (changed - self._row_moves) / min(self._frames_seen, 50)
         return self._unusable(image, small) or ("torn" if torn else None)
@@ -202,7 +202,7 @@ GAP_INTERVALS = 4.0
 
 @dataclass(frozen=True)
 class Timing:
-    """Corrected time of a frame."""
+    """Corrected timestamp of a frame, and what was wrong with the original one."""
 
     pts_ns: int
     """Timestamp without clock jumps in nanoseconds; never decreases."""
@@ -400,7 +400,7 @@ def _sampled(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.fl
 
 
 def _change_of_bands(small: NDArray[np.uint8], before: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """Return the mean absolute change of each horizontal band."""
+    """Return the mean absolute change between two reduced pictures in each of the `BANDS` horizontal bands."""
     difference = cv2.absdiff(small, before).reshape(len(small), -1)
     rows = cv2.reduce(difference, 1, cv2.REDUCE_AVG, dtype=cv2.CV_32F).ravel()
     edges = [band * len(rows) // BANDS for band in range(BANDS + 1)]
@@ -453,7 +453,7 @@ class MaskCheck:
 
 @dataclass(frozen=True)
 class CheckedDepth:
-    """Depth of a frame without invalid values."""
+    """Result of the depth check: the depth map without invalid values, and what was found."""
 
     depth: NDArray[np.float32] | None
     """float32 [H, W] in millimetres, 0 = unknown; the given array if it is valid. None if discarded."""

@@ -95,10 +95,10 @@ class Node:
     operator: str
     """Name of the operator, a key of `OPERATORS`."""
     inputs: tuple[str, ...]
-    """Names of values; an omitted input has the name ""."""
+    """Names of the operator's input values, in order; an omitted optional input has the name ""."""
     output: str
     options: Mapping[str, Any]
-    """Attributes that `Operator.run` takes."""
+    """Values of the ONNX attributes that are passed to `Operator.run`, by name."""
 
 
 @dataclass(frozen=True)
@@ -181,7 +181,7 @@ OPERATORS: Mapping[str, Operator] = {
         _enlarged,
         fixed={
             "coordinate_transformation_mode": "asymmetric",
-            "cubic_coeff_a": -0.75,  # of the mode `cubic`; the exporter writes it for every mode
+            "cubic_coeff_a": -0.75,  # only the mode `cubic` uses it, but the exporter writes it for every mode
             "mode": "nearest",
             "nearest_mode": "floor",
         },

@@ -30,7 +30,7 @@ NETWORK = Path(__file__).with_name("tool_network.onnx")
 INPUT_PX = (96, 80)
 """Width and height of the network's input; pictures of any aspect are resized to it."""
 ROUND_NETWORK = Path(__file__).with_name("tool_network_round.onnx")
-"""Network of pictures whose view is round or octagonal."""
+"""File of the tool network for pictures whose view is round or octagonal; other pictures have their own network."""
 ROUND_INPUT_PX, ROUND_INPUTS = (128, 96), 8
 CORNER, DARK_CORNER = 1 / 16, 0.75
 """Side of the corners of a picture, as a share of its sides, and the share of a corner that is dark if the view is round. A patient's name or
@@ -222,7 +222,7 @@ are.
 SHARP_EDGE = 0.36
 """Smallest change of redness across a region's outline, within three pixels. Pale tissue and glare change gradually."""
 CORE = 0.35
-"""Share of a tool's region that must be clearly grey (`CLEARLY_BELOW`)."""
+"""Share of a region's pixels that must be clearly grey (`CLEARLY_BELOW`) for the region to be a tool."""
 CLEARLY_BELOW = 0.08
 """Distance of a pixel's redness below the threshold for tools from which the pixel counts as clearly grey."""
 KNOWN = 0.5
@@ -246,7 +246,7 @@ class Regions:
 
     redness: Plane
     threshold: float
-    """Redness below which a pixel is grey."""
+    """Redness below which a pixel counts as grey and may belong to a tool."""
     brightness: Bytes
     inside: Bytes
     """Field of view: 1 inside, 0 outside."""
@@ -255,7 +255,7 @@ class Regions:
     previous: Bytes | None
     """1 on tools of the previous frame, 0 elsewhere; None without a previous frame of the stream."""
     sharp_edge: float = SHARP_EDGE
-    """Smallest change of redness across a tool's outline."""
+    """Smallest mean change of redness across the outline of a region for the region to be a tool."""
 
     @property
     def whole(self) -> bool:
@@ -425,9 +425,9 @@ class View:
     """Frame reduced to the size at which tools are found."""
 
     redness: Plane
-    """Log of red over green and blue, [h, w]."""
+    """Redness of each pixel: logarithm of red relative to green and blue, [h, w]."""
     brightness: Bytes
-    """Largest channel, [h, w]."""
+    """Brightness of each pixel: largest of red, green and blue, [h, w]."""
     inside: Bytes
     """Field of view: 1 inside, 0 outside."""
     levels: NDArray[np.float64]
@@ -474,7 +474,7 @@ class ToolFinder:
         if self._previous is not None and self._previous.shape != view.redness.shape:
             self.reset()
         tools = self._find(view)
-        # Outlines are interpolated linearly between pixels of the working size.
+        # Enlarge the mask linearly, so that outlines are interpolated between pixels of the working size.
         tissue = np.empty((height, width), np.uint8)
         cv2.resize(tools, (width, height), dst=tissue, interpolation=cv2.INTER_LINEAR)
         cv2.threshold(tissue, 0, 1, cv2.THRESH_BINARY_INV, dst=tissue)

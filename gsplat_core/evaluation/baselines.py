@@ -252,7 +252,7 @@ def _neighbourhoods(recording: Iterable[Frame], most: int) -> Iterator[tuple[Fra
 
 
 class _Sums:
-    """Accumulator of the mean of each measure, by baseline."""
+    """Accumulator of the mean PSNRs of each baseline over the added frames."""
 
     def __init__(self) -> None:
         self._means: dict[tuple[str, object], tuple[ScoredMean, ...]] = {}

@@ -37,7 +37,7 @@ class FlatDepths(NamedTuple):
     level: Array
     """Median true depth at every pixel: a plane perpendicular to the optical axis."""
     plane: Array
-    """Plane of any tilt with the least squared error in z."""
+    """Depth of the tilted plane with the least squared error in z."""
 
 
 def flat_depths(rays: Array, z: Array) -> FlatDepths | None:
@@ -124,7 +124,7 @@ class DepthErrors:
     rmse_mm: float
     """Root mean square depth error in mm."""
     relative: float
-    """Mean absolute error divided by the true depth."""
+    """Mean over the pixels of the absolute depth error divided by the true depth."""
     scaled_rmse_mm: float
     """RMSE after scaling each frame by its median of true over rendered depth; measures shape alone."""
     covered: float

@@ -146,10 +146,10 @@ class PartShares:
     """
 
     motion: float
-    """Share of the squared error that the changes of positions and orientations remove."""
+    """Share of the frozen model's squared error that changes of positions and orientations over time remove."""
     colour: float
     size: float
-    """Share of the squared error that the changes of sizes and opacities remove."""
+    """Share of the frozen model's squared error that changes of sizes and opacities over time remove."""
     explained: float
     """Sum of the shares of motion, colour and size. The rest of the squared error remains in the complete model."""
     reference_s: float
@@ -217,7 +217,7 @@ def _subsets(names: tuple[str, ...]) -> list[frozenset[str]]:
 
 
 MOST_FRAMES = 48
-"""Maximum number of compared frames, spread evenly over the recording."""
+"""Maximum number of frames whose geometry is compared with the truth, spread evenly over the recording."""
 NO_SCALING = 0.005
 """Tolerance around a scale factor of 1. Within it, the scores of the scaled model are copied from the unscaled one
 instead of being rendered.
@@ -231,7 +231,7 @@ class Geometry:
     frames: int
     """Number of compared frames."""
     depth: DepthShare | None
-    """Errors of the blended depth of the Gaussians' centres."""
+    """Errors of the model's default depth: the blended depth of the Gaussians' centres."""
     normals: NormalErrors | None
     """Errors of the normals computed from the model's depth."""
     views: tuple[NovelView, ...]
@@ -354,7 +354,7 @@ def _picture_from(model: Model, camera: Camera) -> Callable[[Gaussians], NDArray
 
 
 def _is_chosen(frame: Frame, frame_count: int, most: int) -> bool:
-    """Return True for comparable frames among at most `most` evenly spaced ones."""
+    """Return True if a frame is fit for scoring and is one of at most `most` evenly spaced frames of the recording."""
     return frame.seq % -(-frame_count // most) == 0 and why_left_out(frame) is None
 
 

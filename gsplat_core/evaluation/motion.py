@@ -28,10 +28,10 @@ from gsplat_core.scene.gaussians import Gaussians
 
 WITHIN_PX = (4, 8, 16, 32, 64)
 WITHIN_MM = (2, 4, 8, 16, 32)
-"""Distance thresholds of the STIR challenge in mm; the score averages the shares within each."""
+"""Distance thresholds of the STIR challenge in mm. The score is the mean, over the thresholds, of the share of closer positions."""
 NEIGHBOURS = 8
 LEAST_OPACITY = 0.1
-"""Minimum opacity of Gaussians that carry tracked points."""
+"""Smallest opacity of the Gaussians whose motion moves the tracked points."""
 
 
 class CarriedPoints:

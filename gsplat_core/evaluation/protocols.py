@@ -39,7 +39,7 @@ from gsplat_core.training.metrics import ScoredMean, psnr_tissue_db, psnrs_db
 
 @dataclass(frozen=True)
 class Picture:
-    """Rendered picture that owns its memory."""
+    """Rendered picture and its depth in their own memory, which the renderer does not reuse."""
 
     image: NDArray[np.uint8]
     """RGB [H, W, 3] as displayed: clipped and rounded to 8 bits."""
@@ -87,7 +87,7 @@ class PictureMaker:
         with torch.inference_mode():
             if model is not self._prepared:
                 self._renderer.prepare(model if self._reads_snapshots else model.as_model())
-                # Do not keep a snapshot, because it would block its slot for training.
+                # Do not keep a snapshot for the next call: while it is referenced, training cannot reuse its slot.
                 self._prepared = model if isinstance(model, Model) else None
             found = self._renderer.render(camera, frame.time_s, self._outputs).outputs()
             output, along_rays = standard_outputs(found), found.get("ray_depth")
@@ -107,7 +107,7 @@ OUTSIDE = "outside of the model's time"
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Scores of a model on the held-out frames."""
+    """Scores of a model on the held-out frames, which were excluded from training."""
 
     score: Score
     """Score of the pictures rounded to 8 bits, as EndoGaussian measures its PNG files."""
@@ -289,7 +289,7 @@ class PlaceFinder:
         self._seen += 1
 
     def visits(self) -> list[Visits]:
-        """Return each return to a place, paired with the previous stay there."""
+        """Return each revisit of a place, as the previous and the new stay of the scope there."""
         if len(self._poses) < 3:
             return []
         times = [time_s for time_s, _ in self._poses]
@@ -359,7 +359,7 @@ class Retention:
     """Scores of the final model on frames from earlier in the stream."""
 
     last: Score
-    """Score on the last seconds of the stream."""
+    """Score of the final model on the frames of the last seconds of the stream."""
     last_range_s: Range
     frozen: BaselineScore
     """Baseline: the stream's last frame shown for all of the last seconds."""
@@ -470,7 +470,7 @@ def _within(frame: Frame, times: Range) -> bool:
 
 
 def _frozen(frames: Iterable[Frame], shown: Frame | None, tail: Range) -> BaselineScore:
-    """Return the score of one still picture on all other frames of a time range."""
+    """Return the score of the picture of the frame `shown`, as a still, on all other frames in the time range `tail`."""
     tissue, whole = ScoredMean(), ScoredMean()
     for frame in frames if shown is not None else ():
         assert shown is not None

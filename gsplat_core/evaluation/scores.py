@@ -102,13 +102,13 @@ class ScoreSums:
         return quality
 
     def take(self, quality: FrameQuality) -> None:
-        """Add measures computed elsewhere; non-finite values count as missing."""
+        """Add the measures of a frame that the caller has computed; non-finite values count as missing."""
         self._quality.take(quality)
         if quality.psnr_tissue_db < self._worst:
             self._worst, self._worst_seq = quality.psnr_tissue_db, quality.seq
 
     def leave_out(self, reason: str) -> None:
-        """Count an excluded frame."""
+        """Count a frame that is excluded from the score, by its reason."""
         self._left_out[reason] += 1
 
     @property
@@ -282,7 +282,7 @@ class LiveSums:
             )
 
     def leave_out(self, reason: str) -> None:
-        """Count a frame that is not scored."""
+        """Count a frame that is not scored, by its reason."""
         self._score.leave_out(reason)
 
     @property

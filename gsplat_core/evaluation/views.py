@@ -29,7 +29,7 @@ from gsplat_core.training.metrics import PSNR_CAP_DB, ScoredMean
 from gsplat_core.training.observations import right_tissue, typical_shift
 
 SAME_DEPTH = 0.02
-"""Relative depth tolerance within which two cameras see the same point."""
+"""Largest relative difference of two cameras' depths at which they count as seeing the same surface point."""
 LEAST_SEEN = 0.05
 """Smallest share of a view's pixels whose tissue the training camera sees; frames with less are not scored."""
 
@@ -41,7 +41,7 @@ class NovelView:
     name: str
     model: Score
     left: Score
-    """Baseline: left picture, unchanged."""
+    """Baseline: the left picture resampled to the view's intrinsics, as if both cameras were at the same place."""
     shifted: Score
     """Baseline: left picture reprojected as if all tissue were at its median distance.
 
@@ -191,7 +191,7 @@ class ViewSums:
 
 
 def _views_of(frame: Frame, truth: GroundTruth) -> Iterator[tuple[str, Camera, Frame]]:
-    """Yield name, camera and picture of each additional camera of a frame."""
+    """Yield name, camera and picture of each further camera of a frame: the right eye, and the novel views of the recording."""
     if frame.right_image is not None and frame.right_camera is not None:
         yield "right", frame.right_camera, Frame(frame.seq, frame.pts_ns, frame.right_image)
     for view in truth.views:
@@ -199,7 +199,7 @@ def _views_of(frame: Frame, truth: GroundTruth) -> Iterator[tuple[str, Camera, F
 
 
 EVERY = 10
-"""Sampling interval in frames; one frame in `EVERY` is scored."""
+"""Interval in frames between two frames of which the right eye's view is scored."""
 BORDER_PX = 10
 """Width in pixels of the excluded border at a picture width of `BORDER_OF_PX` or more.
 

@@ -40,7 +40,7 @@ MOVES_PX = 2.0
 FEWEST_PULL_POINTS = 30
 """Fewest points per picture on average with a deviation above `MOVES_PX` from which a pull is estimated."""
 SPREAD_PX = 0.7
-"""Cauchy scale in pixels of the points' deviations."""
+"""Cauchy scale in pixels of the points' deviations from the common direction of a pull."""
 ROUNDS = 8
 HEAD_ON = 0.05
 """Sine of the angle between pull and line of sight, added as regularisation; limits the estimate for motion seen head-on."""
@@ -55,7 +55,7 @@ class Pull:
     """Common direction in which a tool pulls tissue."""
 
     direction: Array
-    """Unit direction in camera coordinates, [3]."""
+    """Direction of the pull as a unit vector in camera coordinates, [3]."""
     error_px: float
     """Median deviation of the points' motion from the common direction, in pixels."""
 
@@ -132,7 +132,7 @@ FEWEST_POINTS = 100
 MOST_ERROR = 0.04
 """Relative error of a distance at which its confidence is one half. A window with a larger median error is rejected."""
 MOST_OFF_PX = 1.0
-"""Median error in pixels of the fitted motion above which it is rejected."""
+"""Median error in pixels above which a fitted motion or direction of pull is rejected."""
 OWN_MOTION = 3.0
 """Ratio of a point's assumed error along its line of sight to its measured error across it."""
 PULL_FRAMES = 3

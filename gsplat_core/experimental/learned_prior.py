@@ -107,14 +107,14 @@ class LocalShares:
 
 
 def cells_for(shape: Sequence[int]) -> tuple[int, int]:
-    """Return columns and rows of cells for fields [h, w, ...]."""
+    """Return the numbers of columns and rows of cells into which fields [h, w, ...] are divided for the mixing weights."""
     height, width = shape[:2]
     shrink = min(1.0, MOST_CELLS / max(height, width))
     return max(1, round(width * shrink)), max(1, round(height * shrink))
 
 
 def blurred(field: NDArray[np.float32], deviation: float) -> NDArray[np.float32]:
-    """Blur a field of any number of channels."""
+    """Blur a field [h, w, channels] with a Gaussian of standard deviation `deviation` in its pixels."""
     return np.asarray(cv2.GaussianBlur(field, (0, 0), deviation), np.float32).reshape(field.shape)
 
 
@@ -197,7 +197,7 @@ PICTURE_SHARES = SharesSettings(at_first=(0.0, 0.0, 0.0, 0.0), decay=0.95, aroun
 ones, the blurred picture, and the mean over other motions. Units are squared grey levels, 0 to 255.
 """
 INVERSE_STEPS = 2
-"""Fixed-point iterations for inverting a flow."""
+"""Number of fixed-point iterations by which a flow is inverted."""
 
 
 @dataclass(frozen=True)
@@ -285,7 +285,7 @@ def moved(picture: Field, motion: Flow) -> Field:
 
 
 def _looked_up(field: Field, back: Field) -> Field:
-    """Sample a field at positions shifted by -`back` [h, w, 2]."""
+    """Return the value of a field for each pixel at the pixel's position minus `back` [h, w, 2], in pixels."""
     height, width = field.shape[:2]
     columns, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
     looked_up = cv2.remap(
@@ -308,7 +308,7 @@ class Expectation:
 
     motion: SurfaceMotion
     picture: Tensor
-    """Colours [H, W, 3], 0 to 1."""
+    """Predicted colours of the next frame [H, W, 3], 0 to 1."""
     tissue: Tensor
     """Weights of the pixels [H, W], 1 on tissue."""
 

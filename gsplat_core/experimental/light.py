@@ -295,7 +295,7 @@ class Places:
     """Positions in a picture with the values and derivatives of the relief's cosine basis at them."""
 
     x: Array
-    """Ray coordinate x / z at each position, [places]."""
+    """Ray coordinate x / z (tangent of the horizontal angle) at each position, [places]."""
     y: Array
     value: Array
     """Value of each basis cosine at each position, [places, cosines]."""
@@ -305,7 +305,7 @@ class Places:
 
     @classmethod
     def at(cls, grid: Grid, column: Array, row: Array) -> Places:
-        """Evaluate the cosines at columns and rows of any shape, in cells."""
+        """Evaluate the relief's cosine basis at `column` and `row`, arrays of any shape in units of cells."""
         column, row = column.ravel(), row.ravel()
         order = np.arange(HALF_WAVES)
         across, down = (
@@ -334,7 +334,7 @@ class Appearance:
     """Appearance (brightness and highlights) of a relief and its derivatives by the coefficients [places, cosines]."""
 
     lit: Array
-    """Logarithm of brightness [places]."""
+    """Logarithm of the brightness that the relief predicts at each position, [places]."""
     lit_by: Array
     angle: Array
     """Angle between normal and ray [places], approximately in radians and rounded off near zero (`ROUND`)."""
@@ -421,9 +421,9 @@ class Reliefs:
     """Reliefs of a window: cosine coefficients of log depth at the key time (the reference), and their change at other times."""
 
     key: Array
-    """Coefficients at the key time, [cosines]."""
+    """Relief coefficients at the key time, one for each basis cosine, [cosines]."""
     changes: Array
-    """Change of the coefficients at each time, [times, cosines]."""
+    """Difference of the relief coefficients at each time from those at the key time, [times, cosines]."""
 
 
 class Equations:
@@ -490,7 +490,7 @@ class Brightness:
         ])  # fmt: skip
 
     def equations(self, key: Array, changes: Array, slopes: float) -> Equations:
-        """Return the linearised equations at the current relief."""
+        """Return the cue's normal equations, linearised at the current reliefs: `key` plus each of `changes`."""
         shown = [
             appearance(each, key + changes[time], slopes) for each, time in zip(self._places, self._times, strict=True)
         ]
@@ -558,7 +558,7 @@ class Glints:
         self._looks = min(GLINT_LOOKS, len(shadings)) / len(shadings)
 
     def equations(self, key: Array, changes: Array) -> Equations:
-        """Return the linearised equations at the current relief."""
+        """Return the cue's normal equations, linearised at the current reliefs: `key` plus each of `changes`."""
         shown: list[Appearance] = [appearance(self._places, key + change) for change in changes]
         angle, by_relief = (
             np.concatenate([each.angle for each in shown]),

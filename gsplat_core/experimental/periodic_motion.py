@@ -50,7 +50,7 @@ Array = NDArray[np.float64]
 NODES = 9, 8
 """Number of nodes of the grid of motion vectors along the picture's width and height."""
 OUTSIDE = 0.15
-"""Extension of the grid beyond the picture, as a share of its side."""
+"""Extension of the grid of motion vectors beyond each edge of the picture, as a share of the picture's side."""
 AMPLITUDE = 0.04
 """Prior standard deviation of the motion's amplitudes, relative to the tissue's distance."""
 BEND = 0.008
@@ -283,7 +283,7 @@ def _at_one_distance(tracks: GridTracks) -> Array:
 AROUND_PX = 24.0
 """Standard deviation in pixels of a point's neighbourhood, over which errors are averaged."""
 CELL_PX = 4
-"""Side of the cells in which deviations are accumulated, in pixels."""
+"""Side in pixels of the cells in which points' deviations are summed before they are averaged over neighbourhoods."""
 FAR_OFF_PX = 8.0
 """Cauchy scale in pixels; points with larger errors are mistracked or on the tool and have little
 weight for their neighbours.
@@ -347,7 +347,7 @@ STEP_CYCLES = 0.25
 COARSE, FINE = (5, 5), (8, 7)
 """Node counts of the motion fits used for comparison: in the coarse search and near the optimum."""
 POINTS, TIMES = 400, 48
-"""Numbers of points and times used for the search."""
+"""Largest numbers of points and of times that the search for frequencies uses."""
 ROUNDS = 4
 BREATHES, BEATS = 0.9, 0.96
 """Largest ratio of the robust cost with a frequency to the cost without, from which breathing and

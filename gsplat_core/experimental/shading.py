@@ -34,7 +34,7 @@ CELLS = 40
 BRIGHTEST, DARKEST = 249, 20
 """Levels of the brightest channel above which a pixel is clipped and below which it is noise."""
 DARKEST_CHANNEL = 5
-"""Level of any channel below which its logarithm is noise."""
+"""Level (0 to 255) of a channel below which its logarithm is noise and the pixel is not used."""
 SHOULDER = 0.8
 """Strength of the camera's highlight compression: linear light x is recorded as (1 - exp(-SHOULDER
 x)) / SHOULDER. It differs between cameras.
@@ -62,7 +62,7 @@ class Cells:
     brightness: NDArray[np.float64]
     """Log brightness without pigment up to an offset, [h, w]; meaningless where `share` is too small."""
     share: NDArray[np.float64]
-    """Share of usable pixels in each cell, [h, w]."""
+    """Share of each cell's pixels that are usable (well-exposed tissue), [h, w]."""
     detail: float
     """Standard deviation of brightness between neighbouring cells caused by remaining pigment and noise."""
 
@@ -210,7 +210,7 @@ def _log_light() -> NDArray[np.float32]:
 
 _LOG_LIGHT = _log_light()
 RETURN_PX = 1.0
-"""Largest accepted forward-backward error of the flow, in pixels."""
+"""Largest forward-backward error in pixels of the optical flow at a pixel that counts as tracked."""
 MOST = 0.5
 """Largest change of a tracked pixel's log brightness that is used; larger changes are tracking errors or shadows."""
 LEAST_FOUND = 0.6
@@ -223,7 +223,7 @@ more.
 
 @dataclass(frozen=True)
 class Look:
-    """Shading and texture of one picture, as input of the comparison with others."""
+    """Precomputed shading and texture of one picture, from which its changes against other pictures are computed."""
 
     shading: Shading
     picture: SmallPicture
@@ -252,7 +252,7 @@ class Change:
 
     @property
     def is_followed(self) -> bool:
-        """True if the other picture shows the same tissue with little change."""
+        """True if enough tissue was tracked into the other picture (`LEAST_FOUND`) and its brightness changed evenly (`WIDEST`)."""
         known = self.known
         return self.found >= LEAST_FOUND and bool(known.any()) and float(np.std(self.brighter[known])) <= WIDEST
 

@@ -37,7 +37,7 @@ BORDER_PX = 6
 RETURN_PX = 1.0
 """Largest accepted forward-backward error of the flow, in pixels."""
 LEAST_SEEN = 0.3
-"""Share of the pictures in which a point must be observed."""
+"""Smallest share of the pictures in which a grid point must be observed to be kept."""
 
 Picture = NDArray[np.uint8]
 
@@ -49,7 +49,7 @@ class TexturedPicture:
     texture: Picture
     """Normalised texture, uint8 [H, W]."""
     usable: Picture
-    """Validity, uint8 [H, W]; 1 where tissue can be tracked."""
+    """Mask uint8 [H, W]: 1 where tissue can be tracked, 0 elsewhere."""
     camera: Camera
 
 
@@ -60,7 +60,7 @@ class GridTracks:
     rays: NDArray[np.float64]
     """Observed rays as x / z and y / z, float64 [T, N, 2]."""
     seen: NDArray[np.bool_]
-    """Validity of `rays`, bool [T, N]."""
+    """True where the point was observed in the picture, bool [T, N]; other `rays` are meaningless."""
     poses: NDArray[np.float64]
     """World-to-camera poses, float64 [T, 4, 4]."""
     times_s: NDArray[np.float64]
@@ -70,7 +70,7 @@ class GridTracks:
     """Half the picture's width and height, in units of the focal length as `rays`."""
 
     def of(self, points: NDArray[Any] | slice, times: NDArray[Any] | slice = slice(None)) -> GridTracks:
-        """Return the tracks of selected points, optionally at selected times only."""
+        """Return the tracks of the points selected by index or mask, optionally at selected times only."""
         return GridTracks(
             self.rays[times][:, points],
             self.seen[times][:, points],

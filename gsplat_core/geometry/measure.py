@@ -45,7 +45,7 @@ class SurfacePoint:
     position: tuple[float, float, float]
     """Position of the surface point in world coordinates."""
     depth: float
-    """z in camera coordinates, in the scene's unit."""
+    """Depth of the point: z in camera coordinates, in the scene's unit."""
     depth_error: float
     """Standard error of `depth`, in its unit. The point is exactly on the pixel's ray."""
     source_error: float

@@ -60,7 +60,7 @@ def in_world(points: Array, camera: Camera) -> NDArray[np.float64]:
 
 
 def known(depth: Array) -> NDArray[np.bool_]:
-    """Return where a depth map is known, bool [H, W]."""
+    """Return a bool mask [H, W], True where a depth map is finite and positive."""
     return np.asarray(np.isfinite(depth) & (depth > 0))
 
 
@@ -93,7 +93,7 @@ def normals_of(depth: Array, camera: Camera) -> NDArray[np.float32]:
     """
     points = points_of(depth, camera)
     (across, has_across), (down, has_down) = (_tangent(points, joined(depth, camera, axis), axis) for axis in (1, 0))
-    normals = np.cross(down, across)  # with x right and y down, this points towards the camera
+    normals = np.cross(down, across)  # down x across: with x right and y down, the normal points towards the camera
     length = np.linalg.norm(normals, axis=-1)
     good = has_across & has_down & (length > 0)
     normals = np.where(good[..., None], normals / np.where(length > 0, length, 1)[..., None], 0)

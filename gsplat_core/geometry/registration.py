@@ -160,7 +160,7 @@ class Registration:
     scale: float
     rounds: int
     rmse: float
-    """Root mean square point-to-plane distance of the pairs used."""
+    """Root mean square point-to-plane distance of the pairs of closest points that the registration used."""
 
 
 @dataclass(frozen=True)

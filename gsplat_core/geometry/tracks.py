@@ -69,7 +69,7 @@ def followed(
 
 
 MOST_POINTS = 700
-"""Largest number of points tracked at once."""
+"""Largest number of points that `FeatureTracks` tracks at once."""
 APART = 0.025
 """Smallest distance between points when they are detected, as a share of the longer side."""
 LEAST_QUALITY = 0.005
@@ -215,7 +215,7 @@ STREAM_APART = 0.03
 STREAM_PATCH_PX = 17
 """Side of the square patch that is tracked, in pixels."""
 STREAM_RETURN_PX = 0.5
-"""Largest accepted forward-backward error in pixels."""
+"""Largest forward-backward error in pixels of a point that counts as tracked in a stream."""
 STREAM_BORDER_PX = 6
 SAME_PX = 3.0
 """Distance in pixels below which two tracked points count as one point."""
@@ -230,7 +230,7 @@ class SmallPicture:
     grey: NDArray[np.uint8]
     """Grey levels uint8 [h, w]."""
     usable: NDArray[np.uint8]
-    """Validity uint8 [h, w]; 0 on tools, highlights and the border."""
+    """Mask uint8 [h, w] of trackable pixels; 0 on tools, highlights and the border."""
     camera: Camera
     """Camera scaled to the size of the reduced picture."""
 
@@ -309,7 +309,7 @@ class StreamTracks:
         self.pixels: Points = np.zeros((0, 2), np.float32)
         """Positions of the tracked points in the last picture, [N, 2]."""
         self.numbers: Numbers = np.zeros(0, np.int64)
-        """Numbers of the points, ascending."""
+        """Unique numbers of the tracked points, in ascending order."""
         self.first: Points = np.zeros((0, 2), np.float32)
         """Pixel position at which each tracked point was first detected, [N, 2]."""
         self._next = 0

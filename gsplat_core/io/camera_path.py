@@ -168,7 +168,7 @@ def _inverse(pose: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _turned(first: NDArray[np.float64], second: NDArray[np.float64], share: float) -> NDArray[np.float64]:
     """Interpolate between two rotations [3, 3] by `share` along the geodesic (Rodrigues' formula)."""
-    import cv2  # imported lazily, because most processes read no path
+    import cv2  # imported only here, because most processes do not use a camera path
 
     between, _ = cv2.Rodrigues(first.T @ second)
     part, _ = cv2.Rodrigues(share * between)

@@ -161,7 +161,7 @@ class PartialFile:
         _unfinished.discard(self.path)
 
     def discard(self) -> None:
-        """Remove the temporary file unless it is finished."""
+        """Remove the temporary file unless `finish` has renamed it already."""
         if self.path not in _unfinished:
             return
         with contextlib.suppress(
@@ -254,7 +254,7 @@ def replace_durably(source: Path, target: Path) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Sync a folder's entries to disk (unnecessary on systems such as Windows)."""
+    """Sync a folder's entries to disk, so that a rename survives a power failure; no effect on systems such as Windows."""
     if not hasattr(os, "O_DIRECTORY"):
         return
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)

@@ -82,7 +82,7 @@ MAX_FIELDS_BYTES = 1 << 16
 MAX_PIECES = 2 + len(ARRAYS)
 MAX_PIXELS = 2**26
 MESSAGE_ARRAYS = ("image", "right_image", "depth", "mask", "pose")
-"""Arrays accepted in messages of other programs."""
+"""Names of the array fields that messages of other programs may have."""
 MAX_MESSAGE_PIXELS = 2**24
 """Maximum number of pixels of a picture from another program, 4096x4096, which bounds the size of a message."""
 
@@ -107,9 +107,9 @@ def _is_origin(name: str) -> str:
 
 
 Pose = Annotated[tuple[Number, ...], Field(min_length=16, max_length=16), AfterValidator(_is_pose)]
-"""Matrix [4, 4] in row-major order, OpenCV axes."""
+"""World-to-camera matrix [4, 4] as 16 numbers in row-major order, OpenCV axes."""
 Origin = Annotated[Text, AfterValidator(_is_origin)]
-"""Name in `DEPTH_ORIGINS`."""
+"""Name of a depth origin, a key of `DEPTH_ORIGINS`."""
 
 
 class Record(BaseModel):
@@ -180,7 +180,7 @@ _Name = TypeVar("_Name", bound=str)
 
 
 def arrays_of(frame: Frame, names: Iterable[_Name]) -> dict[_Name, NDArray[Any]]:
-    """Return the arrays that a frame has, by field."""
+    """Return those of the array fields `names` that are not None in a frame, by name."""
     return {name: array for name in names if (array := getattr(frame, name)) is not None}
 
 

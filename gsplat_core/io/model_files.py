@@ -116,7 +116,7 @@ def gaussians_of(
     logits: NDArray[np.float32],
     sh: NDArray[np.float32],
 ) -> Gaussians:
-    """Return Gaussians that share the memory of the arrays."""
+    """Return Gaussians whose tensors share the memory of the NumPy arrays."""
     # Imported lazily, because the service opens model files in processes without torch.
     import torch
 

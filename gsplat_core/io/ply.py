@@ -395,7 +395,7 @@ class Element:
 
     @property
     def nbytes(self) -> int:
-        """Size of all rows in bytes."""
+        """Total size in bytes of the element's rows."""
         return self.count * self.layout.itemsize
 
     @property

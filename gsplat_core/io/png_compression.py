@@ -36,7 +36,7 @@ COARSE = 256
 KMEANS_ROWS = 1 << 24
 """Largest number of distances between rows and centroids that k-means computes at a time, to bound memory."""
 _PICTURES = {"means": 16, "scales": 8, "quats": 8, "opacities": 8, "sh0": 8}
-"""Bits per value of the tensors that are stored as pictures."""
+"""Number of bits per value of each tensor that is stored as pictures; `shN` is stored by cluster instead."""
 _CLUSTERED = "shN"
 
 

@@ -36,11 +36,11 @@ PIECE_BYTES = 1 << 17
 
 
 class ZstdError(Exception):
-    """The library is missing, or the stream is damaged or truncated."""
+    """libzstd is not installed, or a Zstandard stream is damaged or truncated."""
 
 
 class _Buffer(ctypes.Structure):
-    """`ZSTD_inBuffer` and `ZSTD_outBuffer`, which have the same layout."""
+    """C structure of libzstd's `ZSTD_inBuffer` and `ZSTD_outBuffer`, which have the same layout."""
 
     _fields_ = (("data", ctypes.c_void_p), ("size", ctypes.c_size_t), ("done", ctypes.c_size_t))
 

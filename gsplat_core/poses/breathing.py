@@ -68,7 +68,7 @@ class _Try:
 
 
 def waves(times_s: Tensor, frequencies_hz: Sequence[float]) -> Tensor:
-    """Return cosine and sine of each frequency at each time, [T, 2 F]."""
+    """Return the cosine and sine of each frequency's phase 2π f t at each time, [T, 2 F]."""
     return waves_of(2 * torch.pi * times_s[:, None] * torch.tensor(frequencies_hz, dtype=times_s.dtype))
 
 

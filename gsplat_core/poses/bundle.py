@@ -159,7 +159,7 @@ def _seen(pose: Array, points: Array, rays: Array, focal_px: float) -> tuple[Arr
 
 
 def _by_twist(local: Array) -> Array:
-    """Return the derivatives of rays by a twist of the camera, [N, 2, 6]."""
+    """Return the derivatives of the rays of points [N, 3] in camera coordinates by a twist of the camera, [N, 2, 6]."""
     x, y, z = local.T
     result = np.zeros((len(local), 2, 6))
     result[:, 0, 0] = result[:, 1, 1] = 1 / z

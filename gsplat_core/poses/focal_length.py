@@ -54,7 +54,7 @@ class FocalLength:
 
     assumed_px: float
     best_px: float
-    """Focal length with the least error."""
+    """Focal length in pixels with the least robust reprojection error."""
     range_px: tuple[float, float]
     """Lowest and highest plausible focal length. At a bound of the search the true range may be wider."""
     known: bool

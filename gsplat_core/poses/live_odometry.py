@@ -166,7 +166,7 @@ class LiveOdometry:
         self.returned = 0
         """Number of times an earlier key frame was recognised."""
         self.is_measured = False
-        """True if lengths have the unit of the frames' depth."""
+        """True if the poses have the unit of the frames' measured depth; otherwise their scale is arbitrary."""
         self._error_px = self._still_px = 0.0
 
     def place(self, frame: Frame) -> NDArray[np.float64]:
@@ -341,7 +341,7 @@ class LiveOdometry:
 
 
 WINDOW = 12
-"""Number of newest key frames whose poses are adjusted."""
+"""Number of newest key frames whose poses bundle adjustment changes."""
 ANCHORS = 5
 """Number of earlier key frames sharing points with the newest ones whose poses are fixed in the adjustment."""
 MOST_KEY_FRAMES = 40
@@ -368,7 +368,7 @@ class KeyFrame:
     picture: SmallPicture
     rays: NDArray[np.float64]
     features: Any = None
-    """ORB corners and descriptors, computed on first use."""
+    """ORB corners and descriptors of the key frame's picture; None until they are first used."""
 
     @property
     def position(self) -> NDArray[np.float64]:
@@ -558,20 +558,20 @@ FEWEST_MATCHES, MATCH_PX = 12, 8.0
 their depth is interpolated from known points.
 """
 TRIES = 100
-"""Number of RANSAC iterations for the pose from feature matches."""
+"""Number of RANSAC iterations in the estimate of a pose from feature matches."""
 Pose = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Recognised:
-    """Key frame recognised in a picture."""
+    """Key frame recognised in a new picture, with the pose of that picture."""
 
     key: KeyFrame
     places: LocalMap
     pose: Pose
     """World-to-camera pose [4, 4] of the picture, estimated from the recognised points alone."""
     numbers: Numbers
-    """Numbers of the points found, ascending."""
+    """Numbers of the key frame's points that were found in the picture, ascending."""
     pixels: Points
     """Pixel positions of the recognised points, [N, 2]."""
 

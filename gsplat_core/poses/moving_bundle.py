@@ -44,7 +44,7 @@ class TrajectoryPrior:
     """Prior of a camera trajectory, a normal distribution of the cameras' coordinates (`coordinates`)."""
 
     precision: Tensor
-    """Precision matrix of each coordinate, [6, C, C]."""
+    """Precision (inverse covariance) matrix over the cameras for each of the six camera coordinates, [6, C, C]."""
     uncertain: float
     """Root mean square uncertainty of the camera positions' motion at the given frequencies, in units of the tissue's
     distance.
@@ -249,7 +249,7 @@ class Rhythm:
     phases: Tensor
     """Estimated phase of each frequency at each camera's time, in radians, [C, F]."""
     expected: Tensor
-    """Phases of a constant rate in radians [C, F]."""
+    """Phases that constant rates would have at the cameras' times, in radians, [C, F]."""
     precision: Tensor
     """Prior precision matrices of `phases` - `expected`, one per wave frequency, [F, C, C]."""
 
@@ -330,7 +330,7 @@ class MovingBundle:
     field: SurfaceField
     """Nodes and prior of the motion field."""
     rhythm: Rhythm | None = None
-    """Phases of the waves; None if the waves are given."""
+    """Phases of the waves, which the adjustment estimates; None if the waves are given and fixed."""
 
     def places(self) -> Tensor:
         """Return the world position of the point at each observation, [K, 3]."""

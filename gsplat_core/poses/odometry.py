@@ -57,7 +57,7 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import BELIEVED, RELATIVE_DISTANCE, Frame
 
 LEAST_SEEN = 4
-"""Fewest frames in which a point must be observed."""
+"""Fewest frames in which a point must be observed to be used."""
 LEAST_POINTS = 24
 """Fewest known points that a frame must observe to be placed."""
 MOST_FRAMES = 3000
@@ -321,7 +321,7 @@ class _Odometry:
 
 
 PAIRS = 12
-"""Number of pairs of frames that are compared, spread over the recording."""
+"""Number of pairs of frames, spread over the recording, from which `rigid_share` tests for a moving scope."""
 APART_S = 0.3
 """Time between the frames of a pair in seconds, but at least one frame interval."""
 LONGEST_APART_S = 1.0
@@ -329,7 +329,7 @@ LONGEST_APART_S = 1.0
 RECENT_PAIRS, FEWEST_PAIRS = 5, 3
 """Number of newest pairs of frames of a stream over which the median is taken, and the least number for a result."""
 LONGEST_PX = 320
-"""Longer side of the compared pictures in pixels."""
+"""Longer side in pixels to which pictures are reduced in the test for a moving scope."""
 MOST_CORNERS, CORNERS_APART_PX = 300, 6
 LEAST_MOTION = 0.005
 """Median motion of the corners, as a share of the longer side, below which the scope counts as static."""
@@ -357,7 +357,7 @@ def rigid_share(frames: Sequence[Frame]) -> float:
 
 
 class MotionTest:
-    """`rigid_share` of the newest frames of a stream."""
+    """Test for a moving scope in a stream: `rigid_share` of the newest frames."""
 
     def __init__(self) -> None:
         self._first: Frame | None = None

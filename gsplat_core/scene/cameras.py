@@ -83,14 +83,14 @@ class Camera:
 
     @property
     def viewmat(self) -> Tensor:
-        """World-to-camera as a float32 tensor [4, 4]."""
+        """World-to-camera matrix as a float32 tensor [4, 4]."""
         import torch
 
         return torch.tensor(self.world_to_camera, dtype=torch.float32)
 
     @property
     def intrinsics(self) -> Tensor:
-        """K as a float32 tensor [3, 3]."""
+        """Intrinsic matrix K as a float32 tensor [3, 3]."""
         import torch
 
         return torch.tensor(self.K, dtype=torch.float32)

@@ -20,7 +20,7 @@ from gsplat_core.errors import InvalidInput
 
 LENS_MODELS = ("pinhole", "ortho", "fisheye", "ftheta")
 WIDEST_PINHOLE_RAD = math.radians(89)
-"""Largest angle to the axis that a pinhole lens maps to a pixel."""
+"""Largest angle to the optical axis, in radians, of points that a pinhole lens projects to pixels."""
 _FOLD_SAMPLES, _FOLD_LEVELS = 512, 3
 _BISECTIONS = 14
 _NEWTON_STEPS = 6
@@ -47,7 +47,7 @@ class FThetaCameraDistortionParameters:
     angle_to_pixeldist_poly: tuple[float, ...]
     """Six coefficients of the distance in pixels by the angle in radians, constant first."""
     max_angle: float
-    """Largest angle to the axis in radians."""
+    """Largest angle to the optical axis, in radians, that the lens maps to a pixel."""
     linear_cde: tuple[float, ...]
     """(c, d, e) of the matrix [[c, d], [e, 1]], which maps radial offsets to pixels."""
 
@@ -62,7 +62,7 @@ class FThetaCameraDistortionParameters:
 
 
 class Pixels(NamedTuple):
-    """Projected points."""
+    """Pixel positions of projected points, and their validity."""
 
     points: Tensor
     """Pixel positions [..., C, M, 2]; the first pixel's centre is at (0.5, 0.5)."""
@@ -183,7 +183,7 @@ class Lens:
             front = points[..., 2] > 0
         if self.model == "ortho":
             return Pixels(_to_pixels(points[..., :2], Ks), points.isfinite().all(-1))
-        # A masked value behind the camera would reach the gradient.
+        # Replace depths behind the camera before the division: masking the result would leave NaN in the gradient.
         depth = torch.where(front, points[..., 2], torch.ones_like(points[..., 2]))
         points = torch.cat(
             [torch.where(front[..., None], points[..., :2], torch.zeros_like(points[..., :2])), depth[..., None]], -1

@@ -24,7 +24,7 @@ class DepthOrigin:
     """Origin of depth, with the uses that its accuracy permits. The defaults suit an estimator without a known scale."""
 
     name: str
-    """Name in files and reports."""
+    """Name of the origin in files and reports."""
     relative_error: float
     """Assumed relative standard error, in addition to the errors visible in a model."""
     scale: Literal["metric", "calibrated", "relative"] = "relative"
@@ -65,7 +65,7 @@ class DepthOrigin:
     """
 
     def is_metric(self, eyes_calibrated: bool) -> bool:
-        """Return True if depth of this origin is in millimetres."""
+        """Return True if depth of this origin is in millimetres. `eyes_calibrated`: the frame's right camera is known."""
         return self.scale == "metric" or (self.scale == "calibrated" and eyes_calibrated)
 
 
@@ -122,7 +122,7 @@ class Frame:
     pts_ns: int
     """Presentation time in nanoseconds of the recording's clock."""
     image: NDArray[np.uint8]
-    """RGB uint8 [H, W, 3]."""
+    """Picture of the (left) camera, RGB uint8 [H, W, 3]."""
     right_image: NDArray[np.uint8] | None = None
     """Picture of the right eye of a rectified stereo pair, RGB uint8 [H, W, 3]; None without one."""
     right_camera: Camera | None = None
@@ -143,7 +143,7 @@ class Frame:
     """World-to-camera matrix [4, 4] in OpenCV axes; None if unknown."""
     status: FrameStatus = FrameStatus.REPLAY
     damage: str | None = None
-    """Description of the damage; None for an intact frame."""
+    """Description of the damage of a damaged picture; None for an intact frame."""
     arrived_ns: int | None = None
     """Arrival time of a live frame in nanoseconds of `time.monotonic_ns`; None if not live."""
     loss_mask: NDArray[np.uint8] | None = None
@@ -256,7 +256,7 @@ def resized_frame(frame: Frame, width_px: int, height_px: int) -> Frame:
 
 def resize_area(image: NDArray[np.uint8], width_px: int, height_px: int) -> NDArray[np.uint8]:
     """Resize an image [H, W, C], by area averaging if it becomes smaller."""
-    import cv2  # here, because the control plane passes frames on without OpenCV
+    import cv2  # imported only here, because the control plane passes frames on without OpenCV
 
     shrinks = width_px <= image.shape[1] and height_px <= image.shape[0]
     interpolation = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR

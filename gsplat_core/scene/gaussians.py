@@ -24,7 +24,7 @@ MAX_SH_DEGREE = 4
 SH_C0 = 0.28209479177387814
 """The constant basis function Y00 = 1 / (2 sqrt(pi)); a colour c has the coefficient (c - 0.5) / SH_C0."""
 EXTRA_PREFIX = "extra."
-"""Prefix of the names of `Gaussians.extra` in `Gaussians.tensors`."""
+"""Prefix that `Gaussians.tensors` puts before the names of the tensors in `Gaussians.extra`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +138,7 @@ class Gaussians:
         return self if self.right_sh is None else replace(self, sh=self.sh + self.right_sh, right_sh=None)
 
     def with_right(self, wanted: bool = True) -> Gaussians:
-        """Return the Gaussians with `right_sh` (zeros if missing), or without it."""
+        """Return the Gaussians with the tensor `right_sh` (zeros if missing) if `wanted`, otherwise without it."""
         if (self.right_sh is not None) == wanted:
             return self
         return replace(self, right_sh=torch.zeros_like(self.sh) if wanted else None)
@@ -208,7 +208,7 @@ LOG_SCALE = slice(7, 10)
 COLOUR = slice(10, 13)
 """Columns of the delta of the degree-0 spherical-harmonics coefficient: red, green, blue."""
 OPACITY = slice(13, 14)
-"""Column of the opacity logit in a raw row."""
+"""Column of the opacity-logit delta in a raw row."""
 
 
 def width_of(*groups: slice) -> int:
@@ -304,7 +304,7 @@ class GaussianRows:
         self._use(moves.count)
 
     def _beside(self, others: Gaussians) -> Iterator[tuple[Tensor, Tensor]]:
-        """Yield pairs of each tensor in use and the corresponding tensor of `others`."""
+        """Return pairs of tensors: each tensor of the rows in use, and the tensor of the same name of `others`."""
         others = others.like(self.used)
         return zip(self.used.tensors().values(), others.tensors().values(), strict=True)
 

@@ -30,7 +30,7 @@ class RangeSensor:
     nearest: float
     """Depth or distance at the first bin's near edge, in the scene's unit."""
     farthest: float
-    """Depth or distance at the last bin's far edge."""
+    """Depth or distance at the last bin's far edge, in the scene's unit."""
     bins: int = 256
     form: Form = "column"
     """`column` for one histogram for each column of the picture, `image` for a single one."""
@@ -93,7 +93,7 @@ class OctLine(RangeSensor):
     """Optical coherence tomography along one row of the picture: a B-scan with an A-scan for each column."""
 
     row: float = 0.5
-    """Position of the line, 0 at the top of the picture to 1 at the bottom."""
+    """Vertical position of the scanned line, from 0 at the top of the picture to 1 at its bottom."""
     thickness_px: int = 1
 
     name = "oct_line"

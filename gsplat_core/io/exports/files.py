@@ -91,7 +91,7 @@ FLOAT, UNSIGNED_SHORT = 5126, 5123
 ARRAY_BUFFER = 34962
 POINTS = 0
 TURN_X = [1.0, 0.0, 0.0, 0.0]
-"""Quaternion of a half turn around x, as x, y, z, w."""
+"""Quaternion xyzw of a half turn around x, which converts OpenCV axes (y down, z forward) to those of glTF."""
 METRES_PER_UNIT = 0.001
 MOST_BYTES = 2**32 - 1
 

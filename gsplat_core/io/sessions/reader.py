@@ -73,7 +73,7 @@ class SessionReader:
         self.fields = frozenset(FIELDS).intersection(*(segment.fields for segment in playable))
         """Optional fields that every readable frame has."""
         self.notes: list[str] = []
-        """Sentences that describe missing data."""
+        """Sentences for the user about missing or damaged parts of the recording."""
         self._take_notes()
 
     @property
@@ -165,7 +165,7 @@ class SessionReader:
         return next((line for line in self.segments[0].lines() if isinstance(line, ReconstructorMade)), None)
 
     def files(self) -> list[Path]:
-        """Return every file that is read, sorted."""
+        """Return the paths of all files of the session that are read, sorted."""
         return [self.folder / SESSION_FILE, *(path for segment in self.segments for path in segment.files())]
 
     def _take_notes(self) -> None:
@@ -314,7 +314,7 @@ class SessionContents:
             yield frame
 
     def files(self) -> list[Path]:
-        """Return every file that is read."""
+        """Return the paths of all files of the session that are read."""
         return self.reader.files()
 
     def digest(self) -> str:

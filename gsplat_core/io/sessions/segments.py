@@ -49,7 +49,7 @@ Stage = Literal["", "prepared_", "late_"]
 passed to training later.
 """
 MOST_FILES = 64
-"""Maximum number of track files; a segment that needs more is ended."""
+"""Maximum number of track files of a segment; if another one is needed, a new segment is started."""
 
 
 def track_file(stage: str, track: str, height_px: int, width_px: int) -> str:
@@ -159,7 +159,7 @@ class SegmentReader:
         self.first: FrameLine | None = None
         """Line of the first readable frame."""
         self.fields = frozenset(FIELDS)
-        """Optional fields that all frames have."""
+        """Names of the optional frame fields that all readable frames of the segment have."""
         self._indices: dict[str, TrackIndex | None] = {}
         self._look(after_seq)
 
@@ -173,14 +173,14 @@ class SegmentReader:
             return  # a log that cannot be read counts as ending here, like a truncated one
 
     def there(self, line: PictureLine) -> bool:
-        """Return True if all pictures of a line are complete in their files."""
+        """Return True if all pictures that a log line refers to are complete in their track files."""
         return all(
             (index := self._index(_file(line, track))) is not None and time in index
             for track, time in line.tracks.items()
         )
 
     def open(self) -> SegmentPictures:
-        """Open the pictures for one pass over the lines."""
+        """Return a decoder of the segment's pictures for one pass over its log lines."""
         return SegmentPictures(self._indices, self.folder)
 
     def files(self) -> list[Path]:
@@ -321,7 +321,7 @@ def encoder_options(coding: Coding, height_px: int, width_px: int) -> dict[str, 
 
 
 def coded_size(coding: Coding, height_px: int, width_px: int) -> tuple[int, int]:
-    """Return height and width of the coded pictures."""
+    """Return height and width of the coded video, which can exceed those of a picture [height_px, width_px]."""
     if coding == "vp9":
         return height_px + height_px % 2, width_px + width_px % 2
     return (_FLOAT_BYTES * height_px if coding == "float" else height_px), width_px
@@ -566,7 +566,7 @@ class TrackReader:
             pictures.close()  # type: ignore[attr-defined]
 
     def _decode(self) -> Iterator[tuple[int, NDArray[Any] | None, str | None]]:
-        """Yield timestamp, picture and damage of all pictures."""
+        """Yield each picture of the track: its timestamp in ms, the picture or None, and a description of damage or None."""
         with (
             open_plain(self._index.path) as file,
             open_container(_Beginning(file, self._index.end), Container("matroska")) as container,  # type: ignore[arg-type]

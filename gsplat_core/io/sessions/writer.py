@@ -78,7 +78,7 @@ class Retention:
         return sum(part.bytes for part in self._parts if part.segment is not None)
 
     def add(self, part: KeptPart) -> None:
-        """Add the newest part of a recorded session."""
+        """Add a finished part, newer than all others, to those that may be deleted."""
         self._parts.append(part)
 
     def give_up(self, now_ns: int) -> Iterator[tuple[KeptPart, str | None]]:
@@ -184,7 +184,7 @@ class Shown:
     """Picture as rendered, RGB uint8 [H, W, 3], without status overlay."""
     model_version: int
     on_screen: NDArray[np.uint8] | None = None
-    """Picture with its status overlay; None if displayed as rendered."""
+    """Picture as displayed, with its status overlay; None if it was displayed as rendered."""
     new: bool = True
     """False if only status or age of the picture on the screen changed."""
     shown_ns: int | None = None
@@ -312,7 +312,7 @@ class SessionWriter:
         self._segment.close(why)
 
     def abandon(self, why: str) -> None:
-        """Close all files after a failed write, as `SegmentWriter.abandon` does."""
+        """Close all files after a failed write, without encoding pending pictures and without syncing to disk."""
         self._segment.abandon(why)
 
     def _pictures(self, stage: Stage, planes: dict[TrackName, NDArray[Any]], pts_ns: int) -> dict[TrackName, int]:
@@ -371,7 +371,7 @@ class SessionWriter:
 
 
 def _said(frame: Frame) -> dict[str, Any]:
-    """Return the fields of a frame other than its arrays, for its log line."""
+    """Return the values of a frame's log line: all but its pictures."""
     return {
         **fields_of(frame),
         "seq": frame.seq,
