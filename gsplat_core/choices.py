@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 FIELDS: Registry[FieldKind[Any]] = Registry(
     "deformation field",
     {
-        # `auto` names the field with the better results in benchmarks/results/replay.md
+        # `auto` stands for the deformation field with the better results in benchmarks/results/replay.md
         "auto": "gsplat_core.deformation.basis:KIND",
         "basis": "gsplat_core.deformation.basis:KIND",
         "hexplane": "gsplat_core.deformation.hexplane:KIND",

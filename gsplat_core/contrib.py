@@ -66,7 +66,7 @@ def ssim_loss(img1: Tensor, img2: Tensor, window_size: int = SSIM_WINDOW_PX) -> 
 
 
 def depth_l1_loss(pred_depth: Tensor, gt_depth: Tensor, scene_scale: float = 1.0) -> Tensor:
-    """Return the mean absolute difference of inverse depths times `scene_scale`; depths up to 0 have the inverse 0."""
+    """Return the mean absolute difference of inverse depths times `scene_scale`; depths of 0 and below have the inverse 0."""
     own, other = (
         torch.where(depth > 0, torch.where(depth > 0, depth, 1).reciprocal(), 0) for depth in (pred_depth, gt_depth)
     )
@@ -138,7 +138,7 @@ def color_correct_quadratic(img: Tensor, ref: Tensor, num_iters: int = 5, eps: f
     for _ in range(num_iters):
         terms = torch.cat([current[:, first] * current[:, second], current, torch.ones_like(current[:, :1])], 1)
         counted = (counts & unsaturated(current)).double()
-        # Normal equations of each channel; the pseudo-inverse also solves those of pictures with few colours.
+        # Solve the normal equations of each channel by the pseudo-inverse, because those of pictures with few colours are singular.
         squares = torch.stack([terms.mT @ (terms * weights[:, None]) for weights in counted.unbind(1)])
         found = (
             torch.linalg.pinv(squares, hermitian=True) @ torch.einsum("pc,pi->ci", counted * other, terms)[..., None]
@@ -443,7 +443,7 @@ class HexPlaneField(torch.nn.Module):
 
 
 class DeformNetwork(torch.nn.Module):
-    """Network from features to changes of means, rotations and opacities. Its heads start at zero, the identity."""
+    """MLP from HexPlane features to changes of means, rotations and opacities. Its heads start at zero, so that nothing deforms."""
 
     def __init__(self, feature_dim: int, hidden_dim: int = 64, num_layers: int = 3) -> None:
         """Create the MLP's layers.
@@ -573,7 +573,7 @@ def time_smoothness(planes: Sequence[Tensor]) -> Tensor:
 
 
 def time_l1(planes: Sequence[Tensor]) -> Tensor:
-    """Return the mean absolute deviation from 1 of each plane, summed over the planes."""
+    """Return the mean absolute deviation of each plane's values from 1, summed over the planes."""
     return _summed(planes, lambda plane: (plane - 1).abs().mean(), planes)
 
 

@@ -23,7 +23,7 @@ class UserError(Exception):
 
 
 class CoreError(Exception):
-    """Base of all exceptions raised deliberately by the core."""
+    """Base class of all exceptions that `gsplat_core` raises deliberately."""
 
 
 class InvalidInput(CoreError, ValueError):
@@ -63,4 +63,4 @@ class RecordingMissing(RecordingError):
 
 
 class RecordingInvalid(RecordingError):
-    """Wrong counts, sizes, mask polarity, calibration or video data in a recording."""
+    """A recording has wrong counts or sizes of files, or wrong mask polarity, calibration or video data."""

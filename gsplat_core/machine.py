@@ -54,7 +54,7 @@ def _of_control_group(folder: Path = Path("/sys/fs/cgroup")) -> int | None:
     limit, current = _text(folder / "memory.max").strip(), _text(folder / "memory.current").strip()
     if not limit.isdecimal() or not current.isdecimal():
         return None
-    # The page cache counts as used, but the kernel can reclaim it.
+    # A control group counts its page cache as used, but the kernel can reclaim it.
     stated = dict(line.split()[:2] for line in _text(folder / "memory.stat").splitlines() if " " in line)
     return max(0, int(limit) - int(current) + int(stated.get("inactive_file", "0")))
 
@@ -85,7 +85,7 @@ def return_freed_memory() -> None:
 
 
 def usable_cores() -> int:
-    """Number of CPU cores available to this process."""
+    """Return the number of CPU cores on which this process may run."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -124,11 +124,11 @@ def one_thread() -> Iterator[None]:
 
 
 NICENESS = 10
-"""Nice value of a background thread."""
+"""Nice value (lower scheduling priority) that `step_back` gives a background thread on Linux."""
 
 
 def step_back() -> None:
     """Lower the scheduling priority of the calling thread. No effect except on Linux."""
     if sys.platform == "linux":  # on other systems the nice value applies to the whole process
-        with suppress(OSError):  # if not permitted, keep the normal priority
+        with suppress(OSError):  # the thread keeps the normal priority if a change is not permitted
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)

@@ -41,7 +41,7 @@ def clamp_time(time_s: float, window_s: tuple[float, float]) -> float:
 
 @dataclass(frozen=True)
 class TrainedBy:
-    """Renderer whose pictures trained a model. Other renderers may be unable to show the model."""
+    """Renderer whose pictures were compared with the frames in training a model. Other renderers may be unable to show the model."""
 
     renderer: str = "alpha"
     """Name of the renderer, a key of `RENDERERS`."""
@@ -103,7 +103,7 @@ class Model:
             raise InvalidInput(f"the field deforms {rows.count} Gaussians, the model has {self.gaussians.count}")
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return all tensors by name: `gaussians.*`, then `field.*` in the field's order."""
+        """Return all tensors of the model by name: `gaussians.*`, then `field.*` in the field's order."""
         named = {f"gaussians.{name}": tensor for name, tensor in self.gaussians.tensors().items()}
         if self.field is not None:
             named |= {f"field.{name}": tensor for name, tensor in self.field.state_dict(keep_vars=True).items()}
@@ -264,7 +264,7 @@ class SnapshotSlot:
 
     @property
     def gaussians(self) -> Gaussians:
-        """All rows of the slot. Rows beyond the count have an opacity logit of -inf and are in no tile list."""
+        """Gaussians in all tensor rows of the slot. Unused rows have an opacity logit of -inf and are in no tile list."""
         assert self._gaussians is not None
         return self._gaussians
 
@@ -386,13 +386,13 @@ class Snapshot:
             return gaussians.map(lambda tensor: tensor[: self.gaussian_count].clone())
 
     def unseen_s(self) -> Tensor | None:
-        """Copy of the time since each Gaussian was last visible, or None; see `Model.unseen_s`."""
+        """Copy of the seconds since each Gaussian was last visible, [N], or None if unknown; see `Model.unseen_s`."""
         if self._unseen_s is None:
             return None
         with self.reading():
             seen = self._unseen_s.clone()
             if seen.is_cuda:
-                # This tensor is in no slot. The publisher may free it before this stream has read it.
+                # `unseen_s` is in no slot. Its memory must not be reused before the current stream has read it.
                 self._unseen_s.record_stream(torch.cuda.current_stream(self.device))
             return seen
 

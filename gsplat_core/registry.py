@@ -1,4 +1,4 @@
-"""Registry of implementations selected by name, such as deformation fields, renderers, sources and sinks."""
+"""Registry of implementations that a user selects by name, such as deformation fields, renderers, sources and sinks."""
 
 from __future__ import annotations
 

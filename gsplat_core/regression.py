@@ -91,7 +91,7 @@ def loss_and_gradients(splats: Splats, points: Tensor, targets: Tensor) -> tuple
 
 @dataclass(frozen=True)
 class BirthDeath:
-    """Indices of the splats that die, and of the parents whose copies replace them; int64 [D] each."""
+    """Result of a round of birth and death: indices of the splats that die and of the splats whose copies replace them; int64 [D] each."""
 
     dying: Tensor
     parents: Tensor
@@ -133,7 +133,7 @@ def births_and_deaths(phi: Tensor, rate: float, random: torch.Generator) -> Birt
         marked = marked[:0]
     if len(marked) == 0:
         return BirthDeath(marked.to(phi.device), marked.to(phi.device))
-    # Inverse transform sampling, because torch.multinomial is limited to 2^24 splats.
+    # Draw parents by inverse transform sampling, because torch.multinomial is limited to 2^24 splats.
     total = birth.cumsum(0)
     draws = torch.rand(len(marked), generator=random, dtype=birth.dtype) * total[-1]
     parents = torch.searchsorted(total, draws, right=True).clamp(max=len(birth) - 1)
@@ -262,7 +262,7 @@ class _Fitting:
             losses.append(loss)
             if options.metric:
                 gradients = gradients.divided_by_mass(self._splats.masses)
-            # ∂L/∂ln|v|. With `metric`, it is divided by the mass, which gives the first variation of the loss at the
+            # φ = ∂L/∂ln|v|. With `metric`, φ is divided by the mass, which gives the first variation of the loss at the
             # splat.
             phi = (self._splats.values * gradients.values).sum(1)
             self._descend(gradients, step)

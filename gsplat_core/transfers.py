@@ -52,7 +52,7 @@ class StagedCopies:
         self._arrived = torch.cuda.Event()
 
     def to_host(self, tensor: Tensor) -> Tensor:
-        """Return the tensor in host memory: a copy of a CUDA tensor, a CPU tensor itself."""
+        """Return a copy of a CUDA tensor in host memory, after waiting for it; a CPU tensor is returned itself."""
         if not tensor.is_cuda:
             return tensor
         with torch.cuda.stream(self.stream):

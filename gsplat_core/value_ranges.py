@@ -94,7 +94,7 @@ def check_seen_at(time_s: float, window_s: tuple[float, float]) -> None:
 
 
 def is_plain(text: str) -> bool:
-    """Return True if a text has ASCII characters only, and neither underscores nor surrounding blanks."""
+    """Return True if a text is suited for a number: ASCII characters only, and neither underscores nor surrounding blanks."""
     return text.isascii() and "_" not in text and text == text.strip()
 
 

@@ -29,7 +29,7 @@ MOST_SPAN = 5.0
 of the network's output.
 """
 ENDS = (2.0, 98.0)
-"""Percentiles used as the near and far ends of a picture; values beyond them may be outliers."""
+"""Percentiles of a picture's values that are used as its near and far end; values beyond them may be outliers."""
 ROUNDS = 10
 LEAST_VALUES = 64
 CONSTANT = 1e-4
@@ -169,7 +169,7 @@ def _stamp(path: Path) -> tuple[int, int] | None:
 
 @lru_cache(maxsize=1)
 def _network(path: Path, stamps: tuple[tuple[int, int] | None, ...]) -> OnnxNetwork[DepthSettings]:
-    """Load a network and try it once; cached for all streams. `stamps` are the files' modification
+    """Load a depth network and run it once as a test; cached for all streams. `stamps` are the files' modification
     times and sizes, so a changed file is reloaded.
     """
     network = OnnxNetwork(path, "depth network", DepthSettings, multiple_px=MULTIPLES_PX[0])
@@ -263,7 +263,7 @@ class LearnedDepth(Estimator):
         large = cv2.resize(values, (size[1], size[0]), interpolation=cv2.INTER_LINEAR).astype(np.float64)
         found = solved.of(large)
         depth = self._kind(np.maximum(found, least)).astype(np.float32)
-        # A network gives no estimate of its error, so the confidence is the threshold everywhere.
+        # A network gives no estimate of its error, so the confidence is everywhere the smallest at which depth is used.
         return DepthMap(
             depth,
             np.where(found > least, BELIEVED, 0).astype(np.float32),
@@ -315,7 +315,7 @@ def _tissue(frame: Frame) -> NDArray[np.uint8]:
 
 
 def _on_grid(plane: NDArray[np.generic], size: tuple[int, int], how: int = cv2.INTER_NEAREST) -> NDArray[np.float64]:
-    """Resample a plane of any size that covers a picture of `size` to the comparison grid."""
+    """Resample a plane that covers a picture of `size` (height, width) to the grid on which network outputs are compared."""
     scale = GRID_PX / max(size)
     columns, rows = (max(1, round(side * scale)) for side in (size[1], size[0]))
     return np.asarray(cv2.resize(np.asarray(plane, np.float32), (columns, rows), interpolation=how), np.float64)

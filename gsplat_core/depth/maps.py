@@ -49,7 +49,7 @@ class DepthMap:
     metric: bool
     """True if the depth is in millimetres; otherwise it is known up to one factor."""
     error: float | None = None
-    """Typical standard error of the confident depth, relative to it; None for the one assumed for its origin."""
+    """Typical standard error of the confident depth, relative to the depth; None for the error assumed for its origin."""
     doubt: str | None = None
     """Reason why the whole map is rejected, as a sentence; None if it is not. A rejected map has no confidence anywhere."""
 
@@ -75,8 +75,8 @@ class DepthMap:
 
     @property
     def kept(self) -> NDArray[np.float32]:
-        """Depth stored with the frame: values with at least the confidence `least_confidence` of the map's origin, else
-        0.
+        """Depth [H, W] that is stored with the frame, with 0 where the confidence is below the `least_confidence` of the map's
+        origin.
         """
         return np.where(self.confidence >= self.origin.least_confidence, self.depth, np.float32(0))
 
@@ -116,7 +116,9 @@ class RecordingDepth(NamedTuple):
     """Depth estimated from all frames of a recording together."""
 
     frames: list[Frame]
-    """Frames; some have depth in the unit of the camera positions. Depth without confidence is an extrapolation."""
+    """All frames of the recording; those with estimated depth have it in the unit of the camera positions. Depth without confidence is
+    an extrapolation.
+    """
     doubts: Mapping[str, int]
     """Reasons why frames of the recording have no depth, as sentences with numbers of frames."""
     at_rest: bool = False
@@ -150,8 +152,8 @@ class OnDevice(Protocol):
 
 
 class RecordedDepth(Estimator):
-    """Depth that is part of the frame. Without a confidence in the frame, outlier pixels are
-    rejected (`measured_confidence`).
+    """Depth source that passes on the frame's own depth. If the frame has no confidence, outlier pixels are rejected
+    (`measured_confidence`).
     """
 
     def estimate(self, frame: Frame, camera: Camera) -> DepthMap | None:
@@ -308,7 +310,7 @@ class DepthFinder:
         """Counters of the reasons for rejected depth maps, and of the remarks about used depth maps."""
 
     def seeks_in(self, frame: Frame) -> bool:
-        """Return True if any source other than the frame's own depth applies to a frame."""
+        """Return True if, for a frame, depth may be estimated by any source other than the frame's own depth."""
         return any(
             suits(frame) for estimator, suits in self._asked if not isinstance(estimator, RecordedDepth | NoDepth)
         )
@@ -326,7 +328,7 @@ class DepthFinder:
             frame.height_px,
         ):  # a stream may change its picture size, and the camera has to match it
             camera = camera.resized(frame.width_px, frame.height_px)
-        # Frames that are not trained on need no estimated depth; their own depth is free.
+        # Estimate no depth for frames that are not trained on; passing on their own depth costs nothing.
         shown_only = shown_only or frame.status is FrameStatus.DAMAGED or frame.withheld is not None
         for estimator, suits in self._asked:
             if not suits(frame) or (shown_only and not isinstance(estimator, RecordedDepth)):
@@ -450,7 +452,7 @@ def _inner(where: NDArray[np.bool_], margin_px: int) -> NDArray[np.bool_]:
 LONGEST_PX = 160
 """Longest side, in pixels, to which depth maps are reduced before two of them are compared (`agree`)."""
 MOST_DISAGREEMENT = 0.25
-"""Largest accepted median difference of two depth maps, as a share of their median relief."""
+"""Largest median difference of two depth maps that agree, as a share of the median relief (variation of depth) that they show."""
 LEAST_SHARED = 0.1
 """Smallest share of the picture that two depth maps must both cover to be compared."""
 UNCONFIRMED = "two depth maps by parallax disagree about the relief, so a level plane may be as accurate"

@@ -39,7 +39,7 @@ contrast do not correlate.
 DISAGREES = 0.5
 """Cost of uncorrelated patches and upper bound of any cost, so that an occluded view cannot outvote the other views."""
 AGREES = 0.2
-"""Cost below which a view votes for a distance, corresponding to a correlation of 0.6."""
+"""Matching cost below which a view counts as agreeing with a distance, corresponding to a correlation of 0.6."""
 
 
 @dataclass(frozen=True)
@@ -281,7 +281,7 @@ def _corners(view: View) -> NDArray[np.float32]:
 def _followed(
     reference: View, view: View, corners: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Return the position of each corner in the other picture [n, 2], and which were found on tissue [n]."""
+    """Return the position of each corner of `reference` in `view` [n, 2], and a bool mask [n], True where it was found on tissue."""
     first, second = (each.grey.astype(np.uint8) for each in (reference, view))
     there, misses_px = followed(first, second, corners, window_px=15, levels=4)
     height, width = view.tissue.shape
@@ -355,7 +355,7 @@ WORKING_PX = 320
 MOST_VIEWS = 6
 """Largest number of other pictures with which one picture is compared."""
 SHORTEST_BASELINE = 0.1
-"""Share of the longest baseline below which a view is ignored because it adds noise."""
+"""Baseline below which a view is ignored because it adds noise, as a share of the longest baseline of all views."""
 WIDEST_TURN = 0.7
 """Smallest cosine between the optical axes of two cameras that are compared."""
 LABEL_PX = 0.75
@@ -363,7 +363,7 @@ LABEL_PX = 0.75
 LABELS = 24, 96
 """Smallest and largest number of distances that a plane sweep tests."""
 MARGIN = 1.6
-"""Factor by which the sweep extends the range of the corners' distances at both ends."""
+"""Factor by which the plane sweep extends the range of the tracked corners' distances at both ends."""
 WORST_COST, BEST_COST = 0.35, 0.15
 """Mean matching cost ((1 - ZNCC) / 2) at which the confidence is 0, and below which it is not reduced."""
 UNIQUE = 0.2
@@ -496,11 +496,12 @@ def _at_full_size(inverse: NDArray[np.float32], confidence: NDArray[np.float32],
 STREAM_PX = 160
 """Longest side of the compared pictures in pixels; smaller than offline to keep up with the stream."""
 MOST_KEY_FRAMES = 8
-"""Largest number of key frames. When it is exceeded, one of the two closest key frames is removed."""
+"""Largest number of key frames of a stream. When it is exceeded, the older of the two key frames with the closest cameras is removed.
+"""
 MOST_OFFLINE = 32
 """Largest number of frames of a complete recording that get depth, spread evenly."""
 LONGEST_S = 3.0
-"""Largest time difference in seconds of compared frames, limited because tissue deforms."""
+"""Largest time difference in seconds between frames compared for parallax, limited because tissue deforms."""
 EVERY_S = 0.2
 """Time in seconds from a depth map to the next attempt. From then on every frame is tried until one gets depth."""
 

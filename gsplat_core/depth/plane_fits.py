@@ -29,9 +29,7 @@ Sums = NDArray[np.floating[Any]]
 
 
 def terms_of(weight: Sums, x: Sums, y: Sums, values: Sums) -> tuple[Sums, ...]:
-    """Return the nine weighted moments that must be summed over each window for `at_middles`, for
-    values at positions (x, y).
-    """
+    """Return nine weighted moments of values at positions (x, y). Their sums over a window define the plane fit of `at_middles`."""
     wx, wy, wv = weight * x, weight * y, weight * values
     return weight, wx, wy, wx * x, wx * y, wy * y, wv, wv * x, wv * y
 
@@ -73,7 +71,9 @@ points, the wide window's weight grows linearly to 1.
 FLOOR = 0.005
 """Relative depth error added to that of every point, so that no single point dominates a fit."""
 LEVEL = 1e-3
-"""Regularisation of slopes as a share of the weights, so that two points do not define a plane."""
+"""Regularisation of a plane's slopes, relative to the variance of the positions in the window, so that two points do not define a
+plane.
+"""
 
 
 def surface_through(pixels: Array, depth: Array, error: Array, size: tuple[int, int]) -> tuple[Array, Array, Array]:

@@ -39,11 +39,11 @@ from gsplat_core.scene.frames import BELIEVED, STEREO, Frame
 from gsplat_core.transfers import HostCopy, tensor_of
 
 EDGE_ERROR_PX = 1.5
-"""Standard deviation in pixels of an additional error of matched disparities near edges and holes."""
+"""Standard deviation, in pixels, of the error that is added to that of matched disparities near edges and holes."""
 SMOOTHNESS, SMOOTH_GREY = 100.0, 5.0
-"""Strength of the edge-aware filter, and the difference of grey values at which the strength falls to 1/e."""
+"""Strength of the edge-aware filter of disparities, and the difference of neighbouring grey values at which it falls to 1/e."""
 LEAST_VARIANCE_PX2 = 0.05
-"""Summand of a disparity's variance in the filter, in pixels²; limits the weight of the best values."""
+"""Variance in pixels² that is added to each disparity's variance in the filter, to limit the weight of the best values."""
 LEAST_WEIGHT = 1e-4
 """Smallest filtered weight of known disparities for a smoothed disparity to count as known."""
 
@@ -62,7 +62,7 @@ class Disparity:
 
 @dataclass(frozen=True)
 class Span:
-    """Search range of disparities: `count` values, a multiple of 16, starting at `lowest`."""
+    """Search range of disparities: `count` whole pixels, a multiple of 16, starting at `lowest`."""
 
     lowest: int
     count: int
@@ -164,9 +164,9 @@ row offset.
 ROW_ERROR_PX = 1.5
 """Deviation in pixels from the fitted row difference between the eyes above which a point counts as wrongly matched."""
 MOST_SLOPE_PX = 1.0
-"""Largest accepted row difference at the edge of the picture in pixels, relative to the common row offset."""
+"""Largest accepted row difference between the eyes at the edge of the picture, in pixels, minus the common row offset."""
 MOST_OFFSET = 0.03
-"""Largest accepted common row offset, as a share of the picture's height."""
+"""Largest accepted row offset between the eyes that all points have in common, as a share of the picture's height."""
 LEAST_DISPARITY_PX = 0.5
 """Disparity in pixels, after subtracting the calibration's, up to which a point has no depth. A pair whose median is
 smaller shows the same picture twice, or tissue at infinity.
@@ -175,7 +175,7 @@ smaller shows the same picture twice, or tissue at infinity.
 
 @dataclass(frozen=True)
 class PairLook:
-    """Result of the check of one pair. If `doubt` is set, the other fields are meaningless."""
+    """Result of the check of one stereo pair. If `doubt` is set, the other fields are meaningless."""
 
     disparities: Points
     """Disparities [N] of points found in both eyes, in pixels."""
@@ -314,7 +314,7 @@ def _fitted_rows(here: Points, lower: Points, width: int, height: int) -> tuple[
 
 
 LOOK_EVERY = 30
-"""Frames between two checks of the pair. The eyes are rigid, but the distance of the tissue changes."""
+"""Number of frames between two checks of the stereo pair. The eyes are rigid, but the distance of the tissue changes."""
 KEPT_LOOKS = 15
 """Number of newest pair checks whose row offsets are combined by their median."""
 MATCHED_WIDTH_PX = 800
@@ -531,8 +531,8 @@ class StereoDepth(Estimator):
         return DepthMap(depth, confidence, STEREO, frame.right_camera is not None, remark=self._remark(middle, reach))
 
     def _remark(self, middle: float, reach: float) -> str | None:
-        """Return a remark about corrected row offsets, whose cause may have shifted columns as well; None for an offset
-        below `SAID_FROM_PX`.
+        """Return a message for the user about corrected row offsets between the eyes, whose cause may have shifted columns as
+        well; None for an offset below `SAID_FROM_PX`.
         """
         off = float(np.median(self._rows, axis=0)[0])
         if abs(off) < SAID_FROM_PX:

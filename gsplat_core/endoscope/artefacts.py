@@ -37,7 +37,7 @@ SURROUND_RANGE = 12
 EDGE_CONTRAST = 18
 """Smallest brightness step from the surround to the inside of the outline, in levels 0 to 255."""
 EDGE_SHARE = 0.6
-"""Share of the outline that must have a brightness step of at least `EDGE_CONTRAST`."""
+"""Share of the field of view's outline that must have a brightness step of at least `EDGE_CONTRAST`."""
 LEAST_SURROUND = 0.015
 """Smallest share of the picture that the dark surround must cover; with less, the field of view is the whole picture."""
 LEAST_FIELD = 0.15
@@ -292,11 +292,11 @@ TEXT_LEVELS = 25.0
 TEXT_STEADINESS = 5.0
 """Smallest ratio of a text's edge step to the step's mean temporal deviation."""
 TEXT_LENGTH = 0.02
-"""Smallest extent of text as a share of the longer side of the band; a third of it in the other direction."""
+"""Smallest extent of text along the border, as a share of the border's length; across the border a third of it suffices."""
 
 
 class StripDetector:
-    """Overlay detector of a stream, called for each frame. It keeps mean gradients near each border."""
+    """Detector of strips and text that a recorder has drawn at a stream's borders, called for each frame."""
 
     def __init__(self) -> None:
         self.mask: NDArray[np.uint8] | None = None
@@ -354,7 +354,7 @@ class StripDetector:
 
 
 class _Band:
-    """Part of the picture near one border, rotated so that the border is its last row."""
+    """Band of the picture near one border with the temporal means of its gradients, rotated so that the border is the last row."""
 
     def __init__(self, turns: int, depth_px: int) -> None:
         self._turns, self._depth_px = turns, depth_px

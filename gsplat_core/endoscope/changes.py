@@ -64,7 +64,7 @@ class View:
     """Reduced picture with the features that are compared to find cuts between scenes."""
 
     def __init__(self, image: NDArray[np.uint8]) -> None:
-        """Reduce an RGB uint8 picture [H, W, 3] of any size and divide each channel by its median."""
+        """Reduce an RGB uint8 picture [H, W, 3] of any size, and divide each channel by its median to remove exposure and tint."""
         small = reduced(image, WIDTH_PX, HEIGHT_PX)
         self.bright: NDArray[np.bool_] = lowest_and_highest(small)[1] >= DARK
         # Make channels contiguous, because medians are then fast.
@@ -297,7 +297,7 @@ class CutDetector:
 
 
 class FrameRate:
-    """Detector of lasting changes of the frame rate. Lost frames are accounted for by their numbers."""
+    """Detector of lasting changes of the frame rate. Frames lost according to the sequence numbers do not count as a change."""
 
     def __init__(self) -> None:
         self._recent: deque[float] = deque(maxlen=RATE_FRAMES)
@@ -334,15 +334,17 @@ LONGEST_RECENT = 600
 
 
 BLURRED_BELOW = 0.75
-"""Ratio of the sharpness to the usual one below which a frame is blurred."""
+"""Ratio of a frame's sharpness to the stream's usual one below which the frame is blurred."""
 SHARP_ABOVE = 0.82
-"""Ratio of the sharpness to the usual one from which a frame after a blurred one is sharp again."""
+"""Ratio of a frame's sharpness to the stream's usual one from which a frame after blurred ones counts as sharp again."""
 SMOKE_CONTRAST = 0.75
-"""Ratio of the contrast to the usual one below which a frame may be smoky. Smoke also requires the next two limits."""
+"""Ratio of a frame's contrast to the stream's usual one below which the frame may be smoky, if the limits `SMOKE_SATURATION` and
+`SMOKE_HAZE` are passed as well.
+"""
 SMOKE_SATURATION = 0.8
-"""Ratio of the saturation to the usual one below which a frame may be smoky."""
+"""Ratio of a frame's saturation to the stream's usual one below which the frame may be smoky."""
 SMOKE_HAZE = 15.0
-"""Excess of the haze over the usual one from which a frame may be smoky, in levels of 255."""
+"""Excess of a frame's haze over the stream's usual haze from which the frame may be smoky, in levels of 255."""
 CLEAR_ABOVE = 0.87
 """Ratio of contrast or saturation to the usual one above which a frame after smoke is clear again."""
 RECENT_S = 1.5
@@ -467,7 +469,7 @@ class SharpnessGate:
 
 
 def appearance(image: NDArray[np.uint8], kept: NDArray[np.generic] | None = None) -> Appearance | None:
-    """Measure RGB uint8 [H, W, 3] where `kept` [H, W] is not 0; None with too few usable pixels."""
+    """Measure sharpness and clarity of a picture RGB uint8 [H, W, 3] where `kept` [H, W] is not 0; None with too few usable pixels."""
     step = max(1, round(max(image.shape[:2]) / SIDE_PX))
     grey = luma(sampled(image, step))
     if min(grey.shape) <= 2 * APART_PX:

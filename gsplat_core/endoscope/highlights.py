@@ -19,7 +19,7 @@ LONG_SIDE_PX = 800
 SHRINK = 8
 """Factor by which pictures are reduced before the surroundings of highlights are averaged, to save time."""
 BLACK = 28
-"""Level below which pixels are excluded from the surroundings, since they may be outside the field of view."""
+"""Level (0 to 255) below which pixels do not count for the mean of the surroundings, since they may be outside the field of view."""
 
 
 BRIGHTEST_CHANNEL = 235

@@ -275,7 +275,7 @@ class OnnxNetwork(Generic[Settings]):
         return np.asarray(output)
 
     def refused(self, why: str) -> InvalidSetting:
-        """Return the error for an unusable network. `why` is the predicate of the message's sentence."""
+        """Return the exception for an unusable network. `why` is the predicate of the message's sentence, such as "has two inputs"."""
         return InvalidSetting(f"{self.what} {self.path} {why}")
 
     def _size(self, height: int, width: int) -> tuple[int, int]:

@@ -51,9 +51,13 @@ COOL = 0.12
 COLD = 0.05
 """Log ratio of red to both green and blue below which a pixel is cold."""
 STRAIGHT, COOL_BESIDE_STRAIGHT = 0.47, 0.4
-"""Agreement of the edges' directions and share of cool pixels from which straight edges are evidence."""
+"""Smallest agreement of the edges' directions (`Evidence.straight`) and smallest share of cool pixels with which straight edges are
+evidence of the outside.
+"""
 ROOM_LIGHT, COLD_BESIDE_LIGHT = 0.84, 0.55
-"""Sum of `Evidence.even` and `Evidence.smooth` and share of cold pixels from which even light is evidence."""
+"""Smallest sum of `Evidence.even` and `Evidence.smooth`, and smallest share of cold pixels, with which even light is evidence of the
+outside.
+"""
 FLAT = 0.01
 """Relative brightness change from pixel to pixel below which a surface is smooth."""
 EDGE_SHARE, EDGE_CONTRAST = 0.2, 0.12
@@ -245,7 +249,7 @@ def _histogram(plane: NDArray[np.uint8], counted: NDArray[np.bool_] | None = Non
 
 
 def _level_at(histogram: NDArray[np.float64], share: float) -> float:
-    """Return the level at a quantile of a histogram, [256]; between two pixels the lower one."""
+    """Return the level at the quantile `share` of a histogram [256]; if the quantile is between two pixels, the lower level."""
     below = np.cumsum(histogram)
     return float(np.searchsorted(below, int(share * (below[-1] - 1)), "right"))
 

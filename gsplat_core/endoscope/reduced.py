@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 
 def median_of(values: NDArray[np.floating], share: float = 0.5) -> float:
-    """Return the value at a quantile of at least one value; between two values the upper one."""
+    """Return the quantile `share` of one or more values; if it is between two values, the upper one."""
     at = int(share * len(values))
     return float(np.partition(values, at)[at])
 

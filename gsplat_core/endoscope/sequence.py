@@ -37,8 +37,8 @@ of its pixels.
 ODD_SHARE = 0.03
 """Tolerated share of other pixels in a black or single-coloured picture, such as a line of text or a logo."""
 NOISE_SHARE = 0.5
-"""Difference of neighbouring pixels relative to that of unrelated ones, from which a picture is
-noise. Tissue has 0.01 to 0.04.
+"""Mean squared difference of neighbouring pixels, relative to that of unrelated pixels, above which a picture is noise. Tissue has
+0.01 to 0.04.
 """
 AVERAGED_PX = 4
 """Side in pixels of squares that are averaged. A picture counts as noise only if these averages are noise as well."""
@@ -191,9 +191,11 @@ REPEATED_TIME = "repeated time"
 
 
 LONGEST_STEP_S = 10.0
-"""Forward step in seconds above which the clock jumped, if arrival times are unknown."""
+"""Forward step of the timestamps in seconds above which the source's clock has jumped, if arrival times are unknown."""
 ARRIVAL_AGREES_S = 1.0
-"""Largest difference in seconds between a forward step and the difference of arrival times."""
+"""Largest excess in seconds of a forward step of the timestamps over that of the arrival times; above it, the source's clock has
+jumped.
+"""
 LATE_FRAMES = 4
 """Number of consecutive frames with earlier timestamps that mean that the clock was set back; fewer are late frames."""
 GAP_INTERVALS = 4.0
@@ -306,7 +308,7 @@ BANDS = 4
 SAMPLES_PER_SIDE = 64
 USUAL_DECAY = 0.1
 LEAST_CHANGE = 0.2
-"""Mean change of a band, in levels of 255, below which a picture may be a repetition."""
+"""Mean change of a horizontal band, in levels of 255, below which a picture may be a repetition and is not ordinary."""
 
 
 LOOK_EVERY_S = 0.2
@@ -314,18 +316,18 @@ LOOK_EVERY_S = 0.2
 frames/s), and at which the reference is renewed.
 """
 MOST_CHANGE_RATIO = 2.0
-"""Largest change of a band from the previous picture, as a multiple of its usual change."""
+"""Largest change of a horizontal band from the previous picture in an ordinary picture, as a multiple of its usual change."""
 LEAST_CHANGE_RATIO = 0.4
 BRIGHTNESS_LEVELS = 2.0
-"""Largest shift of a channel's mean from the reference, in levels of 255."""
+"""Largest difference of a channel's mean from the reference picture in an ordinary picture, in levels of 255."""
 SHARPNESS_SHARE = 0.08
 """Largest change of an ordinary picture's sharpness (mean difference of neighbouring pixels), relative to the reference."""
 MOST_INTERVAL_RATIO = 1.7
-"""Longest interval since the last frame at an ordinary picture, as a multiple of the usual interval."""
+"""Longest time since the previous frame at which a picture still counts as ordinary, as a multiple of the usual interval."""
 
 
 class OrdinaryPictures:
-    """Test for ordinary pictures of a stream, called for each frame. Its state is a reduced picture and a few numbers."""
+    """Cheap test for pictures that look as expected from the stream's earlier ones and need no detailed checks."""
 
     def __init__(self) -> None:
         self.reset()

@@ -188,7 +188,7 @@ OPERATORS: Mapping[str, Operator] = {
     ),
     "Unsqueeze": Operator(_unsqueezed),
 }
-"""Supported operators of ONNX with the attributes that torch's exporter writes, all of which must be present."""
+"""Implementations of the supported ONNX operators by name. All attributes that torch's exporter writes must be present."""
 
 
 def read_graph(path: Path) -> Graph:
@@ -232,7 +232,9 @@ _ATTRIBUTES: Mapping[int, tuple[int, Callable[[list[Any]], Any]]] = {
     4: (5, lambda found: _tensor(found[0])[1]),
     7: (8, tuple),
 }
-"""Field and conversion of an attribute's value by its type: float, integer, text, tensor and integers."""
+"""Decoding of ONNX attributes by their type number (float, integer, text, tensor, integers): the field number of the value, and the
+conversion of the field.
+"""
 _DTYPES = {1: "<f4", 7: "<i8"}
 
 

@@ -37,9 +37,11 @@ CORNER, DARK_CORNER = 1 / 16, 0.75
 the time may be printed over the rest.
 """
 LOGARITHMS = np.log(np.arange(256, dtype=np.float32) / 255 + np.float32(0.06))
-"""Logarithm of each byte value / 255 plus 0.06, which keeps noise small where it is dark. As in training."""
+"""Logarithm of each byte value / 255 plus 0.06, which keeps noise small where it is dark. The network was trained with the same values."""
 SURROUND = 16
-"""Largest channel below which a pixel counts as surround of the field of view. As in training."""
+"""Level of the largest channel (0 to 255) below which a pixel counts as outside the field of view. The network was trained with the
+same value.
+"""
 CERTAIN = 2.0
 """Largest magnitude of a logit; logits beyond it are clipped before the smoothing along edges."""
 EDGE_RADIUS_PX, EDGE_CONTRAST = 3, 0.01
@@ -216,8 +218,7 @@ SMALLEST_REGION = 0.003
 SMALLEST_INNER_REGION = 0.01
 """Smallest area of a tool region that does not reach the border of the view, as a share of the field of view."""
 MOST_GLARE = 0.3
-"""Share of a tool region without contact to the border that may be as bright as the brightest pixels, as highlights
-are.
+"""Share of pixels as bright as the brightest ones (highlights) from which a region without contact to the border is not a tool.
 """
 SHARP_EDGE = 0.36
 """Smallest change of redness across a region's outline, within three pixels. Pale tissue and glare change gradually."""
@@ -308,7 +309,7 @@ def tool_regions(view: Regions) -> Bytes:
 
 
 def whole_tools(view: Regions, found: Bytes) -> Bytes:
-    """Return the tools extended by edges that reflect surrounding tissue, closed, and dilated by a margin; 1 on tools."""
+    """Return the mask `found` of tools, extended by the tools' edges (which reflect surrounding tissue), closed, and dilated by a margin."""
     if not cv2.countNonZero(found):
         return found
     own = cv2.mean(view.redness, found)[0]
@@ -355,8 +356,8 @@ def _outline(view: Regions, grey: Bytes) -> Bytes:
 
 
 def _well_inside(inside: Bytes) -> Bytes:
-    """Return 1 where all pixels within a distance of three are in the field of view. Pixels beyond the picture's edge
-    count as inside.
+    """Return a mask [h, w], 1 where all pixels within a distance of three are in the field of view, else 0. Pixels beyond the
+    picture's edge count as inside.
     """
     return np.asarray(cv2.erode(inside, neighbourhood(7)), np.uint8)
 
@@ -392,7 +393,7 @@ BINS, LOWEST, HIGHEST = 100, -0.3, 0.7
 MEMORY = 0.9
 """Weight of the earlier frames in the running mean of the redness histogram, which adapts within about ten frames."""
 FINE_BINS, FINE_REACH = 4500, 4.5
-"""Number and range (±) of fine bins of a frame's redness, more than bytes can resolve."""
+"""Number of bins, and largest magnitude, in the fine histogram of a frame's redness. The bins are finer than 8-bit levels."""
 OTHER_SCENE = 0.7
 """Distance between a frame's redness histogram and the running one (sum of absolute differences, 0 to 2) above which another scene
 has started.

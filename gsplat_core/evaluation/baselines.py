@@ -188,9 +188,9 @@ class _Values:
     by_key: dict[tuple[str, object], tuple[float, ...]]
 
     def entry(self, ages: Sequence[int]) -> Entry:
-        """Return the log entry of the frame; all entries have the same keys.
+        """Return the log entry of the frame: the PSNR in dB of each baseline; all entries have the same keys.
 
-        The copy of the previous frame is the reference for the other figures.
+        `psnr_tissue_db` is that of the copy of the previous frame.
         """
         frame = self.frame
         value = lambda group, name: finite(self.by_key[group, name][0]) if (group, name) in self.by_key else None

@@ -251,7 +251,7 @@ class DepthShareSums:
 MOST_PLANE_PIXELS = 8192
 """Number of evenly spaced pixels per frame (up to twice as many) used to fit its plane."""
 SMOOTH_PX = 5
-"""Width in pixels of the smoothing before differentiation; quantised depth has steps."""
+"""Width in pixels of the window that smooths depth before normals are computed from it; quantised depth has steps."""
 
 
 @dataclass(frozen=True)

@@ -113,7 +113,7 @@ def _centres(poses: Poses) -> Poses:
 
 
 def _alignment(found: Poses, right: Poses) -> tuple[Poses, float]:
-    """Return the rotation [3, 3] and scale that align `found` with `right` about their means.
+    """Return the rotation [3, 3] and the scale that align the positions `found` with the true ones `right` about their means.
 
     The scale of coincident positions is 0.
     """

@@ -187,7 +187,7 @@ class FollowedPoints:
         true: Points,
         true_px: Points,
     ) -> None:
-        """Start tracking newly visible points at their pixels, lifted by the model's depth."""
+        """Start tracking newly visible points at their pixels, unprojected with the model's depth."""
         z = at_pixels(shown, true_px)
         new = np.flatnonzero(seen & ~self._started & (z > 0))
         if not len(new):

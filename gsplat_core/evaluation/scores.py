@@ -51,7 +51,7 @@ class Score:
 
 @dataclass(frozen=True)
 class BaselineScore:
-    """Score of one baseline: means in decibels over `frames` frames; None if no frame has the measure."""
+    """Mean PSNRs of one baseline in decibels over `frames` frames; a field is None if no frame has the measure."""
 
     psnr_tissue_db: float | None = None
     psnr_frame_db: float | None = None
@@ -206,9 +206,9 @@ class Live:
     settled: Score
     """Score over the frames after the first `SETTLING_S` seconds, without the start-up of training."""
     previous: BaselineScore
-    """Baseline for `score`: the previous raw frame, over the same frames and pixels."""
+    """Baseline for `score`: the previous received frame in place of the displayed picture, over the same frames and pixels."""
     settled_previous: BaselineScore
-    """Baseline for `settled`: the previous raw frame, over the same frames and pixels."""
+    """Baseline for `settled`: the previous received frame in place of the displayed picture, over the same frames and pixels."""
     age_when_shown: Ages | None
     """Time from a frame's arrival until its picture is displayed; None without a picture."""
     age_on_screen: Ages | None

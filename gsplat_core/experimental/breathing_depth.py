@@ -45,8 +45,8 @@ ROUNDS = 8
 HEAD_ON = 0.05
 """Sine of the angle between pull and line of sight, added as regularisation; limits the estimate for motion seen head-on."""
 LEAST_TOLD = 15.0
-"""Smallest ratio of the second smallest to the smallest generalised eigenvalue; below it the direction of the pull is
-ambiguous.
+"""Smallest ratio of the second smallest to the smallest eigenvalue in the least-squares estimate of a pull's direction; below it the
+direction is ambiguous.
 """
 
 
@@ -136,9 +136,7 @@ MOST_OFF_PX = 1.0
 OWN_MOTION = 3.0
 """Ratio of a point's assumed error along its line of sight to its measured error across it."""
 PULL_FRAMES = 3
-"""Number of frames before a frame, and from it on, at the sampled rate, in which a tool's pull is assumed to have one
-direction.
-"""
+"""Half length, in sampled frames, of the time around a frame in which a tool's pull is assumed to have one direction."""
 PULL_ERROR = 0.4
 """Relative uncertainty of the depth change caused by a pull."""
 TOO_SHORT = (
@@ -280,8 +278,9 @@ def _surface(window: _Window, camera: Camera, time_s: float) -> tuple[NDArray[np
 
 
 def _pulled(window: _Window, index: int, pose: Array, rays: Array, off: Array) -> tuple[Array, Array]:
-    """Return the relative depth change of points by a pull beside their periodic motion, and its uncertainty. The change
-    is 0 if no common direction is found.
+    """Return the relative change of points' depth by a tool's pull, in addition to their periodic motion, and its uncertainty.
+
+    The change is 0 if the deviations have no common direction.
     """
     tracks = window.tracks
     near = range(max(0, index - PULL_FRAMES), min(len(tracks.times_s), index + PULL_FRAMES))
@@ -302,7 +301,7 @@ def _pulled(window: _Window, index: int, pose: Array, rays: Array, off: Array) -
 
 
 MOST_PIXELS = 64_000_000
-"""Largest total number of pixels of frames with depth. Each pixel takes 12 bytes here and again in the observations."""
+"""Largest total number of pixels of the frames that get depth, to bound memory: each pixel takes 12 bytes here and 12 in training."""
 NEEDS_ALL_FRAMES = "depth of breathing tissue is estimated from a complete recording, by `intrasplat reconstruct`"
 
 

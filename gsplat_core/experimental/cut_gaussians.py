@@ -31,7 +31,7 @@ FARTHEST_FLIP = 0.5
 side of the curve (a flip).
 """
 SMALLEST_FLIP = 0.15
-"""Smallest shift to a flip with which the gradient is computed, since it is inversely proportional to the shift."""
+"""Lower bound, in standard deviations, of the shift to a flip in the gradient, which is inversely proportional to the shift."""
 BEND = 1.0
 """Initial bend of a curve in standard deviations of the splat. Nearly straight curves have an ill-conditioned implicit form."""
 TILE_SIZE, MAX_ALPHA, LEAST_ALPHA = 16, 0.99, 1 / 255
@@ -231,7 +231,10 @@ def render_kernel(
 
 
 def _padded(starts: Tensor, ids: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the tiles' lists padded to equal length, int64 [T, L], and the mask of their entries. Synchronises."""
+    """Return the tiles' lists of splats padded to equal length, int64 [T, L], and a mask that is False on the padding.
+
+    Synchronises with the device.
+    """
     counts = torch.diff(starts.long(), append=starts.new_full((1,), len(ids)).long())
     longest = max(int(counts.max()) if len(counts) else 0, 1)
     place = torch.arange(longest, device=ids.device)

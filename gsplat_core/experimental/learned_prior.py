@@ -121,7 +121,7 @@ def blurred(field: NDArray[np.float32], deviation: float) -> NDArray[np.float32]
 REMEMBERED = 256
 """Number of remembered frames: some seconds, several heartbeats."""
 SOONEST = 6
-"""Distance in frames that a compared moment must exceed, because neighbouring frames are always similar."""
+"""Smallest age in frames of the earlier moments that are compared with now, because the newest frames are always similar."""
 EARLIER_COUNTS = 0.64
 """Weight of the dissimilarity of the two preceding moments in the dissimilarity of two moments."""
 FOLLOWED = 6

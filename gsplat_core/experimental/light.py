@@ -47,7 +47,7 @@ newest picture's change is estimated.
 
 
 class LightWindow:
-    """Looks (shading and texture of one picture each) whose tissue can be tracked from one of them, the key."""
+    """Consecutive pictures of a stream, as looks (shading and texture), whose tissue can be tracked from one of them, the key."""
 
     def __init__(self, grid: Grid, key: Look, before: Sequence[Look] = ()) -> None:
         """Create a window around a key.
@@ -102,7 +102,7 @@ class LightWindow:
 
 
 EVERY_S = 0.3
-"""Time from one estimate to the next in seconds. Frames between reuse the previous result."""
+"""Time in seconds from one depth estimate to the next. Frames in between reuse the previous result."""
 MOST_LOOKS = 12
 """Largest number of looks (pictures of one window) fitted together."""
 NEWEST = 0.2
@@ -114,7 +114,7 @@ LEAST_SEEN = 0.25
 ERROR = 0.05
 """Assumed standard deviation of a picture's log brightness that is caused by pigment and model errors instead of distance."""
 REACH = 0.05
-"""Distance from usable cells at which the confidence halves, as a share of the picture's longer side."""
+"""Distance from cells with usable pixels at which the confidence halves, as a share of the picture's longer side."""
 UNSEEN = "too little of the picture is well exposed tissue for depth by shading"
 FLAT = "brightness does not change more than pigment could explain, so depth by shading is no better than a plane"
 
@@ -179,7 +179,7 @@ class LightDepth(Estimator):
 
 
 def shows_enough(look: Look) -> bool:
-    """Return True if at least `LEAST_SEEN` of the cells are known, which depth by shading needs."""
+    """Return True if a picture has enough cells of well-exposed tissue (`LEAST_SEEN`) for depth by shading."""
     return bool(look.shading.known.mean() >= LEAST_SEEN)
 
 
@@ -368,8 +368,8 @@ def appearance(places: Places, coefficients: Array, slopes: float = 1.0) -> Appe
 
 
 RELIEF, RELIEF_COUNT = 0.05, 100
-"""Prior standard deviation of the coefficients of coarse cosines, and the number of
-pseudo-observations with which that value enters its estimate.
+"""Prior standard deviation of the relief coefficients of coarse cosines, and the number of pseudo-observations with which this value
+enters the estimate of the standard deviation.
 """
 RELIEF_LIMITS = 0.025, 2.0
 CHANGE, CHANGE_COUNT, CHANGE_LIMITS = 0.03, 20, (0.005, 0.3)

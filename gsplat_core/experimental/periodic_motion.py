@@ -56,7 +56,7 @@ AMPLITUDE = 0.04
 BEND = 0.008
 """Prior standard deviation of a node's vector from the mean of its neighbours, relative to the distance."""
 RELIEF = 0.5
-"""Prior standard deviation of the points' depth from the median, relative to it."""
+"""Prior standard deviation of the difference of the points' depth from the median depth, relative to the median."""
 SPREAD_PX = 0.5
 """Cauchy scale of reprojection errors, in pixels."""
 TRACK_PX = 0.35
@@ -343,9 +343,9 @@ HEART_HZ = 0.8, 3.0
 LEAST_CYCLES = 0.6
 """Fewest cycles over the recording of the slowest frequency tried; slower motion cannot be distinguished from drift."""
 STEP_CYCLES = 0.25
-"""Spacing of the tried frequencies in cycles over the recording; closer ones are indistinguishable."""
+"""Spacing of the tried frequencies in cycles over the recording; closer frequencies are indistinguishable."""
 COARSE, FINE = (5, 5), (8, 7)
-"""Node counts of the motion fits used for comparison: in the coarse search and near the optimum."""
+"""Grid sizes (nodes along width and height) of the motion fits that compare frequencies: in the coarse search and near the optimum."""
 POINTS, TIMES = 400, 48
 """Largest numbers of points and of times that the search for frequencies uses."""
 ROUNDS = 4

@@ -40,7 +40,7 @@ SHOULDER = 0.8
 x)) / SHOULDER. It differs between cameras.
 """
 BESIDE_TOOLS = 0.07
-"""Margin around tools excluded because of shadows, as a share of the longer side."""
+"""Width of the margin around tools that is excluded because of the tools' shadows, as a share of the picture's longer side."""
 LEAST_KNOWN = 0.3
 """Smallest share of usable pixels (tissue that is neither under- nor overexposed) at which a grid cell counts as known."""
 LEAST_DETAIL = 0.01
@@ -48,7 +48,7 @@ LEAST_DETAIL = 0.01
 LEAST_RED = 0.1
 """Smallest excess of red over green and blue, relative to red, for the diffuse part to be usable."""
 GLINT = 0.35
-"""Smallest excess of white over the surroundings of a highlight, relative to the surroundings' brightness."""
+"""Smallest excess of a highlight's white over that of its surroundings, relative to the surroundings' brightness."""
 SURROUNDINGS = 0.025
 """Standard deviation of the window for a highlight's surroundings, as a share of the longer side."""
 BESIDE_TOOL_EDGE = 0.0125
@@ -148,8 +148,9 @@ def _spread(steps: NDArray[np.float64]) -> float:
 
 
 def log_diffuse(picture: SmallPicture) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Return the logarithm of the diffuse light [H, W] without specular reflections, and where it
-    is known. It relies on tissue being red.
+    """Return the logarithm of the diffuse light [H, W], without specular reflections, and a bool mask [H, W], True where it is known.
+
+    It is the excess of red over green and blue, so the tissue must be red.
     """
     light = np.exp(_LOG_LIGHT[picture.levels])
     diffuse = light[..., 0] - 0.5 * (light[..., 1] + light[..., 2])

@@ -147,7 +147,9 @@ def follow_grids(pictures: Sequence[TexturedPicture], times_s: NDArray[np.float6
 def _from_key(
     pictures: Sequence[TexturedPicture], key: int, start: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Return positions [T, N, 2] and validity [T, N] of the points `start` [N, 2] of a key picture in all pictures."""
+    """Track the points `start` [N, 2] of a key picture. Return their positions [T, N, 2] in all pictures, and a mask [T, N], True
+    where a point was found.
+    """
     method: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     here = start.astype(int)
     usable = pictures[key].usable[here[:, 1], here[:, 0]] > 0

@@ -106,7 +106,9 @@ def _pair(values: NDArray, axis: int) -> tuple[NDArray, NDArray]:
 
 
 def _tangent(points: Array, joins: NDArray[np.bool_], axis: int) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the tangent along `axis` [H, W, 3], from both connected neighbours or one, and where it exists [H, W]."""
+    """Return the surface tangent along `axis` [H, W, 3], from one or both connected neighbours, and a bool mask [H, W], True where it
+    exists.
+    """
     before, after = _pair(points, axis)
     step = np.where(joins[..., None], after - before, 0)
     padding = [(0, 0), (0, 0), (0, 0)]
@@ -118,7 +120,7 @@ def _tangent(points: Array, joins: NDArray[np.bool_], axis: int) -> tuple[Array,
 
 
 LEAST_OPACITY = 0.5
-"""Least opacity of a pixel that becomes part of the mesh, stricter than `COVERED`."""
+"""Least rendered opacity of a pixel that becomes part of the mesh."""
 assert LEAST_OPACITY >= COVERED
 
 

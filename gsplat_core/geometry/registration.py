@@ -21,7 +21,7 @@ from gsplat_core.transfers import HostCopy, tensor_of
 
 Array = NDArray[np.float64]
 SAMPLES = 100_000
-"""Approximate number of samples spread over the mesh for the nearest-neighbour search."""
+"""Approximate number of sample points spread over the mesh, among which the nearest neighbours of a point are searched."""
 CANDIDATES = 6
 """Number of nearest samples whose triangles are tested exactly. Where triangles of very different sizes meet, the
 closest point may be on a triangle without such a sample. The error is then less than the distance between samples.
@@ -144,7 +144,7 @@ TRIM = 0.8
 """Default share of the pairs of closest points that the registration uses; the most distant pairs are left out."""
 MOST_ROUNDS = 60
 SETTLED = 1e-6
-"""Largest displacement of a point in one round, as a share of the surface's extent, below which the iteration ends."""
+"""Displacement of the most displaced point in one ICP round, as a share of the surface's extent, below which the iteration ends."""
 MOST_POINTS = 5000
 """Largest number of points that the registration uses; larger sets are subsampled."""
 

@@ -73,7 +73,7 @@ MOST_POINTS = 700
 APART = 0.025
 """Smallest distance between points when they are detected, as a share of the longer side."""
 LEAST_QUALITY = 0.005
-"""Smallest quality of a detected corner, as a share of that of the picture's best one."""
+"""Smallest quality of a detected corner, as a share of the quality of the picture's best corner."""
 PATCH_PX = 21
 """Side of the square patch that is tracked, in pixels."""
 LEVELS = 3
@@ -81,7 +81,7 @@ RETURN_PX = 0.7
 """Largest accepted error of a point tracked forward and back, in pixels."""
 BORDER_PX = 8
 SURVIVORS = 0.2
-"""Smallest share of the points that must be found in the next picture; otherwise that picture is skipped."""
+"""Smallest share of the tracked points that must be found in the next picture; otherwise that picture is skipped."""
 MOST_LEFT_OUT = 15
 """Largest number of consecutively skipped pictures. After that, tracking continues with new points
 as if in a new scene.
@@ -90,8 +90,8 @@ as if in a new scene.
 
 @dataclass(frozen=True)
 class Observations:
-    """Point observations in frame order: `frame` [M], `point` [M] and `pixels` [M, 2] as x, y with
-    the first pixel's centre at 0.5.
+    """M observations of tracked points in frame order: the frame number, the point number, and `pixels` [M, 2] as x, y with the
+    first pixel's centre at 0.5.
     """
 
     frame: NDArray[np.int64]
@@ -485,7 +485,7 @@ class _Reference:
         self.missed = 0
         """Number of consecutive pictures in which too few corners were found."""
         self.share = 1.0
-        """Share of the corners found in the latest picture in which the reference was found."""
+        """Share of the reference's corners that were found in the latest picture with enough of them."""
         self._picture = picture
         self._grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), 2).astype(np.float32)
         self._map = self._ahead = self._grid

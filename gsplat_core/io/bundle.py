@@ -37,7 +37,7 @@ from gsplat_core.scene.gaussians import MAX_SH_DEGREE, Gaussians
 from gsplat_core.value_ranges import IntegerIn, JsonObject, NumberIn, shortened
 
 PIECE_BYTES = 1 << 22
-"""Piece size in bytes for hashing and writing; other threads run between two pieces."""
+"""Size in bytes of the pieces in which tensors are hashed and written; other threads can run between two pieces."""
 ALIGNMENT = 8
 
 

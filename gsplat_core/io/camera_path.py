@@ -77,7 +77,7 @@ class CameraPath:
         return self._times[0], self._times[-1]
 
     def camera(self, start: Camera, time_s: float) -> Camera:
-        """Return `start` at the path's pose and, if given, with its intrinsics; times are clamped."""
+        """Return the camera `start` at the path's pose at `time_s`, with the path's intrinsics if it has any; times are clamped."""
         k = min(max(bisect_right(self._times, time_s) - 1, 0), len(self._times) - 1)
         before, after = self._waypoints[k], self._waypoints[min(k + 1, len(self._times) - 1)]
         span = after.time_s - before.time_s

@@ -21,7 +21,7 @@ from gsplat_core.scene.gaussians import SH_C0, Gaussians
 
 WIDTH_PX, HEIGHT_PX = 640, 512
 FIELD_OF_VIEW = 0.9
-"""Height of the area that the default camera of a splat file sees at a distance, divided by that distance."""
+"""Vertical field of view of the default camera of a splat file: height of the visible area divided by its distance."""
 SHOWN_SHARE = 0.9
 """Share of the Gaussians inside the sphere that determines the default camera's distance; the others are outliers. The sphere fills
 the height of the picture.
@@ -29,7 +29,7 @@ the height of the picture.
 WINDOW_S = (0.0, 4.0)
 """Time window in seconds that a splat file, which has no time, gets as a model: the duration of one turn of an orbit."""
 LEAST_RADIUS = 0.02
-"""Smallest displayable scene radius, in the file's unit, because of the near plane of the rasterizer."""
+"""Smallest accepted radius of a splat file's scene, in the file's unit; the rasterizer's near plane would cut a smaller scene."""
 MOST_PLACED = 1_000_000
 """Largest number of Gaussians from which the default camera is computed. In a larger file, only every k-th Gaussian is used."""
 MOST_COORDINATE = 1e9

@@ -145,7 +145,7 @@ def _float_table(rows: NDArray[np.void]) -> NDArray[np.float32]:
         return rows.view("<f4").reshape(len(rows), len(names))
     table = np.empty((len(rows), len(names)), np.float32)
     for i, name in enumerate(names):
-        # A double beyond the range of float32 becomes infinite, which is refused afterwards.
+        # A double beyond the range of float32 becomes infinite; non-finite values are rejected afterwards.
         with np.errstate(over="ignore"):
             table[:, i] = rows[name]
     return table
@@ -340,7 +340,7 @@ def _packed_11_10_11(share: NDArray[np.float64]) -> NDArray[np.uint32]:
 
 
 def _packed_rotation(quats: NDArray[np.float32]) -> NDArray[np.uint32]:
-    """Pack unit quaternions wxyz; the sign is chosen so that the largest component is positive."""
+    """Pack unit quaternions wxyz into 32 bits each; the sign is chosen so that the largest component is positive."""
     largest = np.abs(quats).argmax(1)
     sign = np.where(np.take_along_axis(quats, largest[:, None], 1) < 0, -1.0, 1.0)
     others = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[largest]

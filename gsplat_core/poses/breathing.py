@@ -250,7 +250,7 @@ class BreathingTrajectory:
     in units of the median depth.
     """
     error: float
-    """Median distance of the observed rays from those of the moving points, as x / z."""
+    """Median distance between the observed rays and the projected moving points, in units of the focal length (x / z)."""
 
 
 @one_thread()
@@ -353,8 +353,8 @@ def _bundle(sightings: Sightings, frames: Tensor, most: int, nodes: int) -> tupl
 
 
 def _limited(poses: Tensor, rest: Tensor, camera: Tensor, point: Tensor, rays: Tensor) -> Tensor:
-    """Return the points on their first observed rays, with depths outside `NEAREST` to `FARTHEST`
-    replaced by the median.
+    """Return points [P, 3] moved to the rays of their first observation, with their depth, or with the median depth if theirs is
+    outside of `NEAREST` to `FARTHEST` times the median.
     """
     number = torch.arange(len(point))
     first = torch.zeros(len(rest), dtype=torch.int64).scatter_reduce(0, point, number, "amin", include_self=False)

@@ -274,7 +274,7 @@ def _step(bundle: Bundle, fixed: Tensor, spread_px: float, damping: float, point
         h[:, 2] += by_depth * flat_px * _relief(bundle)
     V = V + damping * diagonal_of(V)
     inverse = torch.linalg.inv(V)
-    # Dense camera-by-point blocks: small enough for a few hundred cameras and a few thousand points.
+    # Store all camera-by-point blocks densely; this suffices for a few hundred cameras and a few thousand points.
     W = torch.zeros(cameras * points, 6, 3, dtype=local.dtype)
     W.index_add_(0, bundle.camera * points + bundle.point, weighted.transpose(1, 2) @ by_point)
     W = W.view(cameras, points, 6, 3)[free]

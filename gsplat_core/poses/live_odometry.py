@@ -105,7 +105,7 @@ OFF_EVERY = 5
 LEFT = 0.7
 """Share of the last key frame's points that must still be tracked; with fewer a new key frame is added."""
 ADJUSTED = 2
-"""Number of frames after a key frame during which the newest key frames are adjusted."""
+"""Number of frames after a new key frame in which bundle adjustment over the newest key frames continues."""
 FIRST_KEYS = 6
 """Number of key frames at the start that are added after a displacement of only `FIRST_MOVED_PX`. With at most this many
 key frames, they are adjusted in every frame.
@@ -128,7 +128,7 @@ CORRECTED_PX = 1.0
 pixels. Bundle adjustment handles smaller errors.
 """
 MOSTLY = 0.75
-"""Share of the image motion that poses must explain; below it the scope may be static."""
+"""Share of the squared image motion that the poses explain, below which the scope may be static and only the tissue moves."""
 MOST_NOT_PLACED = 15
 """Consecutive frames that cannot be placed after which a new map is started."""
 
@@ -190,7 +190,7 @@ class LiveOdometry:
         return 1 - (self._error_px / max(self._still_px, 1e-9)) ** 2
 
     def _hold_pose(self) -> None:
-        """Count a frame that keeps the previous pose, and predict no motion for the next one."""
+        """Count a frame that keeps the previous pose because it was not placed, and predict no motion for the next frame."""
         self._waiting += 1
         self.not_placed += 1
         self._motion = torch.eye(4, dtype=torch.float64)
@@ -544,7 +544,7 @@ def position_of(pose: Tensor) -> NDArray[np.float64]:
 
 
 SHOWN = 0.4
-"""Share of a key frame's points that must be inside the picture for it to be searched."""
+"""Share of a key frame's points that must project into the picture for the key frame to be searched there."""
 FOUND = 0.3
 """Share of the searched points of a key frame that must be found for it to be recognised."""
 AGREE, AGREE_PX = 0.5, 4.0

@@ -126,7 +126,7 @@ def learned_from(poses: Tensor, times_s: Tensor, waves: Tensor) -> TrajectoryPri
 
 @dataclass(frozen=True)
 class _Smoothness:
-    """Kernel of the trajectory's Gaussian process, with the restricted likelihood of a trajectory."""
+    """Candidate kernel of the trajectory's Gaussian process, and the restricted likelihood of the trajectory with it."""
 
     likelihood: float
     factor: Tensor
@@ -217,7 +217,7 @@ def _spread(points: Tensor, middle: Tensor, most: int) -> Tensor:
 
 
 SIGMA = 0.002
-"""Standard deviation of an observed ray (x / z). It corresponds to 0.6 pixels at a picture width of 320 and includes
+"""Standard deviation of the tracking error of an observed ray (x / z). It corresponds to 0.6 pixels at a picture width of 320 and includes
 the correlation of errors over time.
 """
 RELIEF = 0.3

@@ -62,13 +62,15 @@ LEAST_POINTS = 24
 """Fewest known points that a frame must observe to be placed."""
 MOST_FRAMES = 3000
 KEY_FRAMES = 60
-"""Number of key frames of a short recording. Longer recordings have at least one in `FARTHEST_APART` frames."""
+"""Number of key frames of a short recording. Longer recordings have at least one key frame in `FARTHEST_APART` frames."""
 FARTHEST_APART = 10
 NEIGHBOURS = 5
 """Number of known points around a new point whose median depth initialises it."""
 POSE_ROUNDS, ROUNDS = 10, 25
 FLAT_PX = 33.0
-"""Prior for similar depths of all points: a deviation of 100 % from the median costs as much as this error in pixels."""
+"""Weight of the prior that all points have similar depths: a depth that deviates by 100 % from the median costs as much as a
+reprojection error of this many pixels.
+"""
 GROWTH = 1.3
 """Factor by which the number of key frames must have grown since the last bundle adjustment for the next one."""
 
@@ -313,7 +315,9 @@ class _Odometry:
         )
 
     def _still_errors_px(self) -> Tensor:
-        """Return the distance of each observation from the median position of its track in pixels [M]."""
+        """Return the distance in pixels of each observation from the median position of its point in the pictures, [M]: the
+        reprojection error of a static scope.
+        """
         order = torch.argsort(self._point, stable=True)
         point, rays = self._point[order], self._rays[order]
         middles = torch.stack([group.median(0).values for group in rays.split(torch.bincount(point).tolist())])
@@ -336,7 +340,7 @@ LEAST_MOTION = 0.005
 MOVING_SHARE = 0.75
 """Share of the image motion that camera motion explains (`rigid_share`), from which poses are worth an estimate."""
 MOST_PATH_FRAMES = 600
-"""Largest number of frames of which a path is estimated. More would take minutes."""
+"""Largest number of frames from which `camera_path_of` estimates a path. More would take minutes."""
 CERTAIN_SHARE = 0.97
 """`rigid_share` from which poses are estimated without a comparison on validation frames."""
 
@@ -364,8 +368,8 @@ class MotionTest:
         self._found: deque[tuple[float, float]] = deque(maxlen=RECENT_PAIRS)
 
     def share(self, frame: Frame) -> float | None:
-        """Take a frame and return the share; None if the frame completes no pair, too few pairs are known, or the pictures
-        hardly move.
+        """Add a frame and return the median share over the newest pairs of frames. None if the frame completes no pair, too few
+        pairs are known, or the pictures hardly move.
         """
         first = self._first
         if first is not None and first.image.shape == frame.image.shape and frame.time_s - first.time_s < APART_S:

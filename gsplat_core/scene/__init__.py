@@ -1,1 +1,4 @@
-"""Scene data shared by all packages of the core: Gaussians, cameras, frames, depth origins. Imports nothing above it."""
+"""Data types that all packages of the core share: Gaussians, cameras, lens distortion, frames, depth origins and range sensors.
+
+This package imports no package that uses it.
+"""

@@ -51,7 +51,7 @@ class Camera:
     width_px: int
     height_px: int
     world_to_camera: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
-    """Pose [4, 4]; lengths in the unit of the scene (millimetres where it has a scale)."""
+    """World-to-camera pose [4, 4]; lengths in the unit of the scene (millimetres if its scale is known)."""
     model: CameraModel = "pinhole"
 
     def __post_init__(self) -> None:
@@ -110,12 +110,12 @@ class Camera:
 
     @property
     def position(self) -> NDArray[np.float64]:
-        """Camera centre in the world [3]."""
+        """Camera centre in world coordinates, [3]."""
         rotation, translation = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]
         return np.asarray(-np.linalg.solve(rotation, translation))
 
     def scaled(self, factor: float) -> Camera:
-        """Return the camera at another resolution; intrinsics match the rounded size exactly."""
+        """Return the camera with a picture size multiplied by `factor` and rounded; intrinsics match the rounded size exactly."""
         if not factor > 0:
             raise InvalidInput(f"camera: the scale factor must be positive, got {factor}")
         return self.resized(max(1, round(self.width_px * factor)), max(1, round(self.height_px * factor)))

@@ -25,7 +25,7 @@ _FOLD_SAMPLES, _FOLD_LEVELS = 512, 3
 _BISECTIONS = 14
 _NEWTON_STEPS = 6
 FTHETA_PIXEL_CENTRE = 0.5
-"""Offset of f-theta principal points, which count from the first pixel's centre."""
+"""Offset added to the principal points of f-theta cameras, which are relative to the centre of the first pixel, not its corner."""
 
 
 class FThetaPolynomialType(Enum):
@@ -399,7 +399,7 @@ def _fisheye_limit(radial: Tensor | None, like: Tensor) -> Tensor:
 
 @torch.no_grad()
 def _first_failure(holds: Callable[[Tensor], Tensor], radial: Tensor, most: float) -> Tensor:
-    """Return the smallest angle [..., C, 1] in 0 to `most` at which a condition fails; `most` if it never does."""
+    """Return the smallest angle [..., C, 1] in 0 to `most` at which the condition `holds` is false; `most` if it is always true."""
     shares = torch.linspace(0, 1, _FOLD_SAMPLES, dtype=radial.dtype, device=radial.device)
     low, high = radial.new_zeros(*radial.shape[:-1], 1), radial.new_full((*radial.shape[:-1], 1), most)
     for _ in range(_FOLD_LEVELS):

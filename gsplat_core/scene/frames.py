@@ -26,7 +26,7 @@ class DepthOrigin:
     name: str
     """Name of the origin in files and reports."""
     relative_error: float
-    """Assumed relative standard error, in addition to the errors visible in a model."""
+    """Assumed standard error relative to the depth, in addition to the errors visible in a model."""
     scale: Literal["metric", "calibrated", "relative"] = "relative"
     """`metric`: in millimetres. `calibrated`: in millimetres if the frame's right camera is known. `relative`: known up to
     one factor.
@@ -34,8 +34,8 @@ class DepthOrigin:
     is_recorded: bool = False
     """True for depth supplied with a frame, False for depth estimated from pictures."""
     initialises_only: bool = False
-    """True if the depth places a new scene, but is neither trained on nor used to correct the scene. For estimators
-    whose scale changes from frame to frame.
+    """True if the depth only initialises a new scene, and is neither trained on nor used to correct the scene later. For
+    estimators whose scale changes from frame to frame.
     """
     is_of_still_tissue: bool = False
     """True if the depth assumes static tissue. It then corrects the scene at all times, otherwise only at its frame's
@@ -134,7 +134,7 @@ class Frame:
     depth_origin: DepthOrigin | None = None
     """Origin of `depth`; None without depth. Depth without an origin counts as recorded with the frame (`MEASURED`)."""
     depth_error: float | None = None
-    """Typical standard error of `depth`, relative to it; None for the one assumed for its origin."""
+    """Typical standard error of `depth`, relative to the depth; None for the error assumed for its origin."""
     ranges: RangeScan | None = None
     """Scan of a range sensor at the camera's position; None without one."""
     mask: NDArray[np.uint8] | None = None
@@ -275,7 +275,7 @@ class DepthError(NamedTuple):
 
     time_s: float
     relative: float
-    """Standard error of z, relative to z."""
+    """Standard error of the model's depth z at that time, relative to z."""
 
 
 @dataclass(frozen=True)
@@ -301,7 +301,7 @@ class DepthSource:
 
     @staticmethod
     def of_first(frame: Frame) -> DepthSource | None:
-        """Return the source for a scene initialised from `frame`.
+        """Return the depth source of a model whose scene is initialised from `frame`.
 
         None without depth; the scene then starts on a plane at an arbitrary distance.
         """
@@ -311,8 +311,8 @@ class DepthSource:
 
     @staticmethod
     def after(source: DepthSource | None, frame: Frame) -> DepthSource | None:
-        """Return the source after another frame: unchanged (also None), but not metric if the frame's depth is not. A
-        scene initialised on a plane never becomes metric.
+        """Return the depth source of a model that has been trained on one more frame: `source` (also None), but not metric if the
+        frame's depth is not. A scene initialised on a plane never becomes metric.
         """
         relative = frame.depth is not None and not frame.depth_is_metric
         return replace(source, metric=False) if source is not None and relative else source

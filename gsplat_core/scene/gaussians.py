@@ -144,7 +144,7 @@ class Gaussians:
         return replace(self, right_sh=torch.zeros_like(self.sh) if wanted else None)
 
     def like(self, other: Gaussians) -> Gaussians:
-        """Return the Gaussians with the optional tensors of `other`: zeros where missing, without those it lacks."""
+        """Return the Gaussians with the same optional tensors as `other`: missing ones are added as zeros, additional ones left out."""
         extra = {
             name: self.extra.get(name, tensor.new_zeros(self.count, *tensor.shape[1:]))
             for name, tensor in other.extra.items()
@@ -218,7 +218,7 @@ def width_of(*groups: slice) -> int:
 
 @dataclass(frozen=True)
 class RowMoves:
-    """Row moves that keep the rows in use contiguous after removals.
+    """Moves of tensor rows that keep the rows of the remaining Gaussians contiguous after removals.
 
     The last remaining rows move into the gaps.
     """
@@ -247,7 +247,7 @@ class RowMoves:
 
     @property
     def order(self) -> Tensor:
-        """Return the moves as one gather index: the old row of each remaining row, int64 [count]."""
+        """Return the moves as a gather index int64 [count]: for each row after the moves, the row that its values come from."""
         order = torch.arange(self.count, device=self.to.device)
         order[self.to] = self.source
         return order

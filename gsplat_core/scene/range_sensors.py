@@ -54,7 +54,9 @@ class RangeSensor:
         return (self.farthest - self.nearest) / self.bins
 
     def factors(self, camera: Camera) -> NDArray[np.float32] | None:
-        """Return measured range / depth z of each pixel [H, W], 0 where the sensor does not look; None for 1 everywhere."""
+        """Return the ratio of measured range to depth z for each pixel [H, W], 0 for pixels that the sensor does not see; None for 1
+        everywhere.
+        """
         raise NotImplementedError
 
 
@@ -65,8 +67,8 @@ class TimeOfFlight(RangeSensor):
     name = "time_of_flight"
 
     def factors(self, camera: Camera) -> NDArray[np.float32] | None:
-        """Return measured distance / depth z of each pixel [H, W]. Raises InvalidInput for a camera other than a
-        pinhole.
+        """Return the ratio of distance along the ray to depth z for each pixel [H, W]. Raises InvalidInput for a camera other than
+        a pinhole.
         """
         if camera.model != "pinhole":
             raise InvalidInput(
@@ -124,7 +126,9 @@ class RangeScan:
 
     sensor: RangeSensor
     counts: NDArray[np.float32]
-    """Returns in each bin, [columns of the picture, bins] or [1, bins], up to one factor for each row."""
+    """Number of detected returns in each bin, [columns of the picture, bins] or [1, bins], up to one factor for each row of the
+    array.
+    """
 
     def __post_init__(self) -> None:
         if self.counts.ndim != 2 or self.counts.shape[1] != self.sensor.bins:

@@ -596,7 +596,7 @@ class TrackReader:
 
 
 def _packets(container: av.container.InputContainer, stream: av.VideoStream) -> Iterator[av.Packet | None]:
-    """Yield the packets with data, then None. An unreadable packet ends the sequence."""
+    """Yield the video packets that have data, then None, which flushes the decoder. An unreadable packet ends the sequence."""
     packets = iter(container.demux(stream))
     while True:
         with captured_log():
