@@ -402,7 +402,7 @@ class HexPlaneField(torch.nn.Module):
         for u, v in AXES:
             plane = torch.empty(1, features, sizes[v], sizes[u])
             plane = plane.fill_(1) if v == 3 else plane.uniform_(0.1, 0.5)
-            # The ops read channels-last planes, which this layout provides without a copy.
+            # Store planes channels-last in memory, as the ops read them, so that they need no copy.
             planes.append(torch.nn.Parameter(plane.contiguous(memory_format=torch.channels_last)))
         return torch.nn.ParameterList(planes)
 

@@ -319,7 +319,7 @@ class Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
             if fullname.startswith("gsplat.") and fullname != _EXTENSION:
                 raise _absent(fullname)
             return None
-        # `from gsplat.exporter import name` asks this finder about missing names of packages only, so all modules are such.
+        # All modules are packages, because `from gsplat.exporter import name` asks this finder about missing names only of packages.
         spec = importlib.machinery.ModuleSpec(fullname, self, origin=__file__, is_package=True)
         spec.has_location = True  # makes the import system set the module's `__file__`
         return spec

@@ -223,8 +223,8 @@ class LearnedDepth(Estimator):
         self._pose: NDArray[np.float64] | None = None
 
     def estimate(self, frame: Frame, camera: Camera) -> DepthMap | None:
-        """Return the depth of a frame from a new inference. Within `EVERY_S` of the last one, return its result while
-        the scope stands still, else None.
+        """Return the depth of a frame from a new inference. Within `EVERY_S` of the last inference, return its result if the
+        scope has not moved, otherwise None.
 
         Raises:
             InvalidSetting: if the network fails on a picture.

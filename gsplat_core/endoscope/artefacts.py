@@ -401,7 +401,7 @@ class _Band:
         seen = runs.any(axis=0)
         first = np.where(seen, runs.argmax(axis=0), depth)
         if seen.mean() >= WHOLE_SHARE:
-            # The rest of the strip's edge does not differ from the background. Use the median position of the visible
+            # The rest of the strip's edge is not visible before the background. Use the median position of the visible
             # part.
             first = np.where(seen, first, int(np.median(first[seen])))
         return np.arange(depth)[:, None] >= first

@@ -67,7 +67,7 @@ class View:
         """Reduce an RGB uint8 picture [H, W, 3] of any size, and divide each channel by its median to remove exposure and tint."""
         small = reduced(image, WIDTH_PX, HEIGHT_PX)
         self.bright: NDArray[np.bool_] = lowest_and_highest(small)[1] >= DARK
-        # Make channels contiguous, because medians are then fast.
+        # Make each channel contiguous in memory, because medians are then fast.
         logs = np.ascontiguousarray(LOGS[small].transpose(2, 0, 1))
         for channel in logs:
             lit = channel[self.bright]
@@ -312,7 +312,7 @@ class FrameRate:
         if len(self._recent) < RATE_FRAMES:
             return False
         now_ns = float(np.median(self._recent))
-        # Require that all intervals differ, not only their median. An unsteady clock is not a new rate.
+        # Require that all intervals differ from the usual one, not only their median: an unsteady clock is no new frame rate.
         if self._usual_ns is None:
             self._usual_ns = now_ns
             return False
@@ -410,7 +410,7 @@ class SharpnessGate:
         """
         elapsed_s = 0.0 if self._last_ns is None else (pts_ns - self._last_ns) * 1e-9
         self._last_ns = pts_ns
-        # Bound the interval. A gap must not dominate the median, and a clock that stands still must not keep
+        # Bound the time since the last frame. A gap must not dominate the median, and a clock that stands still must not keep
         # old frames in the window.
         elapsed_s = min(max(elapsed_s, 1e-3), RECENT_S / RECENT_FRAMES)
         seen = appearance(image, kept)

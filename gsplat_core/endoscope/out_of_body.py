@@ -126,7 +126,7 @@ def evidence_of(image: NDArray[np.uint8]) -> Evidence | None:
         raise InvalidInput(f"image must be RGB uint8 [H, W, 3], got {image.dtype} {list(image.shape)}")
     if min(image.shape[:2]) < SMALLEST_PX:
         return None
-    # Average to suppress noise, which would look like varied colours.
+    # Average pixels, because noise would look like varied colours.
     small = averaged(image, _size(image, LONG_SIDE_PX), samples=3)
     cv2.GaussianBlur(small, (0, 0), 1.0, dst=small)
     brightness, middle = _highest_and_middle(small)

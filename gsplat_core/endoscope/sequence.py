@@ -165,7 +165,7 @@ class SequenceCheck:
             fresh = np.flatnonzero(~stale[rows])
             below = len(rows) if len(fresh) == 0 else int(fresh[0])
             above = rows[below:]
-            # A tear is abrupt, and of no consequence in a still picture. At the edge of a soft view changes fade.
+            # Require an abrupt tear in a moving picture: at the edge of a soft view, changes fade gradually instead.
             usual = float(np.median(share[above])) if len(above) else 0.0
             abrupt = usual >= LEAST_CHANGED and share[above[:3]].mean() >= ABRUPT_SHARE * usual
             enough = below >= least and len(above) >= least
@@ -479,13 +479,13 @@ class DepthCheck:
         known = sampled[possible & (sampled > 0)]
         if len(known) and self._at_another_scale(float(np.median(known))):
             return CheckedDepth(None, "depth at another scale")
-        # Minimum and maximum are NaN if any value is NaN.
+        # Minimum and maximum are NaN if any value is NaN, so that both comparisons are false.
         if depth.min() >= 0 and depth.max() <= FARTHEST_MM:
             return CheckedDepth(depth)
         return CheckedDepth(np.where(self._possible(depth), depth, 0).astype(np.float32), "depth repaired")
 
     def _possible(self, depth: NDArray[np.floating]) -> NDArray[np.bool_]:
-        # Comparisons with NaN are false.
+        # NaN counts as invalid, because comparisons with NaN are false.
         return (depth >= 0) & (depth <= FARTHEST_MM)
 
     def _at_another_scale(self, median_mm: float) -> bool:

@@ -157,7 +157,7 @@ def round_view(small: NDArray[np.uint8]) -> bool:
 
 
 def along_edges(logits: NDArray[np.float32], planes: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return logits [h, w], limited to ±`CERTAIN`, with the edges of the picture.
+    """Return logits [h, w] in the range ±`CERTAIN` whose outlines are aligned with edges of the picture.
 
     The guided filter (He, Sun and Tang, "Guided image filtering", 2013) moves outlines to edges of colour and removes specks.
 
@@ -530,7 +530,7 @@ def view_of(image: NDArray[np.uint8]) -> View:
     cv2.max(cv2.max(red, green, dst=brightness), blue, dst=brightness)
     inside = field_of_view(brightness)
     levels = cv2.calcHist([brightness], [0], inside, [256], [0, 256]).ravel().astype(np.float64)
-    # The ratio of channels is noise in dark regions. This offset pulls it to 0.
+    # Add an offset to each channel: the ratio of dark channels is noise, and the offset pulls its logarithm to 0.
     floor = max(3.0, 0.06 * mean_level(levels))
     # Red is compared with a level halfway between two values of green and blue: their mean, which is
     # less noisy, and their minimum, which separates yellow from grey.
@@ -553,7 +553,7 @@ def field_of_view(brightness: Bytes) -> Bytes:
     around = cv2.copyMakeBorder(dark, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=1)
     cv2.floodFill(around, None, (0, 0), 2)
     inside = cv2.threshold(around[1:-1, 1:-1], 1, 1, cv2.THRESH_BINARY_INV, dst=dark)[1]
-    # Exclude the outermost pixels, which mix with the black surround.
+    # Exclude the outermost pixels of the view, which mix with the black surround.
     cv2.erode(inside, neighbourhood(3), dst=dark, borderType=cv2.BORDER_CONSTANT, borderValue=1)
     return dark
 

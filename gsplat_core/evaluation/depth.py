@@ -70,7 +70,10 @@ def best_plane(rays: Array, z: Array) -> Array | None:
     unit = float(z.mean())
     heights = z / unit
     starts = [np.array([0.0, 0.0, 1.0])]
-    for power in (1, 2):  # weights of the fit: squared differences of 1/z, then of z to first order
+    for power in (
+        1,
+        2,
+    ):  # two linear fits: of relative errors of 1/z, then of errors of z to first order
         weight = heights**power
         found, *_ = np.linalg.lstsq(rays * weight[:, None], weight / heights, rcond=None)
         if (rays @ found).min() > STEEPEST_RATIO:

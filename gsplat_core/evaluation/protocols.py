@@ -251,7 +251,7 @@ AWAY = 3.0
 """Smallest distance of the scope from a place between two stays, in multiples of the distance below which positions
 count as the same place.
 
-The distance is the larger of the position and the angle measure of `_distances`.
+The distance (`_distances`) is the larger of the distances in position and in viewing direction.
 """
 MAX_POSES = 2048
 """Maximum number of poses that `PlaceFinder` stores; longer streams are subsampled by powers of two."""

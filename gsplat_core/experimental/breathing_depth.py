@@ -261,7 +261,7 @@ def _surface(window: _Window, camera: Camera, time_s: float) -> tuple[NDArray[np
     tracks = window.tracks
     after = int(np.clip(np.searchsorted(tracks.times_s, time_s), 1, len(tracks.times_s) - 1))
     share = (time_s - tracks.times_s[after - 1]) / (tracks.times_s[after] - tracks.times_s[after - 1])
-    # A frame between two samples uses the points visible in both. Their ray errors (observed minus predicted by the motion) are interpolated.
+    # A frame between two sampled frames uses the points visible in both, with interpolated ray errors (observed minus predicted).
     ends = [each for each, weight in ((after - 1, 1 - share), (after, share)) if weight > 1e-6]
     seen = np.logical_and.reduce([tracks.seen[each] for each in ends])
     off = np.average(window.off[ends], axis=0, weights=[each for each in (1 - share, share) if each > 1e-6])
@@ -319,7 +319,7 @@ class BreathingDepth(Estimator):
     def of_recording(self, frames: Sequence[Frame], cameras: Sequence[Camera]) -> RecordingDepth:
         """Estimate the depth of a recording's frames together.
 
-        If all frames have more than `MOST_PIXELS` pixels, evenly spaced ones get depth. The frames are unchanged if the
+        If all frames together have more than `MOST_PIXELS` pixels, only evenly spaced frames get depth. The frames are unchanged if the
         camera is no pinhole, or if a frame has depth.
         """
         if cameras[0].model != "pinhole" or any(frame.depth is not None for frame in frames):

@@ -211,7 +211,7 @@ def render_kernel(
     sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
     alpha = (opacities[lists][:, None] * torch.exp(-sigma)).clamp(max=MAX_ALPHA)
     if CURVES in kernel.extra:
-        # Offsets are in standard deviations, so that the limits of a flip do not depend on the size of the splat.
+        # Divide offsets by the splat's standard deviation, so that the limits of a flip do not depend on its size.
         spread = rows.conics.detach()[:, [0, 2]].sum(1).clamp(min=1e-12).mul(0.5).rsqrt()[lists]
         curves = projected_curves(gaussians, camera, rows.means2d)[lists] / spread[:, :, None, None, None]
         factors = kernel.factors(offsets.detach() / spread[:, None, :, None], curves)

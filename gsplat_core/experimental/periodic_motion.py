@@ -164,8 +164,10 @@ class _Fit:
         return off, seen / (1 + squared)
 
     def _step(self, errors: bool) -> None:
-        """Do one Gauss-Newton step; `errors` also estimates the errors of the distances. Derivatives are taken at predicted positions. At observed
-        positions their noise would correlate with the residual and bias distances to be too short.
+        """Do one Gauss-Newton step; with `errors`, also estimate the errors of the distances.
+
+        Derivatives are taken at predicted positions. At observed positions their noise would correlate with the residual
+        and bias distances to be too short.
         """
         tracks, focal = self._tracks, self._tracks.focal_px
         local = in_cameras(self._points(), tracks.poses)

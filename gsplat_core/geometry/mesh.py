@@ -65,7 +65,7 @@ def known(depth: Array) -> NDArray[np.bool_]:
 
 
 def joined(depth: Array, camera: Camera, axis: int) -> NDArray[np.bool_]:
-    """Return which neighbouring pixels are connected by the surface.
+    """Return a mask of the pairs of neighbouring pixels that the surface connects.
 
     Two pixels are connected if both depths are known and the surface between them is tilted by less than `TORN_DEGREES`
     against the image plane.

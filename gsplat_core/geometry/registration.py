@@ -106,7 +106,7 @@ def closest_on_triangles(points: Array, corners: Array) -> Array:
     dot = lambda u, v: np.einsum("ij,ij->i", u, v)
     aa, ab_ac, cc, ap_ab, ap_ac = dot(ab, ab), dot(ab, ac), dot(ac, ac), dot(ap, ab), dot(ap, ac)
     determinant = aa * cc - ab_ac**2
-    has_area = determinant > 0  # the closest point of other triangles is on an edge
+    has_area = determinant > 0  # degenerate triangles have no area; their closest point is on an edge
     determinant = np.where(has_area, determinant, 1.0)
     v, w = (cc * ap_ab - ab_ac * ap_ac) / determinant, (aa * ap_ac - ab_ac * ap_ab) / determinant
     inside = has_area & (v >= 0) & (w >= 0) & (v + w <= 1)
@@ -305,7 +305,7 @@ def nearest_others(points: Tensor, most: int = NEIGHBOURS) -> Tensor:
         there = np.ascontiguousarray(host[finite] - host[finite].mean(axis=0))
         tree = cv2.flann_Index(there, {"algorithm": EXACT_KD_TREE, "leaf_max_size": 10})  # type: ignore[attr-defined]
         found, _ = tree.knnSearch(there, count + 1, params={"checks": -1, "eps": 0.0, "sorted": True})
-        # A point is its own first result, unless other points coincide with it. In that case drop the
+        # The search finds each point itself first, unless other points coincide with it. In that case drop the
         # last result instead.
         itself = found == np.arange(len(there))[:, None]
         itself[~itself.any(axis=1), -1] = True

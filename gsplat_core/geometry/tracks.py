@@ -499,9 +499,9 @@ class _Reference:
     def found(
         self, picture: NDArray[np.uint8], usable: NDArray[np.uint8], flow: NDArray[np.float32]
     ) -> tuple[NDArray[np.int64], Points] | None:
-        """Return numbers and positions of the corners found in a picture, or None if there are too few.
+        """Return numbers and positions of the reference's corners found in a picture, or None if there are too few.
 
-        The map changes with `advance`.
+        The map from the reference to this picture is kept only after a call of `advance`.
 
         Args:
             picture: local contrast of the picture uint8 [H, W].

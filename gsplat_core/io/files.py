@@ -64,7 +64,7 @@ def open_regular(path: str | Path, *, follow_links: bool = True) -> io.BufferedR
     except OSError as error:
         if error.errno != errno.ENXIO:
             raise
-        raise _not_regular(os.stat(path).st_mode, path) from error  # a socket, which cannot be opened
+        raise _not_regular(os.stat(path).st_mode, path) from error  # the path is a socket, which cannot be opened
     mode = os.fstat(descriptor).st_mode
     if not stat.S_ISREG(mode):
         os.close(descriptor)

@@ -430,7 +430,7 @@ def _arrays(g: dict[str, NDArray[np.float32]], header: bytes, version: int, frac
         yield _packed_rotations(g["quats"][rows], version).tobytes()
     higher = g["sh"].shape[1] - 1
     for rows in blocks if higher else []:
-        # Five bits for degree 1, four for the others: fewer values compress better, as the reference encoder does.
+        # Quantise harmonics of degree 1 to five bits and others to four, like the reference encoder: fewer values compress better.
         step = np.array([8.0] * 3 + [16.0] * (higher - 3))[:, None]
         steps = np.floor((np.rint(g["sh"][rows, 1:] * _signs(higher) * 128 + 128) + step / 2) / step)
         yield _byte(steps * step).tobytes()

@@ -93,7 +93,7 @@ def frequencies_of(start: MovingBundle, times_s: Tensor, fastest_hz: float = HEA
     best = _breath_of(breaths, length_s)
     if best is None:
         return ()
-    # One step per heart frequency is enough, since the bundle is already adjusted for breathing.
+    # A single adjustment step per heart frequency is enough, since the bundle is already adjusted for breathing.
     beats = [
         _tried(best.bundle, times_s, (*best.hz, hz), 1)
         for hz in _frequency_grid(HEART_HZ[0], min(HEART_HZ[1], fastest_hz), 2 * step)
@@ -101,7 +101,7 @@ def frequencies_of(start: MovingBundle, times_s: Tensor, fastest_hz: float = HEA
     usual = float(np.median([each.cost for each in beats])) if beats else 0.0
     beats = [each for each in _local_minima(beats) if each.cost < BEATS * usual]
     if beats:
-        # A strong heartbeat hides the frequency of weak breathing.
+        # Search the breathing frequency again with the heartbeat, because a strong heartbeat hides weak breathing.
         both = _best(beats)
         breaths = [_tried(both.bundle, times_s, (hz, both.hz[1]), ROUNDS) for hz in slow]
         best = _breath_of(breaths, length_s) or both

@@ -405,7 +405,7 @@ class LocalMap:
         """Append the newest key frame, evicting one if the map is full."""
         self.keys.append(key)
         if len(self.keys) > MOST_KEY_FRAMES:
-            # Keep the window, which is adjusted, and the first key frame, which fixes the world coordinates.
+            # Never evict the newest key frames, which are adjusted, and the first one, which fixes the world coordinates.
             places = np.stack([key.position for key in self.keys[:-WINDOW]])
             apart = np.linalg.norm(places[:, None] - places[None], axis=2) + np.diag(np.full(len(places), np.inf))
             self.keys.pop(1 + int(np.argmin(apart[1:].min(1))))

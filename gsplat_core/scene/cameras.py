@@ -102,7 +102,7 @@ class Camera:
         """
         import torch
 
-        # Copy both in one transfer. CUDA copies so few bytes immediately, so the source may be freed.
+        # Copy pose and K in one transfer. CUDA copies so few bytes immediately, so the source may be freed.
         values = np.concatenate([self.world_to_camera.ravel(), self.K.ravel()])
         both = torch.tensor(values, dtype=dtype or torch.float32)
         both = both.to(device, non_blocking=True)

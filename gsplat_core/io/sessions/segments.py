@@ -505,7 +505,9 @@ class TrackIndex:
             size = file.seek(0, io.SEEK_END)
             for cluster in islice(whole_clusters(file, size, check_sums=check_sums), MOST_PICTURES):
                 rising = cluster.time < _MOST_MS and (not self._times or cluster.time > self._times[-1])
-                if not cluster.intact or not rising:  # `TrackWriter` writes increasing timestamps
+                if (
+                    not cluster.intact or not rising
+                ):  # timestamps that do not rise are damage, because `TrackWriter` writes increasing ones
                     break
                 self._times.append(cluster.time)
                 self.end = cluster.end
@@ -535,7 +537,7 @@ class TrackReader:
 
     def __init__(self, index: TrackIndex, track: str, height_px: int, width_px: int) -> None:
         self._index, self._size = index, (height_px, width_px)
-        # Sessions of earlier versions may have displayed pictures without loss.
+        # In sessions of earlier versions, displayed pictures may be coded without loss.
         self._lossless: Coding = "colour" if track == "shown" else CODINGS[track]
         self._pictures: Iterator[tuple[int, NDArray[Any] | None, str | None]] | None = None
         self._next: tuple[int, NDArray[Any] | None, str | None] | None = None
