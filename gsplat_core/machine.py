@@ -129,8 +129,7 @@ NICENESS = 10
 
 def step_back() -> None:
     """Lower the scheduling priority of the calling thread. No effect except on Linux."""
-    if (
-        sys.platform == "linux"
-    ):  # on systems other than Linux, the nice value applies to the whole process instead of one thread
+    # On systems other than Linux, the nice value applies to the whole process instead of one thread.
+    if sys.platform == "linux":
         with suppress(OSError):  # the thread keeps the normal priority if a change is not permitted
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)

@@ -176,9 +176,8 @@ def best_labels(total: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArra
     below, here, above = (np.take_along_axis(total, inner + step, 2)[..., 0] for step in (-1, 0, 1))
     bend = below - 2 * here + above
     shift = np.where(bend > 1e-6, 0.5 * (below - above) / np.maximum(bend, 1e-6), 0.0)
-    shift = np.where(
-        best == inner[..., 0], shift, 0.0
-    )  # the parabola's minimum is at most half a label away from the best label, whose cost is the least
+    # The parabola's minimum is at most half a label away from the best label, whose cost is the least.
+    shift = np.where(best == inner[..., 0], shift, 0.0)
     least = total.min(axis=2)
     near = np.abs(np.arange(labels) - best[..., None]) <= 2
     second = np.where(near, np.inf, total).min(axis=2)

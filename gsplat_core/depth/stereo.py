@@ -241,9 +241,8 @@ def _points_in_both(
     the number of corners tried.
     """
     shown = np.asarray(cv2.erode((left < SATURATED).astype(np.uint8), np.ones((7, 7), np.uint8)), np.uint8)
-    if (
-        usable is not None
-    ):  # a window that contains the border of the field of view finds the border, which has no disparity
+    if usable is not None:
+        # A window that contains the border of the field of view would find the border, which has no disparity.
         window = np.ones((FLOW_WINDOW_PX, FLOW_WINDOW_PX), np.uint8)
         shown &= np.asarray(cv2.erode(usable, window), np.uint8)
     corners = cv2.goodFeaturesToTrack(_levelled(left), CORNERS, CORNER_QUALITY, CORNER_APART_PX, mask=shown)
@@ -491,9 +490,8 @@ class StereoDepth(Estimator):
             variance = (found.error_px.square() + off_px.square()) / (HALF_BELIEVED_PX * shrink) ** 2
             depth = torch.where(known, reach_of(frame, camera) / torch.where(known, shift, 1), 0)
             planes = HostCopy(torch.stack([depth, torch.where(known, 1 / (1 + variance), 0)]))
-        both = (
-            planes.numpy().copy()
-        )  # copy out of page-locked memory, which is scarce, because frames may be kept for long
+        # Copy out of page-locked memory, which is scarce, because frames may be kept for long.
+        both = planes.numpy().copy()
         both[1] *= _has_company(both[1], shrink)
         return both
 

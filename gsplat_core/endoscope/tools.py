@@ -385,8 +385,8 @@ SMALLEST_PX = 24
 RED_SCENE = 0.8
 """Third quartile of a scene's redness below which all its redness is multiplied up to it: smoke, fat or a phantom is pale."""
 PALEST_SCENE = 0.2
-"""Lower limit of the scene's third quartile of redness in that multiplication, so that very pale scenes are not stretched without
-limit.
+"""Smallest third quartile of redness for which a pale scene's redness is fully stretched to `RED_SCENE`; paler scenes get the same
+factor.
 """
 BINS, LOWEST, HIGHEST = 100, -0.3, 0.7
 """Number of bins of the redness histogram, and its range; values beyond the range count in the first and last bin."""

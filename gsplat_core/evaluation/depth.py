@@ -70,10 +70,8 @@ def best_plane(rays: Array, z: Array) -> Array | None:
     unit = float(z.mean())
     heights = z / unit
     starts = [np.array([0.0, 0.0, 1.0])]
-    for power in (
-        1,
-        2,
-    ):  # two linear fits: of relative errors of 1/z, then of errors of z to first order
+    # Two linear fits: of relative errors of 1/z, then of errors of z to first order.
+    for power in (1, 2):
         weight = heights**power
         found, *_ = np.linalg.lstsq(rays * weight[:, None], weight / heights, rcond=None)
         if (rays @ found).min() > STEEPEST_RATIO:

@@ -390,7 +390,7 @@ MOST_MISSES = 15
 NODES = 16
 """Number of nodes, along each side of the picture, of the smooth map from a reference picture to another one."""
 REACH = 0.12
-"""Standard deviation of the Gaussian that smooths the residuals of that map, as a share of the picture's longer side."""
+"""Standard deviation of the Gaussian that smooths the residuals of a reference's map, as a share of the picture's longer side."""
 HELD = 0.5
 """Weight of zero in the weighted mean of matches' residuals at a node of the map, which pulls it to zero where matches are sparse. A
 match at the node has the weight 1.

@@ -124,7 +124,7 @@ def load_bundle(folder: str | Path) -> Model:
     """
     folder = Path(folder)
     path = folder / TENSORS
-    if os.path.isfile(folder):  # False for names that the system does not support; opening the file below reports them
+    if os.path.isfile(folder):  # False for unsupported names; opening the file below reports them
         raise BundleError(
             f"{folder} is a file, and a model is a folder with {TENSORS} and {MANIFEST}; give that folder"
         )

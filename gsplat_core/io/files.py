@@ -164,9 +164,8 @@ class PartialFile:
         """Remove the temporary file unless `finish` has renamed it already."""
         if self.path not in _unfinished:
             return
-        with contextlib.suppress(
-            OSError
-        ):  # closing writes buffered bytes, which fails on a full disk; the file is discarded anyway
+        # Closing writes buffered bytes, which fails on a full disk; the file is discarded anyway.
+        with contextlib.suppress(OSError):
             self.file.close()
         self.path.unlink(missing_ok=True)
         _unfinished.discard(self.path)

@@ -281,9 +281,8 @@ def _with_bases(gaussians: Gaussians, bases: int) -> Gaussians:
 def _quaternion(matrix: Tensor) -> Tensor:
     """Return the unit quaternion wxyz [4] of a rotation matrix, from its largest component (Shepperd 1978)."""
     m = matrix
-    squares = (
-        torch.stack([m.trace(), *(2 * m.diagonal() - m.trace())]) + 1
-    )  # 4 w², 4 x², 4 y² and 4 z² of the quaternion
+    # 4 w², 4 x², 4 y² and 4 z² of the quaternion
+    squares = torch.stack([m.trace(), *(2 * m.diagonal() - m.trace())]) + 1
     wx, wy, wz = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
     xy, xz, yz = m[0, 1] + m[1, 0], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1]
     rows = [

@@ -505,9 +505,8 @@ class TrackIndex:
             size = file.seek(0, io.SEEK_END)
             for cluster in islice(whole_clusters(file, size, check_sums=check_sums), MOST_PICTURES):
                 rising = cluster.time < _MOST_MS and (not self._times or cluster.time > self._times[-1])
-                if (
-                    not cluster.intact or not rising
-                ):  # timestamps that do not rise are damage, because `TrackWriter` writes increasing ones
+                # Timestamps that do not rise are damage, because `TrackWriter` writes increasing ones.
+                if not cluster.intact or not rising:
                     break
                 self._times.append(cluster.time)
                 self.end = cluster.end
