@@ -284,7 +284,7 @@ class Sentences:
 
 
 class DepthFinder:
-    """Selects the depth of each frame of one stream according to a setting."""
+    """Selection of the depth of each frame of a stream: tries the estimators of a depth setting (`auto` or a name) in order."""
 
     def __init__(self, choice: str, camera: Camera, *, has_time: bool = False, device: str = "cpu") -> None:
         """Create the estimators of a stream.

@@ -192,7 +192,7 @@ APART_PX = 5
 RETURNS_PX = 0.5
 """Largest accepted error of a point tracked forward and back, in pixels."""
 FEWEST_POINTS = 24
-"""Fewest tracked corners from which a view is used."""
+"""Fewest tracked corners that a view must have in common with the reference picture to be used."""
 TRACK_ERROR_PX = 0.5
 """Standard deviation of a tracked position in pixels."""
 RELIEF = 0.5

@@ -424,7 +424,7 @@ FARTHEST_MM = 2000.0
 WRONG_DEPTH_SHARE = 0.2
 """Share of invalid values (not finite, negative or too far) from which a frame's depth is discarded."""
 USUAL_DEPTH_RATIO = 4.0
-"""Ratio of the median depth to that of earlier frames, in either direction, from which a frame's depth is discarded."""
+"""Ratio of a frame's median depth to that of earlier frames, in either direction, from which the depth is discarded."""
 UNUSUAL_FRAMES = 10
 """Largest number of consecutive depth maps that are discarded for their scale. After that the new distance is accepted."""
 

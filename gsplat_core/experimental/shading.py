@@ -28,7 +28,7 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 
 LONG_SIDE_PX = 320
-"""Longest side of the analysed pictures, in pixels."""
+"""Longest side, in pixels, to which pictures are reduced before their shading is analysed."""
 CELLS = 40
 """Number of cells along the longer side of the brightness grid."""
 BRIGHTEST, DARKEST = 249, 20
@@ -46,7 +46,7 @@ LEAST_KNOWN = 0.3
 LEAST_DETAIL = 0.01
 """Lower bound of `Cells.detail`: no picture has less noise of log brightness between neighbouring cells."""
 LEAST_RED = 0.1
-"""Smallest excess of red over green and blue, relative to red, for the diffuse part to be usable."""
+"""Smallest excess of red over green and blue, relative to red, at a pixel whose diffuse light is usable."""
 GLINT = 0.35
 """Smallest excess of a highlight's white over that of its surroundings, relative to the surroundings' brightness."""
 SURROUNDINGS = 0.025
@@ -238,11 +238,11 @@ class Change:
     """Change of the tissue from a key picture to another picture, in each cell of the key picture."""
 
     brighter: NDArray[np.float64]
-    """Change of log brightness, float64 [h, w], mean over the cell."""
+    """Change of log brightness from the key picture to the other one, mean over the cell's tracked pixels, float64 [h, w]."""
     share: NDArray[np.float64]
     """Share of the cell's pixels that were tracked into the other picture, float64 [h, w]."""
     moved: NDArray[np.float64]
-    """Displacement in cells (columns, rows), float64 [h, w, 2]."""
+    """Displacement of each cell's tissue from the key picture to the other one, in cells (columns, rows), float64 [h, w, 2]."""
     found: float
     """Share of the key picture's tissue pixels that were tracked into the other picture."""
 

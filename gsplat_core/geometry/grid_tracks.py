@@ -20,7 +20,7 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 
 LONGEST_PX = 320
-"""Longest side of the compared pictures, in pixels."""
+"""Longest side, in pixels, to which pictures are reduced before grid points are tracked."""
 SPACING_PX = 10
 """Distance between neighbouring points of the tracked grid, in pixels of the reduced picture."""
 DARK = 8

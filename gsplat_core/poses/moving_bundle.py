@@ -328,7 +328,7 @@ class MovingBundle:
     influence: Tensor
     """Weight of each node's vector at each point, [P, M]."""
     field: SurfaceField
-    """Nodes and prior of the motion field."""
+    """Nodes of the field of motion vectors, and the field's prior."""
     rhythm: Rhythm | None = None
     """Phases of the waves, which the adjustment estimates; None if the waves are given and fixed."""
 

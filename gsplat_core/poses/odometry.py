@@ -96,7 +96,7 @@ class Trajectory:
     points: NDArray[np.float64]
     """Tissue points [P, 3] in the world."""
     error_px: float
-    """Median reprojection error in pixels."""
+    """Median reprojection error of the tissue points in pixels."""
     still_error_px: float
     """Median distance of observations from their track's median position in pixels: the error of a static scope."""
     lost: tuple[int, ...]

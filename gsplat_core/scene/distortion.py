@@ -338,9 +338,8 @@ def _to_pixels(flat: Tensor, Ks: Tensor) -> Tensor:
 
 
 def _focal(Ks: Tensor) -> Tensor:
-    return Ks.diagonal(dim1=-2, dim2=-1)[
-        ..., None, :2
-    ]  # the diagonal is used because indexing with lists would synchronise on CUDA
+    # Take the diagonal, because indexing with lists would synchronise on CUDA.
+    return Ks.diagonal(dim1=-2, dim2=-1)[..., None, :2]
 
 
 def _polar(points: Tensor) -> tuple[Tensor, Tensor]:
