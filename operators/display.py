@@ -204,7 +204,9 @@ class LiveDisplayResult:
     age: DurationSummary
     """Distribution of the age of each new picture at the time of display."""
     settled_age: DurationSummary
-    """Distribution of the ages of new pictures at display after the first `SETTLING_S` seconds of the stream."""
+    """Distribution of the ages of new pictures at display (time since their content arrived), after the first `SETTLING_S`
+    seconds of the stream.
+    """
     used_age: DurationSummary
     """Distribution of `settled_age` without pictures of withheld and damaged frames, which show the content of an
     earlier frame.

@@ -367,7 +367,7 @@ class OfflineSection(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class ChecksSection(Section):
-    """Options for the checks of the frames."""
+    """Options for tool masks and for pictures from outside the body."""
 
     tool_mask: Annotated[
         str,

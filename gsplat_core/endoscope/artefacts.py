@@ -80,7 +80,7 @@ class FieldOfView:
         self._candidates: list[Outline | None] = []
 
     def observe(self, image: NDArray[np.uint8]) -> NDArray[np.uint8] | None:
-        """Process a usable frame, RGB uint8 [H, W, 3], and return `mask` (None: the whole picture)."""
+        """Process a usable frame, RGB uint8 [H, W, 3], and return `mask`; None if the field of view is the whole picture."""
         if image.shape != self._shape:
             self._start(image.shape)
         scale = FIELD_SIDE_PX / max(image.shape[:2])
@@ -236,7 +236,9 @@ def _along(hull: Outline) -> Outline:
 
 
 def _ends_sharply(inside: NDArray[np.bool_], brightest: NDArray[np.uint8], limit: float) -> bool:
-    """Return True if a share `EDGE_SHARE` of the field's rim is brighter than the surround by `EDGE_CONTRAST`."""
+    """Return True if a share `EDGE_SHARE` of the field's rim is brighter by `EDGE_CONTRAST` than `limit`, the highest level of
+    the surround.
+    """
     three = np.ones((3, 3), np.uint8)
     field = inside.astype(np.uint8)
     inner = cv2.erode(field, three, iterations=2, borderType=cv2.BORDER_CONSTANT, borderValue=1)
@@ -312,7 +314,7 @@ class StripDetector:
         self._before: NDArray[np.bool_] | None = None
 
     def observe(self, image: NDArray[np.uint8]) -> NDArray[np.uint8] | None:
-        """Process a usable frame, RGB uint8 [H, W, 3], and return `mask` (None: nothing was found)."""
+        """Process a usable frame, RGB uint8 [H, W, 3], and return `mask`; None if no strip or text was found."""
         if image.shape != self._shape:
             self._start(image.shape)
         if self._bands:

@@ -409,7 +409,9 @@ tools.
 CLEAR_VALLEY = 1.15
 """Smallest ratio of both neighbouring peaks of the redness distribution to the valley between them."""
 SMALLEST_SHARE = 0.003
-"""Share of a picture's pixels that must be lit, and that must be greyer than the threshold, for tools to be found."""
+"""Smallest share of a picture's pixels that must be lit for tools to be found, and of the lit pixels that must be at most as
+red as a histogram valley for it to be the threshold.
+"""
 HELD_FRAMES = 3
 """Largest number of frames for which the previous tool mask is kept if tools disappear suddenly, as by glare or blur."""
 BIN_EDGES = np.linspace(LOWEST, HIGHEST, BINS + 1)

@@ -362,7 +362,7 @@ class Retention:
     """Score of the final model on the frames of the last seconds of the stream."""
     last_range_s: Range
     frozen: BaselineScore
-    """Baseline: the stream's last frame shown for all of the last seconds."""
+    """Baseline: the last usable frame of `last_range_s` as a still, scored on the other frames of that range."""
     places: tuple[PlaceScore, ...]
 
 

@@ -113,7 +113,7 @@ class ZstdStream:
 
 MAGIC = b"NGSP"
 VERSIONS = (2, 3)
-"""Versions of the `.spz` format that are stored in a gzip stream; these are also written."""
+"""Versions of the `.spz` format that are stored in a gzip stream. They can be read and written; version 4 is read only."""
 ZSTD_VERSION = 4
 HEADER_4 = struct.Struct("<4sIIBBBBI12x")
 """Header of version 4: magic, version, count, degree of the harmonics, fractional bits, flags, number of streams and offset of

@@ -368,8 +368,8 @@ class MotionTest:
         self._found: deque[tuple[float, float]] = deque(maxlen=RECENT_PAIRS)
 
     def share(self, frame: Frame) -> float | None:
-        """Add a frame and return the median share over the newest pairs of frames. None if the frame completes no pair, too few
-        pairs are known, or the pictures hardly move.
+        """Add a frame and return the median share of squared image motion that a homography explains, over the newest pairs of
+        frames. None if the frame completes no pair, too few pairs are known, or the pictures hardly move.
         """
         first = self._first
         if first is not None and first.image.shape == frame.image.shape and frame.time_s - first.time_s < APART_S:

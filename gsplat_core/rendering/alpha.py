@@ -471,7 +471,7 @@ class FrameRenderer:
         self.gaussians = gaussians.detach()
         self.field = field
         self.capacity = TileListCapacity.initial(gaussians.count, camera.width_px, camera.height_px)
-        """Capacity of the tile lists; may be replaced between frames."""
+        """Capacity of the tile lists; replaced by one that fits when a frame overflows it."""
         self._camera = camera
         self._background = background
         self._dtype = torch.float32 if precision == "fp32" else torch.float16

@@ -299,7 +299,9 @@ class RayDepth:
     needs_depth: ClassVar[bool] = True
 
     def compare(self, rays: RenderedRays) -> Tensor:
-        """Return the mean difference of inverse ray depths, relative to the mean inverse depth of the observation."""
+        """Return the mean absolute difference of inverse ray depths over tissue, relative to the observation's mean inverse
+        depth.
+        """
         assert rays.known_depth is not None
         return ray_depth_loss(rays.depths, rays.known_depth, rays.tissue)
 

@@ -83,7 +83,9 @@ class LateDepth:
         return LateDepth(None, known_depth(possible, device) if possible.any() else None, None)
 
     def added_to(self, seen: Observation, frame: Frame) -> Observation:
-        """Return the observation of `frame` with `believed` as the target of its depth loss."""
+        """Return the frame's observation `seen` with its confident depth `believed`, and that depth's error, for the depth
+        loss.
+        """
         return replace(seen, depth=self.believed, depth_error=error_of_depth(frame))
 
 

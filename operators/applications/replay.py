@@ -269,7 +269,7 @@ def new_reconstructor(settings: ReplaySettings, source: FrameSource, *, offline:
 
 
 def lacking_depth(settings: ReplaySettings, source: SourceDescription, config: ReconstructorConfig) -> str | None:
-    """Return a note if the source's frames have no usable recorded depth; None otherwise."""
+    """Return a note if the frames have no recorded depth or the setting `depth` leaves it out; None if it is used."""
     poses = {"pose"} if settings.poses != "given" else set()
     return without_depth(settings.depth, source.fields | poses, config)
 

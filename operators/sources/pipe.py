@@ -317,8 +317,8 @@ class PipeSource(StreamSource):
 
 
 def pipe_source(rest: str, options: SourceOptions) -> PipeSource:
-    """Open `pipe:-?size=640x512&format=rgb24&fps=30` or `pipe:/path/of/a/fifo`. Raises
-    InvalidSetting and SourceUnavailable.
+    """Open standard input (`pipe:-`) or a named pipe (`pipe:/path/of/a/fifo`). Frames are y4m, or raw with options such as
+    `?size=640x512&format=rgb24&fps=30`. Raises InvalidSetting and SourceUnavailable.
     """
     address = PipeAddress.parse(rest, options)
     if address.size is None:

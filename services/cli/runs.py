@@ -134,12 +134,18 @@ def next_frame_line(report: RunReport) -> list[str]:
 
 
 def replay_command(settings: ReplaySettings, *, as_json: bool) -> int:
-    """Replay, write the reports and print their paths. Return the exit code: OK or INTERRUPTED."""
+    """Replay and write the reports. Print the main figures and the path of the page, or the report as JSON.
+
+    Return the exit code: OK or INTERRUPTED.
+    """
     return report_run(lambda *callbacks: replay(settings, *callbacks), settings.out, as_json=as_json)
 
 
 def reconstruct_command(settings: ReconstructSettings, *, as_json: bool) -> int:
-    """Reconstruct offline, write the reports and print their paths. Return the exit code: OK or INTERRUPTED."""
+    """Reconstruct offline and write the reports. Print the main figures and the path of the page, or the report as JSON.
+
+    Return the exit code: OK or INTERRUPTED.
+    """
     return report_run(
         lambda *callbacks: reconstruct(settings, settings.steps, *callbacks), settings.out, as_json=as_json
     )

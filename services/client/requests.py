@@ -298,10 +298,10 @@ def _check_whole(answer: httpx2.Response, digest: bytes, size: int, name: str) -
 
 
 def _pieces(content: BinaryIO, size: int, file: Path) -> Iterator[bytes]:
-    """Yield the announced number of bytes of a file.
+    """Yield the `size` bytes of a file for an upload, as announced in its Content-Length.
 
     Raises:
-        ClientError: if the file changes meanwhile.
+        ClientError: if the file becomes shorter or longer meanwhile.
     """
     left = size
     while piece := content.read(min(CHUNK_BYTES, left)):

@@ -266,7 +266,7 @@ MOST_TENSOR_BYTES = 4 * GIB
 MOST_PIXELS = 4096 * 4096
 """Maximum number of pixels of the pictures of an uploaded model's camera."""
 CHECK_MEMORY_BYTES = 12 * GIB
-"""Memory of the checking process beyond torch itself, in bytes."""
+"""Memory limit of the checking process on the CPU, beyond what torch uses at its start, in bytes."""
 CHECK_S = 120.0
 """Processor time of the check in seconds, without the start of torch. Exceeding it rejects the version."""
 CHECK_PASSED_S = 600.0

@@ -245,7 +245,7 @@ class LiveFacts(Part):
     dropped: dict[str, Count]
     """Number of frames, pictures and scores dropped in favour of newer ones, by graph edge or operator."""
     withheld: dict[str, Count]
-    """Frames displayed without training, by reason."""
+    """Number of withheld and damaged frames, by reason. Blurred frames and possible cuts may be trained on nevertheless."""
     scenes: dict[str, Count]
     """Number of scene changes, by reason."""
     analysis: dict[str, dict[str, Count]] = {}

@@ -479,7 +479,7 @@ class Plan:
     observations: Sequence[Observation]
     """Observations of both eyes to train on."""
     steps: int
-    """Number of optimiser steps."""
+    """Number of optimiser steps of the whole training."""
     most_gaussians: int
     """Largest number of Gaussians."""
     random: np.random.Generator
