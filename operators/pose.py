@@ -164,7 +164,9 @@ class AutoPoseOp(PoseOp):
 
 
 def check_poses(choice: str, camera: Camera) -> None:
-    """Raise InvalidSetting for an unknown choice, or for a camera that pose estimation does not support."""
+    """Raise InvalidSetting for an unknown choice, or if poses are to be estimated and pose estimation does not support the
+    camera.
+    """
     if choice not in get_args(Poses):
         raise InvalidSetting(f"poses is {choice!r}; choose {', '.join(get_args(Poses))}")
     if choice == "estimated" or (choice == "auto" and camera.model == "pinhole"):

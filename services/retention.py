@@ -104,7 +104,7 @@ class ReplayRetention:
 
     @asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
-        """Enforce the limits while the block runs."""
+        """Delete replays beyond the age and number limits periodically while the block runs."""
         task = asyncio.create_task(again_and_again(self.enforce), name="retention of replays")
         try:
             yield

@@ -367,7 +367,7 @@ def install(constants: str = "1.6") -> None:
 
 
 PATH_ENTRY = str(Path(__file__).parent / "path_entry")
-"""Folder whose modules install the hook in processes that inherit `sys.path`, but not `sys.meta_path`."""
+"""Folder whose modules install the import hook in spawned processes, which inherit `sys.path`, but not `sys.meta_path`."""
 _CONSTANTS_VARIABLE = "INTRASPLAT_GSPLAT_CONSTANTS"
 """Environment variable that tells spawned processes which version's constants to use (argument of `install`)."""
 

@@ -51,7 +51,8 @@ ellipse. As a share of the ellipse's diameter in that direction.
 LIT_OUTSIDE = 0.25
 """Largest share of lit pixels outside the outline, such as text, logos and compression artefacts."""
 MARGIN_SHARE = 0.01
-"""Margin inside the outline that is excluded because it is blurred or has a bright ring, as a share of the longer side.
+"""Margin inside the outline that is excluded because it is blurred or has a bright ring, as a share of the picture's longer
+side.
 """
 WINDOW_FRAMES = 30
 """Number of frames whose extreme levels are examined together for the field of view; the first frame is examined alone."""

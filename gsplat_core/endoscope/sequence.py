@@ -464,7 +464,9 @@ class CheckedDepth:
 
 
 class DepthCheck:
-    """Check of depth maps for invalid values, and for sudden changes of the median depth."""
+    """Check of a stream's depth maps. Sets invalid values to 0, and discards maps that are mostly invalid or whose median
+    depth changes suddenly.
+    """
 
     def __init__(self) -> None:
         self._medians: deque[float] = deque(maxlen=15)

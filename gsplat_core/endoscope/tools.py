@@ -425,7 +425,7 @@ RED_OVER_OTHERS = np.array([[1, -0.25, -0.25, -0.5]], np.float32)
 
 @dataclass(frozen=True)
 class View:
-    """Frame reduced to the size at which tools are found."""
+    """Redness, brightness and field of view of a frame, at the reduced size at which tools are found."""
 
     redness: Plane
     """Redness of each pixel: logarithm of red relative to green and blue, [h, w]."""

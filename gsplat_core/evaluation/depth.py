@@ -141,7 +141,7 @@ class DepthSums:
         self._frames = 0
 
     def add(self, frame: Frame, depth: NDArray[np.float32]) -> float:
-        """Compare rendered depth z [H, W], 0 = unknown, with the frame's depth.
+        """Add a frame: compare rendered depth z [H, W], 0 = unknown, with the frame's depth on tissue.
 
         Returns:
             Mean absolute error in the unit of the frame's depth, NaN if nothing is comparable.

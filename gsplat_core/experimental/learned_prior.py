@@ -49,7 +49,9 @@ class SharesSettings:
     around_cells: float
     """Standard deviation of the Gaussian over which the sums of neighbouring cells are averaged, in cells."""
     pull: float
-    """Weight of the regularisation that pulls a cell's mixing weights to those of the whole picture."""
+    """Weight of the regularisation that pulls a cell's mixing weights of the predictions (pictures or motions) to those of the
+    whole picture.
+    """
     ridge: float
     """Weight of ridge regression that pulls each prediction's share over the whole picture to its initial value."""
 

@@ -405,7 +405,7 @@ GLINT_CELL_SHARE = 1 / 64
 FEWEST_GLINTS = 0.3
 """Value added to the variance of a cell's number of highlights, so that it is not near 0."""
 BRIGHTNESS_LOOKS = 5
-"""Number of pictures, evenly spaced in the window, whose brightness is used as a cue."""
+"""Largest number of pictures, evenly spaced in the window, whose brightness is used as a cue for the relief."""
 ROUNDS = 16
 ROUNDS_OF_CHANGE = 4
 ROUNDS_TO_SLOPES = 4

@@ -251,7 +251,9 @@ class _Fit:
         return np.asarray((across[:, :, None] * down[:, None, :]).reshape(len(local), -1))
 
     def _limited(self, rest: Array) -> Array:
-        """Clamp depths of rest positions in the middle frame to `NEAREST` to `FARTHEST` times the median depth."""
+        """Clamp depths of rest positions in the middle frame to `NEAREST` to `FARTHEST` times the median depth. Positions move
+        along their rays.
+        """
         pose = self._tracks.poses[self._middle]
         local = rest @ pose[:3, :3].T + pose[:3, 3]
         depth = np.clip(local[:, 2], NEAREST * self._distance, FARTHEST * self._distance)

@@ -46,7 +46,7 @@ LEAST_KNOWN = 0.3
 LEAST_DETAIL = 0.01
 """Lower bound of `Cells.detail`: no picture has less noise of log brightness between neighbouring cells."""
 LEAST_RED = 0.1
-"""Smallest excess of red over green and blue, relative to red, at a pixel whose diffuse light is usable."""
+"""Smallest excess of red over the mean of green and blue, relative to red, at a pixel whose diffuse light is usable."""
 GLINT = 0.35
 """Smallest excess of a highlight's white over that of its surroundings, relative to the surroundings' brightness."""
 SURROUNDINGS = 0.025

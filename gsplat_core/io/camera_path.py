@@ -114,7 +114,9 @@ def read_camera_path(path: Path) -> CameraPath:
 
 
 def _intrinsics(waypoint: Waypoint, camera: Camera) -> NDArray[np.float64]:
-    """Return fx, fy, cx and cy of a waypoint in pixels of the camera; the vertical field of view is kept."""
+    """Return fx, fy, cx and cy of a waypoint in pixels of the camera. Intrinsics of another picture height are scaled to the
+    camera's height, with the principal point in the middle.
+    """
     fx, fy, cx, cy = waypoint.intrinsics or ()
     if waypoint.height_px is None:
         return np.array([fx, fy, cx, cy])

@@ -548,7 +548,9 @@ SHOWN = 0.4
 FOUND = 0.3
 """Share of the searched points of a key frame that must be found for it to be recognised."""
 AGREE, AGREE_PX = 0.5, 4.0
-"""Share of the found points that must agree on a pose, and their largest reprojection error in pixels."""
+"""Share of a key frame's found points that must agree with the estimated pose for it to be recognised, and their largest
+reprojection error in pixels.
+"""
 FEATURES = 400
 """Largest number of ORB features per picture."""
 CLEARER = 0.8

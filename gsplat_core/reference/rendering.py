@@ -111,7 +111,9 @@ def visible_harmonics(
     batch_dims: int = 0,
     sparse_grad: bool = False,
 ) -> Tensor:
-    """Return the spherical harmonics of packed rows; see `gsplat_core.ops.packed_projection`."""
+    """Return the spherical harmonics of visible (camera, Gaussian) pairs, in rows. `sparse_grad` has no effect; gradients are
+    dense.
+    """
     return spherical_harmonics(degree, dirs, values_of_rows(coefficients, ids, pairs, batch_dims))
 
 

@@ -258,7 +258,9 @@ class SampledRenderer:
 
     @property
     def samples_drawn(self) -> int:
-        """Number of samples per sub-pixel in the last frame."""
+        """Number of samples per sub-pixel in the last picture, including those accumulated over earlier progressive frames of
+        the same view.
+        """
         return self._drawn
 
     def prepare(self, model: Model | Snapshot) -> None:

@@ -292,8 +292,12 @@ class FlowPrior:
                 motion_of(step).move_to(time_s, held)
 
     def velocity(self, step: TrainingStep, deltas: Tensor | None = None) -> Tensor | None:
-        """Return the velocity of the raw parameters [N, 16] that continues the last motion, damped; None without a
-        usable motion.
+        """Return the velocity of the raw parameters [N, 16], per second, that continues the last motion, damped; None without
+        a usable motion.
+
+        Args:
+            step: training of the scene.
+            deltas: offsets of the raw parameters at the newest frame; None to evaluate the field.
         """
         motion = self._usable_motion()
         if motion is None:

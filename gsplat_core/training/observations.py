@@ -422,7 +422,7 @@ def _correlations(left: NDArray[np.float32], right: NDArray[np.float32], most: i
 
 
 def _sums(picture: NDArray[np.float64], begins: NDArray, widths: NDArray) -> NDArray[np.float64]:
-    """Return the sum of a picture over each of several column ranges, given by first column and width."""
+    """Return the sum of all pixels in each of several column ranges, [ranges]. A range is given by its first column and width."""
     upto = np.concatenate([[0.0], picture.sum(0).cumsum()])
     return np.asarray(upto[begins + widths] - upto[begins])
 

@@ -181,7 +181,9 @@ class FlowTracker:
         return tuple(merged.items())
 
     def finish(self, operator: str, trails: list[Trail]) -> None:
-        """Record the latency of each path of the messages that an operator without connected outputs (a leaf) has processed."""
+        """Record the time since the start of each path of the messages that an operator without connected outputs (a leaf) has
+        processed.
+        """
         now_ns = perf_counter_ns()
         for trail in trails:
             for node, began_ns in trail:

@@ -233,7 +233,7 @@ class ServiceManager:
             log.warning("systemd was not notified of %s: %s", lines[0], error)
 
     async def feed_watchdog(self) -> None:
-        """Send watchdog notifications until cancelled."""
+        """Send watchdog notifications to systemd until cancelled. Return at once if the watchdog is off."""
         while self.feed_s is not None:
             self.tell("WATCHDOG=1")
             await asyncio.sleep(self.feed_s)
@@ -552,7 +552,7 @@ class ServerCertificate(Collector):
         return CheckResult(left_s > 0, said if left_s > 0 else f"{said}; renew it", False)
 
     def collect(self) -> Iterable[Metric]:
-        """Export the expiry time and the reload status; see `Collector`."""
+        """Export metrics of the TLS certificate: expiry time and reload status."""
         expiry = GaugeMetricFamily(
             "intrasplat_certificate_expiry_timestamp_seconds", "Unix time at which the TLS certificate in use expires."
         )

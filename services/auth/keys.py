@@ -335,7 +335,7 @@ class KeyStore:
         return self._path.with_suffix(".used.json")
 
     def _uses(self) -> dict[str, str]:
-        """Return the times of last use, loaded from the file on first access."""
+        """Return the time of last use by key id, loaded from the file on first access."""
         if self._used is None:
             self._used = _parse_used(self._used_path)
             self._saved = self._saved[0], dict(self._used)

@@ -421,10 +421,11 @@ class Claims:
         self._most, self._is_published = most_attempts, is_published
 
     def take(self) -> Claimed | None:
-        """Claim the oldest free job. Free jobs with a published result, a cancellation or too many attempts are ended.
+        """Claim the oldest free job: queued, or running with an expired lease. Free jobs with a published result, a
+        cancellation or too many attempts are ended.
 
         Returns:
-            The job, or None.
+            The job, or None if no job is free.
         """
         at_ms = _now_ms()
         free = sa.or_(

@@ -287,7 +287,7 @@ class FolderLock:
 
     @contextlib.contextmanager
     def alone(self, wait_s: float) -> Iterator[bool]:
-        """Try to hold the lock exclusively for up to `wait_s` seconds.
+        """Try for up to `wait_s` seconds to take the lock exclusively. It is held while the block runs.
 
         Yields:
             True if the lock is held, False after the timeout.

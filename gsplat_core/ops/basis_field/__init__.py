@@ -48,10 +48,11 @@ def basis_field(
 def basis_field_backward(
     gradient: Tensor, centers: Tensor, log_widths: Tensor, weights: Tensor, tau: float | Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the gradients of (centers, log_widths, weights); exactly zero for inactive bumps.
+    """Return the gradients of (centers, log_widths, weights). They are exactly zero for bumps more than 4 widths from `tau`.
 
     Args:
         gradient: dL/d(deltas) [N, 13], or [N, 16] of which the last three columns are ignored.
+        tau: normalised time of the forward pass.
     """
     _check(centers, log_widths, weights)
     _check_gradient(gradient, centers)
