@@ -30,7 +30,7 @@ WRONG = {
 
 
 ANY_NUMBER_OF_CHANNELS = {("colors", "a longer end"), ("colors", "empty")}
-"""What looks wrong and is allowed."""
+"""Calls with unusual arguments that are accepted."""
 
 
 @pytest.mark.parametrize(
