@@ -1,16 +1,19 @@
 """Pictures of polygons fitted by cut Gaussians and by Gaussians at equal bytes.
 
-    python benchmarks/methods/cut_gaussians.py [--pictures 3] [--splats 64] [--steps 500] [--full] [--device cpu|cuda] [--out FILE]
+    python benchmarks/methods/cut_gaussians.py [--pictures 6] [--splats 40] [--steps 500] [--full] [--device cpu|cuda] [--out FILE]
 
 A picture has eight random triangles and quadrangles of uniform colours, antialiased by 8x8 samples. A Gaussian has 14 float32
 numbers (as a .ply of degree 0); each curve adds 8. Plain Gaussians get as many splats as give the same bytes. All splats start
-on a jittered grid, and have the same rates and numbers of steps.
+on a jittered grid, and have the same number of steps. The factor on the learning rates is searched for each number of curves
+in the same grid, on other pictures than the reported ones. The same search chooses the number of curves.
 """
 
 from __future__ import annotations
 
+import argparse
 import statistics
 import time
+from pathlib import Path
 
 import cv2
 import log
@@ -24,6 +27,12 @@ from gsplat_core.scene.gaussians import SH_C0, Gaussians
 
 NUMBERS, PER_CURVE, FINER = 14, 8, 8
 RATES = {"means": 0.4, "quats": 2e-2, "log_scales": 3e-2, "logit_opacities": 5e-2, "sh": 3e-2, CURVES: 2e-2}
+FACTORS = (2.0, 4.0, 8.0)
+"""Factors on `RATES` among which the best is chosen."""
+WIDEST_PX, NARROWED = 4.0, 0.7
+"""Width of an edge at the start, and the share of the steps after which it is 1 pixel. It decreases geometrically."""
+FIRST_CHOICE = 100
+"""Seed of the first picture that the factors and the number of curves are chosen on."""
 
 
 def polygons(size: int, seed: int) -> torch.Tensor:
@@ -57,69 +66,93 @@ def first_splats(count: int, size: int, picture: torch.Tensor, seed: int) -> Gau
 
 
 def fitted_db(
-    picture: torch.Tensor, count: int, curves: int, steps: int, seed: int, device: str, distance: float
+    picture: torch.Tensor, count: int, curves: int, factor: float, seed: int, chosen: argparse.Namespace
 ) -> tuple[float, float]:
-    """Return the PSNR of the fit, and milliseconds of a step."""
-    size = len(picture)
+    """Return the PSNR of the fit with edges of 1 pixel, and milliseconds of a step."""
+    size, steps = len(picture), chosen.steps
     camera = Camera(np.eye(3), size, size, model="ortho")
-    scene = first_splats(count, size, picture, seed).to(device)
-    kernel = KERNELS["cut" if curves else "gaussian"]()
+    scene = first_splats(count, size, picture, seed).to(chosen.device)
     if curves:
-        scene = with_curves(scene, curves, torch.Generator().manual_seed(seed), distance)
+        scene = with_curves(scene, curves, torch.Generator().manual_seed(seed), chosen.distance)
     scene.requires_grad_()
-    background = picture.mean((0, 1)).to(device).requires_grad_()
-    tensors = scene.tensors()
-    groups = [{"params": [tensor], "rate": RATES[name.removeprefix("extra.")]} for name, tensor in tensors.items()]
+    background = picture.mean((0, 1)).to(chosen.device).requires_grad_()
+    groups = [
+        {"params": [tensor], "rate": factor * RATES[name.removeprefix("extra.")]}
+        for name, tensor in scene.tensors().items()
+    ]
     optimiser = torch.optim.Adam([*groups, {"params": [background], "rate": 1e-2}], eps=1e-12)
-    wanted, best = picture.to(device), 0.0
+    wanted = picture.to(chosen.device)
+
+    def loss_at(width_px: float) -> torch.Tensor:
+        kernel = KERNELS["cut"](width_px) if curves else KERNELS["gaussian"]()
+        return (render_kernel(scene, camera, kernel, background) - wanted).square().mean()
+
     start = time.perf_counter()
     for step in range(steps):
         for group in optimiser.param_groups:
             group["lr"] = group["rate"] * 0.02 ** (step / steps)
-        off = render_kernel(scene, camera, kernel, background) - wanted
-        loss = off.square().mean()
-        best = max(best, float(-10 * torch.log10(loss.detach()))) if step % 25 == 0 or step == steps - 1 else best
+        loss = loss_at(WIDEST_PX ** max(0.0, 1 - step / steps / NARROWED))
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
-    return best, (time.perf_counter() - start) / steps * 1e3
+    step_ms = (time.perf_counter() - start) / steps * 1e3
+    if chosen.save:
+        save(Path(chosen.save) / f"{seed}-{curves}.png", render_kernel(scene, camera, KERNELS["cut" if curves else "gaussian"](), background), picture)  # fmt: skip
+    with torch.no_grad():
+        return float(-10 * torch.log10(loss_at(1.0))), step_ms
+
+
+def save(path: Path, fitted: torch.Tensor, picture: torch.Tensor) -> None:
+    """Write the picture and its fit next to each other, enlarged four times."""
+    both = torch.cat([picture, fitted.detach().cpu().clamp(0, 1)], 1).numpy()
+    enlarged = cv2.resize((both[..., ::-1] * 255).astype(np.uint8), None, fx=4, fy=4, interpolation=cv2.INTER_NEAREST)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), enlarged)
 
 
 def main() -> None:
     parser = log.options("Pictures of polygons fitted by cut Gaussians and by Gaussians at equal bytes.")
-    parser.add_argument("--pictures", type=int, default=3)
-    parser.add_argument("--splats", type=int, default=64, help="number of cut Gaussians with one curve")
-    parser.add_argument("--curves", default="1,2,3")
+    parser.add_argument("--pictures", type=int, default=6)
+    parser.add_argument(
+        "--chosen-on", type=int, default=3, help="number of other pictures that the rates are chosen on"
+    )
+    parser.add_argument("--splats", type=int, default=40, help="number of cut Gaussians with one curve")
+    parser.add_argument("--curves", default="1,2")
     parser.add_argument("--steps", type=int, default=500)
-    parser.add_argument("--size", type=int, default=64)
-    parser.add_argument("--distance", type=float, default=1.0, help="of a curve at the start, in standard deviations")
+    parser.add_argument("--size", type=int, default=96)
+    parser.add_argument("--distance", type=float, default=1.5, help="of a curve at the start, in standard deviations")
+    parser.add_argument("--save", default="", help="folder for the fitted pictures")
     chosen = parser.parse_args()
     if chosen.full:
         chosen.pictures, chosen.splats, chosen.steps, chosen.size = 10, 400, 3000, 256
     numbers = chosen.splats * (NUMBERS + PER_CURVE)
     counts = {curves: numbers // (NUMBERS + PER_CURVE * curves) for curves in (0, *map(int, chosen.curves.split(",")))}
-    pictures = [polygons(chosen.size, seed) for seed in range(chosen.pictures)]
-    db, ms = {}, {}
+    others = range(FIRST_CHOICE, FIRST_CHOICE + chosen.chosen_on)
+    db, ms, searched, best = {}, {}, {}, {}
     for curves, count in counts.items():
+        searched[curves] = {
+            factor: round(statistics.mean(fitted_db(polygons(chosen.size, s), count, curves, factor, s, chosen)[0] for s in others), 2)
+            for factor in FACTORS
+        }  # fmt: skip
+        best[curves] = max(searched[curves], key=searched[curves].__getitem__)
+        print(f"{curves} curves: {searched[curves]} dB by the factor on the rates", flush=True)
         each = [
-            fitted_db(picture, count, curves, chosen.steps, seed, chosen.device, chosen.distance)
-            for seed, picture in enumerate(pictures)
+            fitted_db(polygons(chosen.size, s), count, curves, best[curves], s, chosen) for s in range(chosen.pictures)
         ]
         db[curves] = [round(value, 2) for value, _ in each]
         ms[curves] = round(statistics.median(value for _, value in each), 1)
         print(f"{curves} curves, {count} splats: {db[curves]} dB, {ms[curves]} ms a step", flush=True)
-    gains = {
-        curves: round(statistics.mean(a - b for a, b in zip(db[curves], db[0], strict=True)), 2)
-        for curves in db
-        if curves
-    }
+    gains = {curves: [round(a - b, 2) for a, b in zip(db[curves], db[0], strict=True)] for curves in db if curves}
+    number = max(gains, key=lambda curves: searched[curves][best[curves]])
     log.write(
         "cut_gaussians",
         chosen,
         {
             "size": chosen.size, "steps": chosen.steps, "bytes": 4 * numbers, "splats_by_curves": counts,
-            "db_by_curves": db, "step_ms_by_curves": ms, "mean_gain_db_by_curves": gains,
-            "gain_db": max(gains.values()),
+            "factor_by_curves": best, "searched_db_by_curves_and_factor": searched, "db_by_curves": db,
+            "step_ms_by_curves": ms, "gains_db_by_curves": gains, "curves": number,
+            "gain_db": round(statistics.mean(gains[number]), 2),
+            "median_gain_db": round(statistics.median(gains[number]), 2), "worst_gain_db": min(gains[number]),
         },
     )  # fmt: skip
 

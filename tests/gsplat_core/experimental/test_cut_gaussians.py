@@ -1,22 +1,23 @@
-"""Cut Gaussians: the implicit form of Bézier curves, the gradient of its sign, and rendering."""
+"""Cut Gaussians: the implicit form of Bézier curves, the signed distance from them, and rendering."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 from gsplat_core.choices import KERNELS
-from gsplat_core.errors import InvalidInput
+from gsplat_core.errors import InvalidInput, InvalidSetting
+from gsplat_core.experimental import cut_gaussians
 from gsplat_core.experimental.cut_gaussians import (
     CURVES,
-    SMALLEST_FLIP,
     implicit_form,
     projected_curves,
     render_kernel,
-    side,
+    signed_distance,
     with_curves,
 )
 from gsplat_core.rendering.rasterization import render
@@ -28,9 +29,33 @@ def random_curves(count):
     return torch.randn(count, 4, 2, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
 
 
+def bernstein(t):
+    return torch.stack([(1 - t) ** 3, 3 * t * (1 - t) ** 2, 3 * t**2 * (1 - t), t**3], -1)
+
+
 def points_on(curves, t):
-    bases = torch.stack([(1 - t) ** 3, 3 * t * (1 - t) ** 2, 3 * t**2 * (1 - t), t**3], -1)
-    return torch.einsum("tk,nkc->ntc", bases, curves)
+    return torch.einsum("tk,nkc->ntc", bernstein(t), curves)
+
+
+def reference_distance(points, curves, count=20001):
+    """Distance by exhaustive search over points of the curves and of the tangents beyond their ends, with the sign of the
+    side of the tangent at the nearest point.
+    """
+    t = torch.linspace(0, 1, count, dtype=torch.float64)
+    before, beyond = (100 * t.flip(0) ** 4, 100 * t**4)
+    ends = [3 * (curves[:, 1] - curves[:, 0]), 3 * (curves[:, 3] - curves[:, 2])]
+    parts = [
+        curves[:, None, 0] - before[:, None] * ends[0][:, None],
+        points_on(curves, t),
+        curves[:, None, 3] + beyond[:, None] * ends[1][:, None],
+    ]
+    along = torch.cat(parts, 1)
+    gap = (along - points[:, None]).norm(dim=-1)
+    least, at = gap.min(1)
+    rows = torch.arange(len(points))
+    tangent = along[rows, (at + 1).clamp(max=along.shape[1] - 1)] - along[rows, (at - 1).clamp(min=0)]
+    off = points - along[rows, at]
+    return least * (tangent[:, 0] * off[:, 1] - tangent[:, 1] * off[:, 0]).sign()
 
 
 def splats(count=40, size=40):
@@ -50,35 +75,101 @@ def camera():
 def test_points_of_a_curve_are_zeros_of_its_implicit_form():
     curves = random_curves(20)
     on = points_on(curves, torch.linspace(0, 1, 7, dtype=torch.float64))
-    value, slopes = implicit_form(on, curves[:, None])
-    off = implicit_form(on + 0.3, curves[:, None]).value
+    value = implicit_form(on, curves[:, None])
+    off = implicit_form(on + 0.3, curves[:, None])
+    assert value.shape == (20, 7)
     assert float(value.abs().max()) < 1e-9 * float(off.abs().max())
-    assert slopes.shape == (20, 7, 4, 2)
 
 
-def test_slopes_are_those_of_autograd():
+def test_the_side_of_a_straight_curve_does_not_depend_on_its_spacing_as_the_sign_of_the_implicit_form_does():
+    x = torch.tensor([[-3.0, -1.2, 1, 3], [-3, -1, 1, 3], [-3, -0.8, 1, 3]], dtype=torch.float64)
+    lines = torch.stack([x, torch.zeros_like(x)], -1)
+    point = torch.tensor([0.3, 1.0], dtype=torch.float64)
+    assert implicit_form(point, lines).sign().tolist() == [-1, 0, 1]
+    torch.testing.assert_close(signed_distance(point, lines), torch.ones(3, dtype=torch.float64))
+
+
+def test_distances_are_those_of_an_exhaustive_search(monkeypatch):
+    curves = random_curves(200)
+    points = 2 * torch.randn(200, 2, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    wanted = reference_distance(points, curves)
+    found = signed_distance(points, curves)
+    # A point that is about equally far from two parts of a curve may be assigned to either.
+    assert float((found.abs() - wanted.abs()).abs().max()) < 0.05
+    assert ((found - wanted).abs() < 2e-3).float().mean() > 0.97
+    single = signed_distance(points.float(), curves.float())
+    assert ((single - found).abs() < 1e-3).float().mean() > 0.97
+    monkeypatch.setattr(cut_gaussians, "CHORDS", 16)
+    torch.testing.assert_close(signed_distance(points, curves).abs(), wanted.abs(), atol=1e-3, rtol=0)
+
+
+def test_the_distance_is_0_on_the_curve_and_on_the_tangents_beyond_its_ends(monkeypatch):
+    curves = random_curves(20)
+    on = points_on(curves, torch.linspace(0, 1, 7, dtype=torch.float64))
+    beyond = [curves[:, 3] + 2 * (curves[:, 3] - curves[:, 2]), curves[:, 0] + 2 * (curves[:, 0] - curves[:, 1])]
+    on = torch.cat([on, torch.stack(beyond, 1)], 1)
+    monkeypatch.setattr(cut_gaussians, "REFINEMENTS", 8)
+    assert float(signed_distance(on, curves[:, None]).abs().max()) < 1e-9
+
+
+def test_gradients_of_the_distance_are_those_of_finite_differences(monkeypatch):
+    monkeypatch.setattr(cut_gaussians, "REFINEMENTS", 40)
     curves = random_curves(20).requires_grad_()
-    points = torch.randn(20, 2, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
-    value, slopes = implicit_form(points, curves)
-    (wanted,) = torch.autograd.grad(value.sum(), curves)
-    torch.testing.assert_close(slopes.detach(), wanted)
+    points = torch.randn(20, 2, generator=torch.Generator().manual_seed(4), dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(signed_distance, (points, curves))
+    assert torch.autograd.gradcheck(signed_distance, (points[:3, None], curves[None, :4]))
 
 
-def test_the_gradient_moves_the_curve_over_the_point():
+def test_gradients_with_the_usual_refinements_are_close():
     curves = random_curves(200).requires_grad_()
-    points = points_on(curves.detach(), torch.tensor([0.5], dtype=torch.float64))[:, 0] + 0.02
-    before = side(points, curves)
-    # A loss that is less on the other side.
-    gradient = 2 * before.detach() - 1
-    (slope,) = torch.autograd.grad((before * gradient).sum(), curves)
-    changed = slope.flatten(1)
-    assert ((changed != 0).sum(1) <= 1).all()
-    assert float(changed.abs().max()) <= 1 / SMALLEST_FLIP + 1e-9
-    found = changed.abs().amax(1) > 0
-    assert found.float().mean() > 0.9
-    moved = curves.detach() - 0.1 * slope.sign()
-    flipped = side(points, moved) != before.detach()
-    assert flipped[found].float().mean() > 0.85
+    points = torch.randn(200, 2, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    (found,) = torch.autograd.grad(signed_distance(points, curves).sum(), curves)
+    step = 1e-6
+    moved = (signed_distance(points, curves + step) - signed_distance(points, curves - step)) / (2 * step)
+    error = (found.sum((1, 2)) - moved.detach()).abs()
+    assert float(error.median()) < 1e-6 and (error < 1e-2).float().mean() > 0.97
+
+
+@pytest.mark.parametrize(
+    ("x", "y"),
+    [
+        ([-3.0, -1, 1, 3], [0.0, 0, 0, 0]), ([-3.0, -3, 3, 3], [0.0, 0, 0, 0]), ([0.0, 0, 0, 1], [0.0, 0, 0, 0]),
+        ([-1.0, -1, -1, 5], [0.0, 0, 0, 0]), ([-1.0, 4, -4, 3], [0.0, 0, 0, 0]), ([-1e-3, 0, 0, 1e-3], [0.0, 0, 0, 0]),
+        ([-1e4, -1e3, 1e3, 1e4], [0.0, 0, 0, 0]), ([-3.0, -1, 1, 3], [1e-6, -1e-6, 1e-6, 0]),
+    ],
+)  # fmt: skip
+def test_straight_curves_of_any_spacing_give_the_distance_from_their_line(x, y):
+    curve = torch.tensor([x, y]).T.requires_grad_()
+    points = torch.tensor([[0.1, 0.5], [0.1, -0.5], [40.0, 7], [-40.0, -7], [0.0, 0]], requires_grad=True)
+    found = signed_distance(points, curve)
+    torch.testing.assert_close(found, points[:, 1].detach(), atol=2e-3, rtol=1e-3)
+    found.sum().backward()
+    torch.testing.assert_close(points.grad, torch.tensor([0.0, 1.0]).expand(5, 2), atol=1e-2, rtol=0)
+    assert curve.grad.isfinite().all()
+    # A shift of all control points by the normal moves the line by as much.
+    assert float(curve.grad[:, 1].sum()) == pytest.approx(-5, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    "curve",
+    [
+        torch.zeros(4, 2), torch.tensor([[0.0, 0], [2, 2], [0, 2], [2, 0]]), torch.tensor([[0.0, 0], [3, 1], [-3, 1], [0, 0]]),
+        torch.tensor([[0.0, 0], [0, 0], [1, 1], [1, 1]]), torch.tensor([[0.0, 0], [1, 0], [0, 0], [1, 0]]),
+        1e6 + torch.tensor([[0.0, 0], [1, 0], [2, 1], [3, 1]]),
+    ],
+    ids=["point", "cusp", "loop", "double ends", "back and forth", "far away"],
+)  # fmt: skip
+def test_degenerate_curves_have_finite_distances_and_gradients(curve):
+    curve = curve.clone().requires_grad_()
+    side = torch.linspace(-4, 4, 41)
+    points = torch.stack(torch.meshgrid(side, side, indexing="ij"), -1).requires_grad_()
+    found = signed_distance(points, curve)
+    found.sum().backward()
+    assert found.isfinite().all() and curve.grad.isfinite().all() and points.grad.isfinite().all()
+    nearest = (
+        points_on(curve[None].double(), torch.linspace(0, 1, 2001).double()) - points.detach()[..., None, :]
+    ).norm(dim=-1)
+    assert (found.abs() <= nearest.amin(-1) + 0.1).all()
 
 
 def test_the_gaussian_kernel_gives_the_picture_of_alpha_blending(camera, device):
@@ -108,19 +199,86 @@ def test_one_straight_edge_shows_where_it_is_projected():
         torch.tensor([[0.0, 0, 20]]), torch.tensor([[1.0, 0, 0, 0]]), torch.tensor([[6.0, 6, 0.1]]).log(),
         torch.tensor([6.0]), torch.full((1, 1, 3), 1.0),
     )  # fmt: skip
-    # The cubic y = x^3 / 30 in standard deviations, nearly the horizontal axis.
-    x = torch.tensor([-3.0, -1, 1, 3])
-    curve = torch.stack([x, torch.tensor([-0.9, 0.9, -0.9, 0.9])], 1)[None, None]
+    curve = torch.tensor([[-3.0, 0], [-1, 0], [1, 0], [3, 0]])[None, None]
+    whole = render_kernel(scene, camera, KERNELS["gaussian"]())[..., 0]
     shown = []
     for points in (curve, curve.flip(2)):
-        cut = Gaussians(**{**scene.tensors(), "extra": {CURVES: points}})
-        assert projected_curves(cut, camera, torch.tensor([[16.0, 16]])).abs().max() == pytest.approx(36, rel=1e-4)
+        cut = replace(scene, extra={CURVES: points})
+        assert (projected_curves(cut, camera) - 16).abs().max() == pytest.approx(36, rel=1e-4)
         shown.append(render_kernel(cut, camera, KERNELS["cut"]())[..., 0])
-    whole = render_kernel(scene, camera, KERNELS["gaussian"]())[..., 0]
-    torch.testing.assert_close(shown[0] + shown[1], whole)
-    halves = [float(part[:12].sum() / whole[:12].sum()) for part in shown]
-    assert sorted(round(share) for share in halves) == [0, 1]
-    assert math.isclose(sum(halves), 1, rel_tol=1e-4)
+    torch.testing.assert_close(shown[0] + shown[1], whole, rtol=2e-2, atol=0)
+    # Rows are whole pixels from the edge less a half; the share there is that of the logistic function.
+    for row, distance in ((15, -0.5), (16, 0.5), (17, 1.5), (19, 3.5)):
+        assert float(shown[0][row, 16] / whole[row, 16]) == pytest.approx(1 / (1 + math.exp(-4 * distance)), abs=2e-3)
+    wide = render_kernel(replace(scene, extra={CURVES: curve}), camera, KERNELS["cut"](width_px=4.0))[..., 0]
+    assert float(wide[17, 16] / whole[17, 16]) == pytest.approx(1 / (1 + math.exp(-1.5)), abs=2e-3)
+
+
+@pytest.mark.parametrize("model", ["pinhole", "ortho"])
+def test_a_splat_shows_the_same_part_from_in_front_and_behind(model):
+    g = torch.Generator().manual_seed(6)
+    scene = with_curves(
+        Gaussians(
+            torch.tensor([[0.0, 0, 0]]), torch.tensor([[1.0, 0, 0, 0]]), torch.tensor([[6.0, 4, 0.1]]).log(),
+            torch.tensor([6.0]), torch.full((1, 1, 3), 1.0),
+        ),
+        2, g, 0.3,
+    )  # fmt: skip
+    front, back = np.eye(4), np.diag([-1.0, 1, -1, 1])
+    front[2, 3] = back[2, 3] = 40
+    K = np.array(
+        [[40.0 if model == "pinhole" else 1.0, 0, 16], [0, 40.0 if model == "pinhole" else 1.0, 16], [0, 0, 1]]
+    )
+    shown = [
+        render_kernel(scene, Camera(K, 32, 32, world_to_camera=view, model=model), KERNELS["cut"]())
+        for view in (front, back)
+    ]
+    assert float(shown[0].max()) > 0.5
+    torch.testing.assert_close(shown[0].flip(1), shown[1], rtol=1e-3, atol=1e-4)
+
+
+def test_the_gradient_of_the_picture_is_that_of_finite_differences(camera):
+    scene = with_curves(splats(count=3), 2, torch.Generator().manual_seed(5), distance=0.5)
+    scene.requires_grad_()
+    kernel = KERNELS["cut"](width_px=2.0)
+    weights = torch.rand(40, 40, 3, generator=torch.Generator().manual_seed(1))
+
+    def total():
+        return (render_kernel(scene, camera, kernel) * weights).sum()
+
+    total().backward()
+    for tensor, step in ((scene.extra[CURVES], 3e-3), (scene.means, 1e-2), (scene.log_scales, 3e-3)):
+        direction = tensor.grad / tensor.grad.norm()
+        with torch.no_grad():
+            tensor += step * direction
+            ahead = float(total())
+            tensor -= 2 * step * direction
+            slope = (ahead - float(total())) / (2 * step)
+            tensor += step * direction
+        assert slope == pytest.approx(float(tensor.grad.norm()), rel=0.05)
+
+
+def test_a_curve_moves_to_the_edge_of_a_picture():
+    camera = Camera(np.eye(3), 32, 32, model="ortho")
+    wanted = torch.zeros(32, 32, 3)
+    wanted[:, :11] = 1
+    wanted[:, 11] = 0.5
+    scene = Gaussians(
+        torch.tensor([[16.0, 16, 5]]), torch.tensor([[1.0, 0, 0, 0]]), torch.tensor([[60.0, 60, 1]]).log(),
+        torch.tensor([8.0]), torch.full((1, 1, 3), 0.5 / 0.28209479),
+    )  # fmt: skip
+    curve = torch.tensor([[[[0.1, -0.3], [0.05, -0.1], [0.02, 0.1], [0.0, 0.3]]]], requires_grad=True)
+    optimiser = torch.optim.Adam([curve], lr=5e-3)
+    for step in range(150):
+        kernel = KERNELS["cut"](width_px=max(1.0, 8 - 0.1 * step))
+        loss = (render_kernel(replace(scene, extra={CURVES: curve}), camera, kernel) - wanted).square().mean()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+    # The edge at x = 11.5 pixels.
+    at = projected_curves(replace(scene, extra={CURVES: curve}), camera).detach()[0, 0]
+    assert signed_distance(torch.tensor([[11.5, 4], [11.5, 16], [11.5, 28]]), at).abs().max() < 0.5
+    assert float(loss.detach()) < 2e-3
 
 
 def test_wrong_arguments_are_refused(camera):
@@ -128,3 +286,5 @@ def test_wrong_arguments_are_refused(camera):
         render_kernel(splats(), camera, KERNELS["cut"]())
     with pytest.raises(InvalidInput, match="fisheye"):
         render_kernel(splats(), Camera(np.eye(3), 40, 40, model="fisheye"), KERNELS["gaussian"]())
+    with pytest.raises(InvalidSetting, match="width_px is 0"):
+        KERNELS["cut"](width_px=0)

@@ -1,4 +1,4 @@
-"""Lists of tiles, pixels of tiles, limits of alpha, and the gradient of the side of a curve."""
+"""Lists of tiles, pixels of tiles, and limits of alpha."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gsplat_core.experimental import cut_gaussians
-from gsplat_core.experimental.cut_gaussians import FARTHEST_FLIP, SMALLEST_FLIP, GaussianKernel, render_kernel, side
+from gsplat_core.experimental.cut_gaussians import GaussianKernel, render_kernel
 from gsplat_core.ops.tiles import TileGrid
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
@@ -62,27 +62,3 @@ def test_alpha_below_a_level_is_not_shown(opacity, is_shown):
 
 def test_colours_below_0_are_black():
     assert not render_kernel(splats([0.9], colour=-0.5), CAMERA, GaussianKernel()).any()
-
-
-@pytest.mark.parametrize(
-    ("value", "slope", "expected"),
-    [
-        (0.2, 1.0, 5.0), (-0.2, 1.0, 5.0), (0.2, -1.0, -5.0), (-0.2, -1.0, -5.0), (0.6, 2.0, 1 / 0.3),
-        (0.01, 1.0, 1 / SMALLEST_FLIP), (FARTHEST_FLIP, 1.0, 1 / FARTHEST_FLIP), (1.01 * FARTHEST_FLIP, 1.0, 0.0),
-        (0.2, 0.0, 0.0), (0.0, 0.0, 0.0),
-    ],
-)  # fmt: skip
-def test_the_gradient_of_a_side_is_one_over_the_smallest_shift_that_flips_it(monkeypatch, value, slope, expected):
-    """The value of the implicit form grows with one coordinate by `slope`, and by less with the others."""
-    slopes = torch.full((4, 2), 0.3 * slope)
-    slopes[2, 1] = slope
-    monkeypatch.setattr(
-        cut_gaussians, "implicit_form", lambda points, curves: cut_gaussians.Implicit(torch.tensor(value), slopes)
-    )
-    curves = torch.zeros(4, 2, requires_grad=True)
-    found = side(torch.zeros(2), curves)
-    assert float(found.detach()) == (value > 0)
-    (gradient,) = torch.autograd.grad(found, curves)
-    wanted = torch.zeros(4, 2)
-    wanted[2, 1] = expected
-    torch.testing.assert_close(gradient, wanted)
