@@ -196,6 +196,12 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "float eps2d, float near_plane, float far_plane, int camera_model, int capacity, int mode) -> (Tensor image, "
       "Tensor alphas, Tensor last, Tensor records, Tensor tile_offsets, Tensor sorted, Tensor splat_starts, "
       "Tensor instance_splats, Tensor status)");
+  // Render one frame of weighted sums, CUDA only: image [H, W, 4] with depth. gaussians as in render_frame. scalars:
+  // sigma, the unit of depths, and the weight of the background, each one number on the device.
+  m.def(
+      "render_weighted_frame(Tensor[] gaussians, Tensor opacity_harmonics, Tensor factors, Tensor[] scalars, Tensor viewmat, "
+      "Tensor K, Tensor? background, int width, int height, float eps2d, float near_plane, float far_plane, int camera_model, "
+      "float least_total, float least_share, int capacity) -> (Tensor image, Tensor alphas, Tensor status)");
   // Gradient of render_frame: of the raw parameters in the layout of raw_layout.h, and of sh if it has more than one
   // basis. forward: the results of render_frame in training mode, without the image.
   m.def(

@@ -33,7 +33,13 @@ from gsplat_core.reference.projection import (
     quat_scale_to_covar_preci,
     spherical_harmonics,
 )
-from gsplat_core.reference.rendering import point_moments, rasterization, render_frame, sample_moments
+from gsplat_core.reference.rendering import (
+    point_moments,
+    rasterization,
+    render_frame,
+    render_weighted_frame,
+    sample_moments,
+)
 from gsplat_core.reference.splat_regression import splat_regression, splat_regression_gradients
 from gsplat_core.reference.stereo import fit_disparities, match_disparities, smooth_within_edges
 from gsplat_core.reference.surfels import fully_fused_projection_2dgs, rasterize_to_pixels_2dgs
@@ -80,6 +86,7 @@ __all__ = [
     "ray_depth_loss",
     "ray_normal_loss",
     "render_frame",
+    "render_weighted_frame",
     "sample_moments",
     "smooth_within_edges",
     "spherical_harmonics",

@@ -1,7 +1,7 @@
 """Whole renderers built from the reference operations: any floating-point dtype and device, slow.
 
-`rasterization`; one frame from raw Gaussians and deltas, the test reference of the CUDA op `render_frame`; and
-expectation and variance of the sort-free renderers. Functions with an underscore are the reference under the names and
+`rasterization`; one frame from raw Gaussians and deltas, the test reference of the CUDA op `render_frame`; one frame of
+weighted sums, the test reference of `render_weighted_frame`; and expectation and variance of the sort-free renderers. Functions with an underscore are the reference under the names and
 with the arguments of `gsplat.cuda._torch_impl`, which gsplat's own tests call.
 
 Stochastic transparency is alpha blending without early stop. In Gaussian point splatting (Rijsdijk et al., TOG 2026),
@@ -31,7 +31,7 @@ from gsplat_core.ops.arguments import (
     require_shape,
 )
 from gsplat_core.ops.plain_torch import proj, world_to_cam
-from gsplat_core.reference.compositing import ALPHA_MAX, blend_rays, rasterize_to_pixels, splat_rays
+from gsplat_core.reference.compositing import ALPHA_MAX, blend_rays, rasterize_to_pixels, splat_rays, weighted_sums
 from gsplat_core.reference.projection import (
     fully_fused_projection,
     isect_offset_encode,
@@ -176,6 +176,48 @@ def render_frame(
         camera_model=view.camera_model,
     )  # fmt: skip
     return image[0], alphas[0, ..., 0]
+
+
+def render_weighted_frame(
+    gaussians: Sequence[Tensor],
+    opacity_harmonics: Tensor,
+    factors: Tensor,
+    scalars: tuple[Tensor, Tensor, Tensor],
+    view: View,
+    *,
+    least_total: float,
+    least_share: float,
+) -> tuple[Tensor, Tensor]:
+    """Render N Gaussians by weighted sums (Hou et al. 2024); the arguments are those of `ops.frame.render_weighted_frame`.
+
+    Evaluates every Gaussian at every pixel, without rounding to fixed point. Gaussians with a non-finite value are culled.
+
+    Returns:
+        Image [H, W, 4] (red, green, blue, mean z) and alphas [H, W].
+    """
+    sigma, distance, behind = scalars
+    usable = torch.cat([t.flatten(1) if t.dim() > 1 else t[:, None] for t in (*gaussians, opacity_harmonics)], 1)
+    rows = (usable.isfinite().all(1) & factors.isfinite()).nonzero()[:, 0]
+    means, quats, log_scales, _, sh = (t[rows] for t in gaussians)
+    directions = means + view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
+    harmonics = opacity_harmonics[rows][..., None].expand(-1, -1, 3)
+    opacities = spherical_harmonics(math.isqrt(harmonics.shape[1]) - 1, directions, harmonics)[:, 0]
+    projected = fully_fused_projection(
+        means, None, quats, log_scales.exp(), view.viewmat[None], view.K[None], view.width, view.height,
+        eps2d=view.eps2d, near_plane=view.near_plane, far_plane=view.far_plane, camera_model=view.camera_model,
+        opacities=opacities.abs().clamp(max=1),
+    )  # fmt: skip
+    radii, means2d, depths, conics = (t[0] for t in projected[:4])
+    seen = (radii > 0).any(-1).nonzero()[:, 0]
+    colors = (spherical_harmonics(math.isqrt(sh.shape[1]) - 1, directions, sh) + 0.5).clamp(min=0)
+    channels = torch.cat([colors, (depths / distance)[:, None]], 1)
+    weights = (1 - depths / sigma).clamp(min=0) * factors[rows]
+    splats = (t[seen] for t in (means2d, conics, channels, opacities, weights))
+    sums = weighted_sums(*splats, view.width, view.height)
+    total = (sums[-1] + behind).clamp(min=least_total)
+    color = sums[:3] if view.background is None else sums[:3] + (behind * view.background)[:, None, None]
+    z = torch.where(sums[-1] > least_share, sums[3] / sums[-1] * distance, 0)
+    return torch.cat([color / total, z[None]]).permute(1, 2, 0), 1 - (behind / total).clamp(max=1)
 
 
 class SampleMoments(NamedTuple):

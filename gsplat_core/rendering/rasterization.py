@@ -20,7 +20,7 @@ from torch.autograd import forward_ad
 
 from gsplat_core.ops.arguments import require_shape
 from gsplat_core.ops.compositing import rasterize_to_pixels
-from gsplat_core.ops.frame import STATUS_NEEDED, STATUS_OVERFLOW, View, render_frame
+from gsplat_core.ops.frame import STATUS_NEEDED, STATUS_OVERFLOW, Frame, View, WeightedFrame, render_frame
 from gsplat_core.ops.native import CUDA_MISSING
 from gsplat_core.ops.packed_projection import values_of_rows, visible_harmonics
 from gsplat_core.ops.projection import fully_fused_projection
@@ -50,6 +50,7 @@ __all__ = ["RenderOutput", "rasterization", "render"]
 
 P = ParamSpec("P")
 R = TypeVar("R")
+F = TypeVar("F", Frame, WeightedFrame)
 _AUTOCAST_DEVICES = ("cpu", "cuda")
 
 
@@ -353,12 +354,28 @@ def render(gaussians: Gaussians, camera: Camera, background: Tensor | None = Non
 def _render_frame(
     gaussians: Gaussians, camera: Camera, viewmat: Tensor, intrinsics: Tensor, background: Tensor | None, depth: bool
 ) -> RenderOutput:
-    capacity = INSTANCES_PER_GAUSSIAN * max(gaussians.count, SMALLEST_SCENE)
     view = View(viewmat, intrinsics, camera.width_px, camera.height_px, background, camera.model)
+    frame = with_capacity(gaussians.count, lambda capacity: render_frame(gaussians.left_tensors, None, view, capacity))
+    return output_of(frame, depth)
+
+
+def with_capacity(count: int, draw: Callable[[int], F]) -> F:
+    """Return `draw(capacity)` with a capacity of the tile lists that suffices for the frame. Waits for the device.
+
+    Args:
+        count: number of Gaussians.
+        draw: renders a frame with a given capacity, which may be too small.
+    """
+    capacity = INSTANCES_PER_GAUSSIAN * max(count, SMALLEST_SCENE)
     while True:
-        frame = render_frame(gaussians.left_tensors, None, view, capacity)
+        frame = draw(capacity)
         status = HostCopy(frame.status).numpy()
         if not status[STATUS_OVERFLOW]:
-            z = frame.image[..., 3] if depth else torch.zeros_like(frame.alphas)
-            return RenderOutput(frame.image[..., :3], frame.alphas, z)
+            return frame
         capacity = int(status[STATUS_NEEDED])
+
+
+def output_of(frame: Frame | WeightedFrame, depth: bool) -> RenderOutput:
+    """Return the outputs of a frame; without `depth` all depths are 0."""
+    z = frame.image[..., 3] if depth else torch.zeros_like(frame.alphas)
+    return RenderOutput(frame.image[..., :3], frame.alphas, z)

@@ -18,11 +18,12 @@ from torch import Tensor
 from gsplat_core.errors import InvalidInput
 from gsplat_core.models import Model, Snapshot
 from gsplat_core.ops.arguments import DenseProjection, TileGrid
+from gsplat_core.ops.frame import OPACITY_BASES, View, render_weighted_frame
 from gsplat_core.ops.projection import fully_fused_projection
 from gsplat_core.ops.spherical_harmonics import spherical_harmonics
 from gsplat_core.ops.tiles import bin_splats
 from gsplat_core.ops.weighted_sum import weighted_sums
-from gsplat_core.rendering.rasterization import RenderOutput
+from gsplat_core.rendering.rasterization import RenderOutput, output_of, with_capacity
 from gsplat_core.rendering.renderer import (
     STANDARD_OUTPUTS,
     Capabilities,
@@ -40,7 +41,6 @@ from gsplat_core.scene.gaussians import SH_C0, Gaussians
 OPACITY, FACTOR = "opacity_sh", "distance_factor"
 """Names of the renderer's tensors in `Gaussians.extra`: harmonics of the opacity [N, 16], and v_i [N]."""
 OPACITY_DEGREE = 3
-OPACITY_BASES = (OPACITY_DEGREE + 1) ** 2
 ROWS_AT_ONCE = 1 << 22
 """Number of Gaussians whose opacities are evaluated at once."""
 LEAST_TOTAL = 1e-2
@@ -54,7 +54,7 @@ class WeightedSumRenderer:
     scene, v_i and the harmonics of the opacity for each Gaussian.
 
     The picture is independent of the order of the Gaussians, so nothing pops when the camera turns. The Gaussians'
-    `logit_opacities` are not used.
+    `logit_opacities` are not used. On CUDA without gradients one op renders the whole frame.
     """
 
     name: ClassVar[str] = "weighted_sum"
@@ -68,6 +68,9 @@ class WeightedSumRenderer:
     """Learning rates, by name, of the tensors in `Gaussians.extra` and of the logarithms of the scene-wide scalars; values
     without an entry are not trained.
     """
+
+    has_whole_frame: ClassVar[bool] = True
+    """Whether `render_weighted_frame` computes the weights of this class."""
 
     def __init__(
         self, camera: Camera, device: torch.device, *, precision: Precision = "fp32", background: Tensor | None = None
@@ -139,14 +142,22 @@ class WeightedSumRenderer:
         depth: bool = True,
     ) -> RenderOutput:
         """Render a differentiable picture; see `TrainableRenderer.picture`."""
-        viewmat, intrinsics = (matrix[None] for matrix in camera.matrices(gaussians.device, gaussians.dtype))
+        viewmat, intrinsics = camera.matrices(gaussians.device, gaussians.dtype)
+        if cls.has_whole_frame and _is_whole_frame(gaussians, background, values):
+            view = View(viewmat, intrinsics, camera.width_px, camera.height_px, background, camera.model)
+            scalars = values["sigma"], values["distance"], values["background"]
+            draw = lambda capacity: render_weighted_frame(
+                gaussians.left_tensors, gaussians.extra[OPACITY], gaussians.extra[FACTOR], scalars, view, capacity,
+                least_total=LEAST_TOTAL, least_share=LEAST_SHARE,
+            )  # fmt: skip
+            return output_of(with_capacity(gaussians.count, draw), depth)
         position = torch.as_tensor(camera.position, dtype=gaussians.dtype).to(gaussians.device, non_blocking=True)
         directions = gaussians.means - position
         opacities = _opacities(gaussians.extra[OPACITY], directions)
         reach = opacities.detach().abs().clamp(max=1)
         size = camera.width_px, camera.height_px
         rows = fully_fused_projection(
-            gaussians.means, None, gaussians.quats, gaussians.scales, viewmat, intrinsics, *size,
+            gaussians.means, None, gaussians.quats, gaussians.scales, viewmat[None], intrinsics[None], *size,
             eps2d=EPS2D, camera_model=camera.model, opacities=reach,
         )  # fmt: skip
         assert isinstance(rows, DenseProjection)
@@ -171,6 +182,14 @@ class WeightedSumRenderer:
         return RenderOutput((image / total).permute(1, 2, 0).contiguous(), alpha, z)
 
 
+def _is_whole_frame(gaussians: Gaussians, background: Tensor | None, values: Mapping[str, Tensor]) -> bool:
+    """Return True for a picture on CUDA without gradients, which one op renders."""
+    if gaussians.device.type != "cuda" or gaussians.dtype != torch.float32:
+        return False
+    tensors = (*gaussians.left_tensors, *gaussians.extra.values(), *values.values(), background)
+    return not (torch.is_grad_enabled() and any(t.requires_grad for t in tensors if t is not None))
+
+
 def _opacities(harmonics: Tensor, directions: Tensor) -> Tensor:
     """Return the opacities [N] in directions [N, 3]."""
     # The op evaluates three channels, of which two are unused. The parts limit the memory of the copies.
@@ -185,6 +204,7 @@ class DirectWeightedSumRenderer(WeightedSumRenderer):
     """Weighted-sum renderer in which every weight ω is 1."""
 
     name: ClassVar[str] = "weighted_sum_direct"
+    has_whole_frame: ClassVar[bool] = False
     rates: ClassVar[Mapping[str, float]] = {OPACITY: 1e-2, "background": 1e-2}
 
     @classmethod
@@ -204,6 +224,7 @@ class ExpWeightedSumRenderer(WeightedSumRenderer):
     """
 
     name: ClassVar[str] = "weighted_sum_exp"
+    has_whole_frame: ClassVar[bool] = False
     rates: ClassVar[Mapping[str, float]] = {OPACITY: 1e-2, "sigma": 5e-3, "beta": 5e-3, "background": 1e-2}
 
     @classmethod

@@ -1,7 +1,9 @@
-"""Op `render_frame`: a whole frame on CUDA, from raw Gaussians to the image, in a few launches without host synchronisation.
+"""Ops `render_frame` and `render_weighted_frame`: a whole frame on CUDA, from raw Gaussians to the image, in a few launches
+without host synchronisation.
 
 The steps are deform, activate, project, sort and blend. Splatting follows Kerbl et al. 2023 and Zwicker et al. 2001,
-with the same picture as `gsplat_core.rasterization`. An instance is a pair of a splat and a tile that it touches.
+with the same picture as `gsplat_core.rasterization`. A frame of weighted sums (Hou et al. 2024) needs neither sorting nor
+blending in order. An instance is a pair of a splat and a tile that it touches.
 """
 
 from __future__ import annotations
@@ -28,10 +30,14 @@ __all__ = [
     "Frame",
     "FrameMode",
     "View",
+    "WeightedFrame",
     "accumulate_status_",
     "render_frame",
+    "render_weighted_frame",
 ]
 
+OPACITY_BASES = 16
+"""Harmonics of a Gaussian's opacity in a frame of weighted sums: degree 3."""
 MAX_SEGMENT = 1024
 """Largest capacity of the buffer segment of one tile in `FrameMode.SEGMENTS`, in instances (pairs of splat and tile)."""
 STATUS_NEEDED, STATUS_LONGEST, STATUS_OVERFLOW = range(3)
@@ -142,6 +148,74 @@ def render_frame(
     )  # fmt: skip
 
 
+class WeightedFrame(NamedTuple):
+    """Rendered frame of weighted sums."""
+
+    image: Tensor
+    """[H, W, 4]: red, green, blue, and the mean of z by weight; 0 where the weights are too small."""
+    alphas: Tensor
+    """Share of the splats' weights in all weights [H, W]."""
+    status: Tensor
+    """Frame status as `Frame.status`."""
+
+
+def render_weighted_frame(
+    gaussians: Sequence[Tensor],
+    opacity_harmonics: Tensor,
+    factors: Tensor,
+    scalars: tuple[Tensor, Tensor, Tensor],
+    view: View,
+    capacity: int,
+    *,
+    least_total: float,
+    least_share: float,
+) -> WeightedFrame:
+    """Render N Gaussians by weighted sums (Hou et al. 2024) with the weights ω = v max(0, 1 - z/σ), without gradients.
+
+    The picture is that of `gsplat_core.rendering.weighted_sum.WeightedSumRenderer`: at a pixel the sum of a ω c over the sum
+    of a ω, each with the background's. A splat's `a` is its opacity, a sum of harmonics of the view direction, times its
+    Gaussian. It contributes where both are at least 1/255.
+
+    Terms and channels are rounded to multiples of 2⁻²⁰ and 2⁻¹⁸, and their products are added as integers: Gaussians in
+    another order give the same bytes. A splat's largest term is limited to ±128, its channels to 2048, and a pixel's sums
+    must be below 2²⁵. Gaussians with a non-finite value are culled. The host does not synchronise.
+
+    Args:
+        gaussians: as in `render_frame`; logit_opacities are not used, but must be finite.
+        opacity_harmonics: float32 [N, 16], harmonics of degree 3.
+        factors: float32 [N], v.
+        scalars: σ, the unit in which depths are added, and the weight of the background, each one number on the device.
+        view: camera with its tensors on the device.
+        capacity: as in `render_frame` with `FrameMode.SHARED`.
+        least_total: lower limit of the sum of all weights at a pixel.
+        least_share: sum of the splats' weights up to which a pixel has no depth (0).
+
+    Raises:
+        InvalidInput: for other devices, dtypes or shapes.
+    """
+    if capacity < 1:
+        raise InvalidInput(f"capacity must be at least 1 instance, got {capacity}")
+    sigma, distance, behind = scalars
+    check_inputs(
+        "render_weighted_frame", gaussians, None, view,
+        opacity_harmonics=opacity_harmonics, factors=factors, sigma=sigma, distance=distance, behind=behind,
+    )  # fmt: skip
+    count = gaussians[0].shape[0]
+    require_shape("opacity_harmonics", opacity_harmonics, (count, OPACITY_BASES), "[N, 16]")
+    require_shape("factors", factors, (count,), "[N]")
+    for name, scalar in (("sigma", sigma), ("distance", distance), ("behind", behind)):
+        if scalar.numel() != 1:
+            raise InvalidInput(f"{name} must be one number, got {list(scalar.shape)}")
+    if native.CUDA_MISSING is not None:
+        raise InvalidInput(f"render_weighted_frame needs the CUDA kernels, which are {native.CUDA_MISSING}")
+    return WeightedFrame(
+        *torch.ops.gsplat_core.render_weighted_frame(
+            list(gaussians), opacity_harmonics, factors, list(scalars), *view.tensors, view.width, view.height,
+            view.eps2d, view.near_plane, view.far_plane, view.model_index, least_total, least_share, capacity,
+        )
+    )  # fmt: skip
+
+
 def accumulate_status_(status: Tensor, totals: Tensor, step: Tensor) -> Tensor:
     """Merge a frame's status into the totals of a series of frames, on the device.
 
@@ -186,6 +260,18 @@ def _render_frame_fake(gaussians: list[Tensor], *rest: Tensor | float | None) ->
         ints(n + 1 if training else 0),
         ints(capacity if training else 0),
         ints(4),
+    )
+
+
+@torch.library.register_fake("gsplat_core::render_weighted_frame")
+def _render_weighted_frame_fake(gaussians: list[Tensor], *rest: Tensor | float | None) -> tuple[Tensor, ...]:
+    width, height = rest[6:8]
+    means = gaussians[0]
+    assert isinstance(width, int) and isinstance(height, int)
+    return (
+        means.new_empty((height, width, 4)),
+        means.new_empty((height, width)),
+        means.new_empty(4, dtype=torch.int32),
     )
 
 

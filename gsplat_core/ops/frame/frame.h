@@ -51,6 +51,22 @@ struct Scene {
   constexpr int64_t tiles() const { return int64_t(tile_width) * tile_height; }
 };
 
+// Values of a frame of weighted sums in addition to those of a `Scene`, see render_weighted_frame. The scalars are read on
+// the device.
+struct Weighting {
+  const float* opacity_harmonics;  // [N, kOpacityBases]
+  const float* factors;            // [N]: v_i
+  const float *sigma, *distance;   // weight of a splat: v_i max(0, 1 - z / sigma); depths are added in units of `distance`
+  const float* behind;             // weight of the background
+  float least_total, least_share;  // lower limit of a pixel's weights; smallest sum of the splats' weights with a depth
+  bool aligned;                    // opacity_harmonics is aligned to 16 bytes
+};
+constexpr int kOpacityDegree = 3, kOpacityBases = 16;
+// Fixed point of weighted sums: a splat's term at a pixel times its channel. A splat's largest term is limited to
+// kMostTerm, its channels to kMostChannel. A pixel's sums may reach 2^(63 - kTermBits - kChannelBits).
+constexpr int kTermBits = 20, kChannelBits = 18;
+constexpr float kMostTerm = 128.0f, kMostChannel = 2048.0f;
+
 // Results of the forward pass other than the image. After an overflow a list may contain -1: no instance.
 struct Lists {
   void* records;                    // Record<4> [N] with colours red, green, blue, z; rows of culled Gaussians are not written
@@ -91,6 +107,12 @@ void preprocess(const Scene& in, const Lists& lists, const Scratch& scratch, cud
 void scan(const Scene& in, const Lists& lists, const Scratch& scratch, cudaStream_t stream);
 void fill(const Scene& in, const Lists& lists, const Scratch& scratch, cudaStream_t stream);
 void blend(const Scene& in, const Lists& lists, const Scratch& scratch, const Pixels& out, cudaStream_t stream);
+
+// The first and last step of a frame of weighted sums, with shared lists (kShared) whose order does not matter. The colours
+// of the records are in fixed point, the fifth is the splat's factor of exp2(power) in units of 2^-kTermBits.
+void preprocess_weighted(const Scene& in, const Weighting& weighting, const Lists& lists, const Scratch& scratch,
+                         cudaStream_t stream);
+void sum_weighted(const Scene& in, const Weighting& weighting, const Lists& lists, const Pixels& out, cudaStream_t stream);
 
 // Accumulate a frame's status in `totals` [kStatusSize]: the maximum of every entry, except that overflowed frames are
 // counted. If the frame did not overflow, increment `step` and set `fits` to 1, otherwise set `fits` to 0.

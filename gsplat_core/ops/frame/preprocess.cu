@@ -15,9 +15,25 @@ union WarpShared {
   uint32_t touched[kMaxSmallTiles];
 };
 
-template <int degree, class Coefficient>
+__device__ inline float in_fixed_point(float channel) {
+  return __int_as_float(__float2int_rn(fminf(channel, kMostChannel) * float(1 << kChannelBits)));
+}
+
+// Return the opacity of a Gaussian in a direction: a sum of harmonics of either sign, which may exceed 1.
+__device__ inline float opacity_in(const Weighting& weighting, int64_t n, const float (&bases)[kOpacityBases]) {
+  const float* const row = weighting.opacity_harmonics + kOpacityBases * n;
+  float sum = 0;
+  for (int k = 0; k < kOpacityBases; k += 4) {
+    const float4 of = load_four(row + k, weighting.aligned);
+    sum = fmaf(bases[k], of.x, fmaf(bases[k + 1], of.y, fmaf(bases[k + 2], of.z, fmaf(bases[k + 3], of.w, sum))));
+  }
+  return sum;
+}
+
+// One frame's Gaussians, of alpha blending or (`weighted`) of weighted sums.
+template <int degree, class Coefficient, bool weighted>
 __global__ void __launch_bounds__(kGaussianThreads, degree < 4 ? 8 : 5)
-    preprocess_gaussians(Scene in, Lists lists, Scratch scratch) {
+    preprocess_gaussians(Scene in, Weighting weighting, Lists lists, Scratch scratch) {
   allow_dependent_launch();
   __shared__ Camera camera;
   __shared__ WarpShared<degree, Coefficient> warps[kGaussianThreads / 32];
@@ -33,9 +49,18 @@ __global__ void __launch_bounds__(kGaussianThreads, degree < 4 ? 8 : 5)
   load_camera(in, camera);
   Projected p;
   p.valid = 0;
-  float opacity = 0;
+  float opacity = 0, factor = 1;  // factor: of a weighted sum, for what the opacity exceeds 1, with its sign
   if (g.usable) {
-    opacity = opacity_of(g);
+    if constexpr (weighted) {
+      float direction[3], bases[kOpacityBases];
+      unit_direction(camera.center, g.mean, direction);
+      bases_at<kOpacityDegree>(direction[0], direction[1], direction[2], bases);
+      factor = opacity_in(weighting, n, bases);
+      opacity = fminf(fabsf(factor), 1.0f);
+      factor = copysignf(fmaxf(fabsf(factor), 1.0f), factor);
+    } else {
+      opacity = opacity_of(g);
+    }
     p = project(projection_input(in, camera), g.mean, geometry_of(g), &opacity, false);
   }
   const unsigned visible = __ballot_sync(kAll, p.valid);
@@ -63,9 +88,16 @@ __global__ void __launch_bounds__(kGaussianThreads, degree < 4 ? 8 : 5)
     } else {
       for (int j = 0; j < 3; ++j) color[j] = fmaf(kConstantBase, to_float(sh[3 * n + j]), color[j]);
     }
-    if (0 * color[0] + 0 * color[1] + 0 * color[2] == 0) {
+    if constexpr (weighted) factor *= fmaxf(1 - p.depth / *weighting.sigma, 0.0f) * weighting.factors[n];
+    // 0 times a non-finite value is NaN. A splat with a weight of 0 adds nothing.
+    if (0 * color[0] + 0 * color[1] + 0 * color[2] + 0 * factor == 0 && factor != 0) {
       for (int j = 0; j < 3; ++j) r.colors[j] = fmaxf(color[j], 0.0f);
       r.colors[3] = p.depth;
+      if constexpr (weighted) {
+        r.colors[3] /= *weighting.distance;
+        for (int j = 0; j < 4; ++j) r.colors[j] = in_fixed_point(r.colors[j]);
+        r.colors[4] = fminf(fmaxf(factor, -kMostTerm), kMostTerm) * float(1 << kTermBits);
+      }
       records[n] = r;
     } else {
       footprint = {0, 0};
@@ -99,20 +131,27 @@ __global__ void __launch_bounds__(kGaussianThreads, degree < 4 ? 8 : 5)
   if (threadIdx.x == 0) scratch.block_counts[blockIdx.x] = sum;
 }
 
-template <class Coefficient>
-void preprocess_by_degree(const Scene& in, const Lists& lists, const Scratch& scratch, cudaStream_t stream) {
-  constexpr decltype(&preprocess_gaussians<0, Coefficient>) by_degree[] = {
-      preprocess_gaussians<0, Coefficient>, preprocess_gaussians<1, Coefficient>, preprocess_gaussians<2, Coefficient>,
-      preprocess_gaussians<3, Coefficient>, preprocess_gaussians<4, Coefficient>};
-  by_degree[in.sh_degree]<<<blocks_for(in.count, kGaussianThreads), kGaussianThreads, 0, stream>>>(in, lists, scratch);
+template <class Coefficient, bool weighted>
+void preprocess_by_degree(const Scene& in, const Weighting& weighting, const Lists& lists, const Scratch& scratch,
+                          cudaStream_t stream) {
+  if (in.count == 0) return;
+  constexpr decltype(&preprocess_gaussians<0, Coefficient, weighted>) by_degree[] = {
+      preprocess_gaussians<0, Coefficient, weighted>, preprocess_gaussians<1, Coefficient, weighted>,
+      preprocess_gaussians<2, Coefficient, weighted>, preprocess_gaussians<3, Coefficient, weighted>,
+      preprocess_gaussians<4, Coefficient, weighted>};
+  by_degree[in.sh_degree]<<<blocks_for(in.count, kGaussianThreads), kGaussianThreads, 0, stream>>>(in, weighting, lists, scratch);
 }
 
 }  // namespace
 
 void preprocess(const Scene& in, const Lists& lists, const Scratch& scratch, cudaStream_t stream) {
-  if (in.count == 0) return;
-  const auto run = in.half_sh ? preprocess_by_degree<__half> : preprocess_by_degree<float>;
-  run(in, lists, scratch, stream);
+  const auto run = in.half_sh ? preprocess_by_degree<__half, false> : preprocess_by_degree<float, false>;
+  run(in, {}, lists, scratch, stream);
+}
+
+void preprocess_weighted(const Scene& in, const Weighting& weighting, const Lists& lists, const Scratch& scratch,
+                         cudaStream_t stream) {
+  preprocess_by_degree<float, true>(in, weighting, lists, scratch, stream);
 }
 
 }  // namespace gsplat::frame

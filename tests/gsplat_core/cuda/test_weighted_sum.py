@@ -1,12 +1,17 @@
-"""Weighted sums on CUDA against the reference in float64."""
+"""Weighted sums on CUDA against the reference in float64: the sums with their gradients, and the whole frame without."""
+
+from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
 
-from gsplat_core import reference
+from gsplat_core import Camera, Gaussians, reference
 from gsplat_core.ops.arguments import TileGrid
+from gsplat_core.ops.frame import STATUS_NEEDED, STATUS_OVERFLOW, View, render_weighted_frame
 from gsplat_core.ops.tiles import bin_splats
 from gsplat_core.ops.weighted_sum import weighted_sums
+from gsplat_core.rendering.weighted_sum import FACTOR, OPACITY, WeightedSumRenderer
 
 WIDTH, HEIGHT = 70, 45
 
@@ -122,3 +127,136 @@ def test_opcheck(gpu):
     torch.library.opcheck(
         torch.ops.gsplat_core.weighted_sums.default, (*(t.requires_grad_() for t in inputs), *lists, WIDTH, HEIGHT)
     )
+
+
+LIMITS = {"least_total": 1e-2, "least_share": 1e-4}
+
+
+def frame_inputs(count, degree=1, model="pinhole", background=True, seed=1, width=WIDTH, height=HEIGHT) -> list[Any]:
+    """Gaussians before the camera, opacities of either sign and above 1, factors, scalars, and the view; all float32."""
+    g = torch.Generator().manual_seed(seed)
+    depths = 4 + 6 * torch.rand(count, generator=g)
+    places = 2 * torch.rand(count, 2, generator=g) - 1
+    places = places * (6 if model == "ortho" else depths[:, None])
+    camera = Camera.from_focal(0.6 * width if model != "ortho" else width / 12, width, height)
+    gaussians = [
+        torch.cat([places, depths[:, None]], 1), torch.randn(count, 4, generator=g),
+        0.4 * torch.randn(count, 3, generator=g) - 1.2, torch.zeros(count),
+        0.4 * torch.randn(count, (degree + 1) ** 2, 3, generator=g),
+    ]  # fmt: skip
+    harmonics = 0.4 * torch.randn(count, 16, generator=g)
+    harmonics[:, 0] += 2 * torch.rand(count, generator=g)
+    factors = 0.5 + torch.rand(count, generator=g)
+    scalars = tuple(torch.tensor(value) for value in (9.0, 6.0, 0.2))
+    behind = torch.tensor([0.2, 0.7, 0.4]) if background else None
+    viewmat, K = (torch.as_tensor(m, dtype=torch.float32) for m in camera.matrices("cpu", torch.float32))
+    viewmat = viewmat.clone()
+    viewmat[:3, 3] = torch.tensor([0.1, -0.2, 0.3])
+    return [gaussians, harmonics, factors, scalars, View(viewmat, K, width, height, behind, model)]
+
+
+def moved(inputs, to) -> list[Any]:
+    gaussians, harmonics, factors, scalars, view = inputs
+    tensors = {name: getattr(view, name).to(to) for name in ("viewmat", "K")}
+    background = None if view.background is None else view.background.to(to)
+    return [
+        [t.to(to) for t in gaussians], harmonics.to(to), factors.to(to), tuple(t.to(to) for t in scalars),
+        view._replace(**tensors, background=background),
+    ]  # fmt: skip
+
+
+def frame_of(inputs, gpu, capacity=1 << 20):
+    frame = render_weighted_frame(*moved(inputs, gpu), capacity, **LIMITS)
+    assert not frame.status[STATUS_OVERFLOW]
+    return frame
+
+
+def check_frame(inputs, gpu):
+    frame = frame_of(inputs, gpu)
+    image, alphas = reference.render_weighted_frame(*moved(inputs, torch.float64), **LIMITS)
+    for actual, wanted in ((frame.image, image), (frame.alphas, alphas)):
+        off = (actual.cpu().double() - wanted).abs()
+        # A splat at its cutoff may differ by float rounding: by 1/255 of its weight, at few pixels.
+        assert off.isfinite().all()
+        assert (off > 2e-4).double().mean() < 2e-3, (off.max(), (off > 2e-4).double().mean())
+    return frame
+
+
+@pytest.mark.parametrize("model", ["pinhole", "ortho", "fisheye"])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
+def test_frame_for_every_degree_and_camera_model(gpu, degree, model):
+    assert check_frame(frame_inputs(400, degree, model), gpu).alphas.max() > 0.5
+
+
+@pytest.mark.parametrize("size", [(1, 1), (16, 16), (17, 33), (200, 131)])
+@pytest.mark.parametrize("count", [0, 1, 127, 129, 1000])
+def test_frame_of_any_size(gpu, count, size):
+    width, height = size
+    check_frame(frame_inputs(count, background=count % 2 == 0, seed=count, width=width, height=height), gpu)
+
+
+def test_frame_with_more_splats_in_a_tile_than_a_batch(gpu):
+    inputs = frame_inputs(3000, width=20, height=20)
+    inputs[0][2] += 1
+    check_frame(inputs, gpu)
+
+
+def test_frame_of_any_order_gives_the_same_bytes(gpu):
+    inputs = frame_inputs(3000, degree=2)
+    first = frame_of(inputs, gpu)
+    order = torch.randperm(3000, generator=torch.Generator().manual_seed(4))
+    gaussians, harmonics, factors, *rest = inputs
+    turned = frame_of([[t[order] for t in gaussians], harmonics[order], factors[order], *rest], gpu)
+    assert first.alphas.max() > 0.5
+    assert torch.equal(turned.image, first.image)
+    assert torch.equal(turned.alphas, first.alphas)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), 3e38])
+@pytest.mark.parametrize("at", range(7))
+def test_a_hostile_value_affects_no_other_splat_of_a_frame(gpu, at, value):
+    inputs = frame_inputs(60)
+    tensors = [*inputs[0], inputs[1], inputs[2]]
+    without = [[t[1:] for t in inputs[0]], inputs[1][1:], inputs[2][1:], *inputs[3:]]
+    tensors[at][0] = value
+    frame = frame_of(inputs, gpu)
+    assert frame.image.isfinite().all()
+    if value != 3e38:  # finite, so the Gaussian may be seen
+        assert torch.equal(frame.image, frame_of(without, gpu).image)
+
+
+def test_a_frame_that_does_not_fit_says_so(gpu):
+    inputs = moved(frame_inputs(500), gpu)
+    small = render_weighted_frame(*inputs, 10, **LIMITS)
+    assert small.status[STATUS_OVERFLOW] == 1
+    needed = int(small.status[STATUS_NEEDED])
+    assert torch.equal(
+        render_weighted_frame(*inputs, needed, **LIMITS).image, render_weighted_frame(*inputs, 1 << 20, **LIMITS).image
+    )
+
+
+@pytest.mark.parametrize("depth", [True, False])
+def test_the_renderer_shows_the_same_picture_with_and_without_gradients(gpu, depth):
+    gaussians, harmonics, factors, _, view = frame_inputs(800, degree=2)
+    scene = Gaussians(*gaussians)
+    scene = replace(scene, extra={OPACITY: harmonics, FACTOR: factors}).to(gpu)
+    camera = Camera(view.K.numpy(), WIDTH, HEIGHT, view.viewmat.numpy())
+    values = {name: torch.tensor(v, device=gpu) for name, v in WeightedSumRenderer.first_values(9.0).items()}
+    background = torch.rand(3, device=gpu)
+    shown = WeightedSumRenderer.picture(scene, camera, background, values, depth)
+    trained = WeightedSumRenderer.picture(scene.detach().requires_grad_(), camera, background, values, depth)
+    assert trained.image.requires_grad
+    assert shown.alpha.max() > 0.5
+    for one, other in zip(shown, trained, strict=True):
+        assert ((one - other).abs() > 1e-4).double().mean() < 1e-3
+
+
+def test_opcheck_of_a_frame(gpu):
+    gaussians, harmonics, factors, scalars, view = moved(frame_inputs(20), gpu)
+    torch.library.opcheck(
+        torch.ops.gsplat_core.render_weighted_frame.default,
+        (
+            gaussians, harmonics, factors, list(scalars), *view.tensors, WIDTH, HEIGHT, 0.3, 0.01, 1e10, 0, 1e-2, 1e-4,
+            1 << 14,
+        ),
+    )  # fmt: skip

@@ -7,9 +7,12 @@ import dataclasses
 import pytest
 import torch
 
-from gsplat_core import Camera
+from gsplat_core import Camera, reference
+from gsplat_core.ops.arguments import View
 from gsplat_core.rendering.weighted_sum import (
     FACTOR,
+    LEAST_SHARE,
+    LEAST_TOTAL,
     OPACITY,
     DirectWeightedSumRenderer,
     ExpWeightedSumRenderer,
@@ -109,3 +112,24 @@ def test_any_order_gives_the_same_bytes(make_gaussians):
     seen = WeightedSumRenderer.picture(scene.select(order), CAMERA, None, values)
     assert wanted.alpha.any()
     assert all(torch.equal(one, other) for one, other in zip(seen, wanted, strict=True))
+
+
+@pytest.mark.parametrize("with_background", [True, False])
+def test_the_picture_equals_the_reference(make_gaussians, assert_near, with_background):
+    scene, values = WeightedSumRenderer.extended(make_gaussians(200)), values_of(WeightedSumRenderer)
+    g = torch.Generator().manual_seed(5)
+    opacity = scene.extra[OPACITY] + 0.3 * torch.randn(200, 16, generator=g)
+    scene = dataclasses.replace(scene, extra={OPACITY: opacity, FACTOR: 0.5 + torch.rand(200, generator=g)})
+    background = torch.tensor([0.1, 0.5, 0.9]) if with_background else None
+    seen = WeightedSumRenderer.picture(scene, CAMERA, background, values)
+    exact = lambda t: None if t is None else t.double()
+    viewmat, K = CAMERA.matrices("cpu", torch.float64)
+    image, alphas = reference.render_weighted_frame(
+        [t.double() for t in scene.left_tensors], exact(opacity), exact(scene.extra[FACTOR]),
+        tuple(values[name].double() for name in ("sigma", "distance", "background")),
+        View(viewmat, K, 32, 24, exact(background)), least_total=LEAST_TOTAL, least_share=LEAST_SHARE,
+    )  # fmt: skip
+    assert alphas.max() > 0.5
+    assert_near(seen.image, image[..., :3], of_largest=1e-4)
+    assert_near(seen.alpha, alphas, of_largest=1e-4)
+    assert_near(seen.depth, image[..., 3], of_largest=1e-4)
