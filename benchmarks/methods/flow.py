@@ -41,6 +41,8 @@ from operators.settings import Device
 CAMERA = Camera.from_focal(350.0, 320, 256)
 DISTANCE_MM, TILT_DEG, SPACING_MM = 100.0, 25.0, 1.0
 STRETCH = ((1.05, 0.03, 0.0), (0.0, 0.96, 0.02), (0.01, 0.0, 1.04))
+POINTS = {"fixed": "scaled", "stereo": "model", "poses": "model", "no-poses": "scaled"}
+"""Alignment of the followed points by case: one scale where nothing tells the size of the scene."""
 CENTRE = torch.tensor([0.0, 0.0, DISTANCE_MM], dtype=torch.float64)
 
 
@@ -127,7 +129,7 @@ def trained(case: str, seed: int, losses: tuple[str, ...], device: Device, full:
     tracking, errors = geometry.tracking, geometry.depth
     third = next(view for view in geometry.views if view.name == "third").model.psnr_tissue_db
     assert tracking is not None and errors is not None and third is not None
-    points = tracking.model if case == "stereo" else tracking.scaled
+    points = getattr(tracking, POINTS[case])
     return {
         "points_mm": round(points.median_mm, 4),
         "points_px": round(tracking.model.median_px, 4),
@@ -143,7 +145,7 @@ def main() -> None:
     parser = log.options(__doc__)
     parser.add_argument("--only", choices=["motions", "training"], help="one of the two parts")
     parser.add_argument("--seeds", type=int, default=1)
-    parser.add_argument("--cases", nargs="+", choices=["fixed", "stereo"], default=["fixed", "stereo"])
+    parser.add_argument("--cases", nargs="+", choices=list(POINTS), default=["fixed", "stereo"])
     parser.add_argument("--weight", type=float, default=0.0, help="weight of the loss; 0 for its default")
     chosen = parser.parse_args()
     figures: dict[str, object] = {}

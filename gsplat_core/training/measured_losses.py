@@ -40,6 +40,9 @@ SEARCH_EVERY = 200
 """Number of loss evaluations after which the nearest splats of each splat, needed to render flow, are searched again."""
 
 
+NOISE_PX = 0.0
+
+
 class FlowLoss:
     """Mean distance in pixels between rendered and observed flow, over pixels with reliable flow.
 
@@ -80,6 +83,7 @@ class FlowLoss:
         known = target[..., 0].isfinite() & rendered.observed  # both components are NaN where flow is unreliable
         off = torch.where(known[..., None], rendered.flow - target, 0)
         lengths = (off.square().sum(-1) + SMOOTH_PX**2).sqrt() - SMOOTH_PX
+        lengths = (lengths - NOISE_PX).clamp(min=0)
         return lengths.sum() / known.sum().clamp(min=1)
 
     def _other(self, observation: Observation, context: LossContext) -> Observation | None:

@@ -176,9 +176,10 @@ def render_weighted_frame(
     of a ω, each with the background's. A splat's `a` is its opacity, a sum of harmonics of the view direction, times its
     Gaussian. It contributes where both are at least 1/255.
 
-    Terms and channels are rounded to multiples of 2⁻²⁰ and 2⁻¹⁸, and their products are added as integers: Gaussians in
-    another order give the same bytes. A splat's largest term is limited to ±128, its channels to 2048, and a pixel's sums
-    must be below 2²⁵. Gaussians with a non-finite value are culled. The host does not synchronise.
+    Terms and channels are rounded to multiples of 2⁻²⁴ and 2⁻¹⁸, and their products are added as integers: Gaussians in
+    another order give the same bytes. A splat's largest term is limited to ±127, its channels to 2048. In tiles with more
+    than 2¹⁷ splats terms are rounded more coarsely, so that a sum of channels is correct as long as the mean of |term
+    channel| over the tile's splats is below 16. Gaussians with a non-finite value are culled. The host does not synchronise.
 
     Args:
         gaussians: as in `render_frame`; logit_opacities are not used, but must be finite.

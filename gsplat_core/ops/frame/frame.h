@@ -62,10 +62,10 @@ struct Weighting {
   bool aligned;                    // opacity_harmonics is aligned to 16 bytes
 };
 constexpr int kOpacityDegree = 3, kOpacityBases = 16;
-// Fixed point of weighted sums: a splat's term at a pixel times its channel. A splat's largest term is limited to
-// kMostTerm, its channels to kMostChannel. A pixel's sums may reach 2^(63 - kTermBits - kChannelBits).
-constexpr int kTermBits = 20, kChannelBits = 18;
-constexpr float kMostTerm = 128.0f, kMostChannel = 2048.0f;
+// Fixed point of weighted sums: a splat's term at a pixel times its channel, with at most kTermBits and kChannelBits binary
+// places. A splat's largest term is limited to kMostTerm, its channels to kMostChannel.
+constexpr int kTermBits = 24, kChannelBits = 18;
+constexpr float kMostTerm = 127.0f, kMostChannel = 2048.0f;
 
 // Results of the forward pass other than the image. After an overflow a list may contain -1: no instance.
 struct Lists {
@@ -109,7 +109,7 @@ void fill(const Scene& in, const Lists& lists, const Scratch& scratch, cudaStrea
 void blend(const Scene& in, const Lists& lists, const Scratch& scratch, const Pixels& out, cudaStream_t stream);
 
 // The first and last step of a frame of weighted sums, with shared lists (kShared) whose order does not matter. The colours
-// of the records are in fixed point, the fifth is the splat's factor of exp2(power) in units of 2^-kTermBits.
+// of the records are in fixed point, the fifth is the splat's factor of exp2(power).
 void preprocess_weighted(const Scene& in, const Weighting& weighting, const Lists& lists, const Scratch& scratch,
                          cudaStream_t stream);
 void sum_weighted(const Scene& in, const Weighting& weighting, const Lists& lists, const Pixels& out, cudaStream_t stream);

@@ -56,7 +56,7 @@ __global__ void __launch_bounds__(kGaussianThreads, degree < 4 ? 8 : 5)
       unit_direction(camera.center, g.mean, direction);
       bases_at<kOpacityDegree>(direction[0], direction[1], direction[2], bases);
       factor = opacity_in(weighting, n, bases);
-      opacity = fminf(fabsf(factor), 1.0f);
+      opacity = isfinite(factor) ? fminf(fabsf(factor), 1.0f) : 0.0f;
       factor = copysignf(fmaxf(fabsf(factor), 1.0f), factor);
     } else {
       opacity = opacity_of(g);
@@ -96,7 +96,7 @@ __global__ void __launch_bounds__(kGaussianThreads, degree < 4 ? 8 : 5)
       if constexpr (weighted) {
         r.colors[3] /= *weighting.distance;
         for (int j = 0; j < 4; ++j) r.colors[j] = in_fixed_point(r.colors[j]);
-        r.colors[4] = fminf(fmaxf(factor, -kMostTerm), kMostTerm) * float(1 << kTermBits);
+        r.colors[4] = fminf(fmaxf(factor, -kMostTerm), kMostTerm);
       }
       records[n] = r;
     } else {

@@ -11,7 +11,11 @@ using namespace blending;
 
 constexpr int kChannels = 4;  // red, green, blue, depth
 
-// Sums of one pixel: channels in units of 2^-(kTermBits + kChannelBits), weights in units of 2^-kTermBits.
+// Binary places of the terms in a tile with a list of this length: kTermBits, and one less for each doubling beyond 2^17
+// splats. A sum of channels is then correct as long as the mean of |term channel| over the list is below 16.
+__device__ inline int term_bits(int length) { return kTermBits - max(0, 15 - __clz(length)); }
+
+// Sums of one pixel: channels in units of 2^-(bits + kChannelBits), weights in units of 2^-bits with the tile's term_bits.
 struct FixedSums {
   int64_t channels[kChannels] = {}, weights = 0;
 
@@ -23,9 +27,9 @@ struct FixedSums {
     for (int d = 0; d < kChannels; ++d)  // the compiler does not always find this instruction
       asm("mad.wide.s32 %0, %1, %2, %0;" : "+l"(channels[d]) : "r"(quanta), "r"(__float_as_int(r.colors[d])));
   }
-  __device__ float weight() const { return __ll2float_rn(weights) * (1.0f / (1 << kTermBits)); }
-  __device__ float channel(int d) const {
-    return __ll2float_rn(channels[d]) * (1.0f / (1 << kTermBits)) * (1.0f / (1 << kChannelBits));
+  __device__ float weight(float quantum) const { return __ll2float_rn(weights) * quantum; }
+  __device__ float channel(int d, float quantum) const {
+    return __ll2float_rn(channels[d]) * quantum * (1.0f / (1 << kChannelBits));
   }
 };
 
@@ -48,7 +52,10 @@ __global__ void __launch_bounds__(kBlockThreads, 7) sum_tiles(Scene in, Weightin
   const auto fetch_ahead = [&](int ahead) {  // this thread's splat of the batch that begins `ahead` splats before the end
     if (int(threadIdx.x) >= ahead) return faint_record<kChannels + 1>();
     const uint32_t splat = uint32_t(lists.keys[end - ahead + int(threadIdx.x)]);
-    return splat < in.count ? static_cast<const Splat*>(lists.records)[splat] : faint_record<kChannels + 1>();
+    if (splat >= in.count) return faint_record<kChannels + 1>();
+    Splat r = static_cast<const Splat*>(lists.records)[splat];
+    r.colors[kChannels] *= float(1 << term_bits(end - begin));
+    return r;
   };
   if (threadIdx.x < 2) stage.splats[threadIdx.x][kBatch] = staged(faint_record<kChannels + 1>(), middle_x, middle_y, no_limit);
   FixedSums sums[kPixelsEach];
@@ -70,16 +77,16 @@ __global__ void __launch_bounds__(kBlockThreads, 7) sum_tiles(Scene in, Weightin
       }
     }
   }
-  const float behind = *weighting.behind;
+  const float behind = *weighting.behind, quantum = 1.0f / float(1 << term_bits(end - begin));
   for (int p = 0; p < kPixelsEach; ++p) {
     if (!w.inside[p]) continue;
-    const float weight = sums[p].weight(), total = fmaxf(weight + behind, weighting.least_total), inverse = 1 / total;
+    const float weight = sums[p].weight(quantum), total = fmaxf(weight + behind, weighting.least_total), inverse = 1 / total;
     float color[3];
     for (int d = 0; d < 3; ++d) {
-      const float of_splats = sums[p].channel(d);
+      const float of_splats = sums[p].channel(d, quantum);
       color[d] = (in.background != nullptr ? fmaf(behind, in.background[d], of_splats) : of_splats) * inverse;
     }
-    const float z = weight > weighting.least_share ? sums[p].channel(3) / weight * *weighting.distance : 0;
+    const float z = weight > weighting.least_share ? sums[p].channel(3, quantum) / weight * *weighting.distance : 0;
     const int64_t pixel = int64_t(w.y[p]) * in.width + w.x;
     out.alphas[pixel] = 1 - fminf(behind * inverse, 1.0f);
     reinterpret_cast<float4*>(out.image)[pixel] = make_float4(color[0], color[1], color[2], z);

@@ -174,11 +174,16 @@ def frame_of(inputs, gpu, capacity=1 << 20):
 def check_frame(inputs, gpu):
     frame = frame_of(inputs, gpu)
     image, alphas = reference.render_weighted_frame(*moved(inputs, torch.float64), **LIMITS)
-    for actual, wanted in ((frame.image, image), (frame.alphas, alphas)):
-        off = (actual.cpu().double() - wanted).abs()
+    assert frame.image.isfinite().all()
+    # Opacities of both signs nearly cancel at some pixels, whose mean depth is not defined to many digits.
+    clear = alphas > 0.3
+    colours, z = ((one.cpu().double() - other).abs() for one, other in zip(
+        (frame.image[..., :3], frame.image[..., 3]), (image[..., :3], image[..., 3]), strict=True
+    ))  # fmt: skip
+    off = [(frame.alphas.cpu().double() - alphas).abs(), colours.amax(-1), torch.where(clear, z, 0) / 10]
+    for each in off:
         # A splat at its cutoff may differ by float rounding: by 1/255 of its weight, at few pixels.
-        assert off.isfinite().all()
-        assert (off > 2e-4).double().mean() < 2e-3, (off.max(), (off > 2e-4).double().mean())
+        assert (each > 2e-4).double().mean() < 2e-3, (float(each.max()), float((each > 2e-4).double().mean()))
     return frame
 
 
@@ -248,7 +253,25 @@ def test_the_renderer_shows_the_same_picture_with_and_without_gradients(gpu, dep
     assert trained.image.requires_grad
     assert shown.alpha.max() > 0.5
     for one, other in zip(shown, trained, strict=True):
-        assert ((one - other).abs() > 1e-4).double().mean() < 1e-3
+        off = (one - other).abs() / other.abs().max().clamp(min=1e-6)
+        assert (off > 2e-4).double().mean() < 2e-3, (float(off.max()), float((off > 2e-4).double().mean()))
+
+
+def test_a_tile_with_very_many_splats_does_not_overflow(gpu):
+    count = 400_000
+    gaussians, harmonics, factors, scalars, view = frame_inputs(1, degree=0, width=16, height=16)
+    gaussians = [t.expand(count, *t.shape[1:]).clone() for t in gaussians]
+    gaussians[0][:] = torch.tensor([0.0, 0.0, 5.0])
+    gaussians[2][:] = 2.0  # much wider than the picture
+    harmonics, factors = torch.zeros(count, 16), torch.full((count,), 20.0)
+    harmonics[:, 0] = 1 / 0.28209479177387814
+    inputs = [gaussians, harmonics, factors, scalars, view]
+    frame = frame_of(inputs, gpu, capacity=count)
+    image, alphas = reference.render_weighted_frame(
+        *moved([[t[:1] for t in gaussians], harmonics[:1], count * factors[:1], scalars, view], torch.float64), **LIMITS
+    )
+    torch.testing.assert_close(frame.image.cpu().double(), image, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(frame.alphas.cpu().double(), alphas, rtol=1e-4, atol=1e-4)
 
 
 def test_opcheck_of_a_frame(gpu):
