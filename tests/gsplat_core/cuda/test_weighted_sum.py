@@ -182,8 +182,9 @@ def check_frame(inputs, gpu):
     ))  # fmt: skip
     off = [(frame.alphas.cpu().double() - alphas).abs(), colours.amax(-1), torch.where(clear, z, 0) / 10]
     for each in off:
-        # A splat at its cutoff may differ by float rounding: by 1/255 of its weight, at few pixels.
-        assert (each > 2e-4).double().mean() < 2e-3, (float(each.max()), float((each > 2e-4).double().mean()))
+        # By float rounding a splat may reach a pixel or not where its alpha is 1/255.
+        assert each.max() < 2e-2
+        assert (each > 2e-4).sum() <= 3 + 2e-3 * each.numel(), (float(each.max()), int((each > 2e-4).sum()))
     return frame
 
 
@@ -267,9 +268,8 @@ def test_a_tile_with_very_many_splats_does_not_overflow(gpu):
     harmonics[:, 0] = 1 / 0.28209479177387814
     inputs = [gaussians, harmonics, factors, scalars, view]
     frame = frame_of(inputs, gpu, capacity=count)
-    image, alphas = reference.render_weighted_frame(
-        *moved([[t[:1] for t in gaussians], harmonics[:1], count * factors[:1], scalars, view], torch.float64), **LIMITS
-    )
+    one = [[t[:1] for t in gaussians], harmonics[:1], factors[:1], (*scalars[:2], scalars[2] / count), view]
+    image, alphas = reference.render_weighted_frame(*moved(one, torch.float64), **LIMITS)
     torch.testing.assert_close(frame.image.cpu().double(), image, rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(frame.alphas.cpu().double(), alphas, rtol=1e-4, atol=1e-4)
 
