@@ -4,8 +4,8 @@
 
 Both renderers train on the same frames of a recording with equal steps. Popping is measured on these models: the camera turns
 by 0.1 degrees about its centre, the picture is warped by the exact homography of the turn, and the difference to the
-picture after the turn is taken. Its 99.9th percentile contains changes of the order of splats, and interpolation, which
-vanishes in larger pictures.
+picture after the turn is taken. Its 99.9th percentile contains changes of the order of splats and errors of the interpolation.
+Pictures with 4x4 samples a pixel, which are warped before the mean over a pixel is taken, have the fewest of these errors.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ RECORDINGS = Path(
 TURN_DEGREES = 0.1
 TURNS = 10
 MARGIN_PX = 8
-ENLARGED = (1, 2, 4)
-"""Sizes of the pictures in which popping is measured, relative to the training pictures."""
+SAMPLES = (1, 2, 4)
+"""Samples in a row and column of a pixel of the pictures in which popping is measured."""
 
 
 def picture(model: Model, camera: Camera, time_s: float) -> np.ndarray:
@@ -81,12 +81,13 @@ def train(renderer: str, frames: list, camera: Camera, config: ReconstructorConf
     }
 
 
-def popping(model: Model, time_s: float, enlarged: int) -> float:
+def popping(model: Model, time_s: float, samples: int) -> float:
     """Return the 99.9th percentile of the warped difference, mean of all turns, in grey levels of 255.
 
-    The picture is `enlarged` times the size of the training pictures. At 1, the interpolation of the warp dominates.
+    Pictures have samples x samples values for each pixel of the training pictures. They are warped at this size, and the
+    difference is averaged over the pixels.
     """
-    camera = model.camera.scaled(enlarged)
+    camera = model.camera.scaled(samples)
     intrinsics = camera.K
     found = []
     before: np.ndarray | None = None
@@ -104,7 +105,9 @@ def popping(model: Model, time_s: float, enlarged: int) -> float:
             matrix = shift @ intrinsics @ relative @ np.linalg.inv(shift @ intrinsics)
             size = (camera.width_px, camera.height_px)
             warped = cv2.warpPerspective(before, matrix, size, flags=cv2.INTER_LANCZOS4)
-            inner = np.abs(warped - seen)[MARGIN_PX:-MARGIN_PX, MARGIN_PX:-MARGIN_PX].max(-1)
+            small = model.camera.width_px, model.camera.height_px
+            off = np.abs(cv2.resize(warped - seen, small, interpolation=cv2.INTER_AREA))
+            inner = off[MARGIN_PX:-MARGIN_PX, MARGIN_PX:-MARGIN_PX].max(-1)
             found.append(float(np.percentile(inner, 99.9)) * 255)
         before, last_turn = seen, turn
     return statistics.mean(found)
@@ -205,7 +208,7 @@ def main() -> None:
         )
         model = result.pop("model")
         middle_s = frames[len(frames) // 2].time_s
-        result["popping_grey_levels"] = {f"{n}x": popping(model, middle_s, n) for n in ENLARGED}
+        result["popping_grey_levels"] = {f"{n}x": popping(model, middle_s, n) for n in SAMPLES}
         result["values"] = dict(model.trained_by.values)
         figures[name] = result
         print(name, result, flush=True)
