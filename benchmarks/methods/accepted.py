@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import json
+import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -97,8 +98,9 @@ METHODS = (
         "3. Weighted sum", "weighted_sum",
         (
             figure("trained on cutting: held out against alpha", "heldout_minus_alpha_db", "at least -1.0", unit="dB"),
-            figure("popping against alpha, turns of 0.1°", "popping_ratio|1x", "at most 0.5", note="likely the interpolation of the compared pictures, which both share"),
-            figure("popping against alpha, twice the size", "popping_ratio|2x", ""),
+            figure("popping against alpha, turns of 0.1°, 4x4 samples a pixel", "popping_ratio|4x", "at most 0.5"),
+            figure("with 2x2 samples", "popping_ratio|2x", ""),
+            figure("with 1 sample", "popping_ratio|1x", "", note="mostly interpolation of the compared pictures, which both share"),
             figure("time against alpha at 1 M, forward", "speed|1|time_ratio", "at most 1.3", note="[profile](../logs/h100-2026-11-27-profile/kernels.txt): the sums take 0.87 of 1.70 ms (blending of alpha, whose pixels end early, 0.34 of 0.53 ms); the rest is projection, colours and lists in separate calls"),
         ),
     ),
@@ -193,10 +195,16 @@ METHODS = (
 )  # fmt: skip
 
 
+def logs_of(method: str, device: str, folder: Path) -> list[dict[str, Any]]:
+    """Return the logs of a method on a device: METHOD-DEVICE.json, and further runs METHOD-DEVICE-2.json and so on."""
+    first = folder / f"{method}-{device}.json"
+    paths = [*([first] if first.exists() else ()), *sorted(folder.glob(f"{method}-{device}-[0-9].json"))]
+    return [json.loads(path.read_text(encoding="utf-8")) for path in paths]
+
+
 def log_of(method: str, device: str, folder: Path) -> dict[str, Any] | None:
-    """Return the log of a method on a device, or None."""
-    path = folder / f"{method}-{device}.json"
-    return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
+    """Return the first log of a method on a device, or None."""
+    return next(iter(logs_of(method, device, folder)), None)
 
 
 def value_at(log: Any, path: Sequence[str]) -> Any:
@@ -210,29 +218,38 @@ def value_at(log: Any, path: Sequence[str]) -> Any:
     return value
 
 
-def cell(figure: Figure, log: Mapping[str, Any] | None) -> str:
-    value = None if log is None else value_at(log, figure.path)
-    if not isinstance(value, int | float):
+def cell(figure: Figure, logs: Sequence[Mapping[str, Any]]) -> str:
+    """Return the figure, or the median of several runs with the smallest and the largest."""
+    values = [value for log in logs if isinstance(value := value_at(log, figure.path), int | float)]
+    if not values:
         return "–"
-    text = f"{figure.scale * value:.{figure.digits}f}" if figure.digits < 10 else f"{value:.1e}"
-    return f"{text} {figure.unit}".strip()
+    texts = [
+        f"{figure.scale * value:.{figure.digits}f}" if figure.digits < 10 else f"{value:.1e}"
+        for value in (statistics.median(values), min(values), max(values))
+    ]
+    spread = f" ({texts[1]} to {texts[2]})" if texts[1] != texts[2] else ""
+    return f"{texts[0]} {figure.unit}".strip() + spread
 
 
-def provenance(logs: Mapping[str, Mapping[str, Any]]) -> str:
+def provenance(logs: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
+    """Return commit, date, machine and command of the logs by device; of runs with the same ones their number."""
     parts = []
-    for device, log in logs.items():
-        machine = log["machine"]
+    for device, runs in logs.items():
+        if not runs:
+            continue
+        log, machine = runs[0], runs[0]["machine"]
         name = machine.get("gpu") or f"{machine['cpu']}, {machine['cores']} cores"
-        parts.append(f"{device}: commit {log['commit']}, {log['date']}, {name}, `{log['command']}`")
+        count = f", {len(runs)} runs" if len(runs) > 1 else ""
+        parts.append(f"{device}: commit {log['commit']}, {log['date']}, {name}{count}, `{log['command']}`")
     return "; ".join(parts)
 
 
 def section(method: Method, folder: Path) -> str:
     """Return the table of one method."""
-    logs = {device: log for device in DEVICES if (log := log_of(method.log, device, folder)) is not None}
+    logs = {device: logs_of(method.log, device, folder) for device in DEVICES}
     lines = ["| figure | required | CPU | GPU | note |", "|---|---|---|---|---|"]
     for each in method.figures:
-        cpu, gpu = (cell(each, logs.get(device)) for device in DEVICES)
+        cpu, gpu = (cell(each, logs[device]) for device in DEVICES)
         lines.append(f"| {each.what} | {each.asked or '–'} | {cpu} | {gpu} | {each.note} |")
     return f"## {method.title}\n\n" + "\n".join(lines) + "\n\n" + (provenance(logs) or "Not measured yet.")
 
@@ -252,8 +269,9 @@ def speed(folder: Path) -> str:
         lines.append(f"| {size} | " + " | ".join(cells) + f" | {'–' if peak is None else f'{peak:.0f}'} |")
     text = (
         "Milliseconds a frame of 1920x1080 on one GPU, of random scenes of degree 3. A dash: not measured in this run."
+        " Required is one sample faster than alpha and gsplat from 10 million splats on."
     )
-    return "## Frame times\n\n" + text + "\n\n" + "\n".join(lines) + "\n\n" + provenance({"cuda": log})
+    return "## Frame times\n\n" + text + "\n\n" + "\n".join(lines) + "\n\n" + provenance({"cuda": [log]})
 
 
 def training(folder: Path) -> str:
@@ -281,14 +299,15 @@ def training(folder: Path) -> str:
         f"`intrasplat reconstruct` with {log['steps']} steps, {log['together']} runs at a time. The synthetic recordings"
         " have exact depth. Depth and followed points of weighted sums are not evaluated: they have no depth along a ray."
     )
-    return "## Training\n\n" + text + "\n\n" + "\n".join(lines) + "\n\n" + provenance({"run": log})
+    return "## Training\n\n" + text + "\n\n" + "\n".join(lines) + "\n\n" + provenance({"run": [log]})
 
 
 def methods_text(folder: Path = FOLDER) -> str:
     """Return the text of results/methods.md."""
     head = (
         "# Splatting methods\n\nGenerated by `python benchmarks/publish.py` from [logs/methods](../logs/methods); do not"
-        " edit. [docs/methods.md](../../docs/methods.md) says what each method is for. Figures are single runs. The default weights of"
+        " edit. [docs/methods.md](../../docs/methods.md) says what each method is for. Figures are single runs, or where stated the median"
+        " of several with the smallest and the largest. The default weights of"
         " the losses ray_depth, normal_consistency, flow, triangulation and range were chosen on the synthetic scenes that"
         " these tables evaluate, so their figures may be too favourable for other scenes."
     )

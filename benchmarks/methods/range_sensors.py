@@ -22,7 +22,7 @@ from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
 from gsplat_core.scene.range_sensors import simulate_scan
-from gsplat_core.training.losses import LossContext
+from gsplat_core.training.losses import LossContext, WeightedLosses, loss_weights
 from gsplat_core.training.measured_losses import RangeLoss, render_ranges
 from gsplat_core.training.observations import Observation
 
@@ -81,6 +81,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=300)
     parser.add_argument("--photons", type=float, default=1000.0, help="expected returns of a column")
     parser.add_argument("--weight", type=float, default=RangeLoss.default_weight)
+    parser.add_argument("--also", default="", help="further losses, with and without a sensor; comma-separated")
     parser.add_argument("--sensors", default="time_of_flight,structured_light,oct_line")
     chosen = parser.parse_args()
     size, side = (256, 120) if chosen.full else (48, 30)
@@ -121,16 +122,17 @@ def main() -> None:
         scene = splats(x, y, torch.full_like(x, DISTANCE), colours, 34.0 / side).to(device).requires_grad_()
         groups = [{"params": [tensor], "lr": RATES[name], "name": name} for name, tensor in scene.tensors().items()]
         optimiser = torch.optim.Adam(groups, eps=1e-12)
-        seen, loss_of = observations(sensor, photons), RangeLoss()
+        seen, names = observations(sensor, photons), [*filter(None, chosen.also.split(","))]
+        losses = WeightedLosses(loss_weights(names if sensor is None else [*names, f"range:{chosen.weight}"]))
         context = LossContext(seen, lambda time_s: scene)
         start = time.perf_counter()
         for step in range(chosen.steps):
             one = seen[step % len(seen)]
             image = render(scene, one.camera, depth=False).image
             loss = camera_weight * (image - one.image.float() / 255).abs().mean()
-            term = loss_of(scene, one, context)
+            term = losses(scene, one, context)
             if term is not None:
-                loss = loss + chosen.weight * term
+                loss = loss + term
             for group in optimiser.param_groups:
                 group["lr"] = RATES[group["name"]] * 0.02 ** (step / chosen.steps)
             optimiser.zero_grad()

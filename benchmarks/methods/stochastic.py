@@ -117,16 +117,16 @@ def statistic_scene() -> tuple[Gaussians, Camera]:
     return gaussians, Camera.from_focal(120, 96, 72)
 
 
-def statistics_of(device: str, samples: int) -> dict[str, Any]:
-    """Return the figures of the statistical tests."""
+def statistics_of(device: str, samples: int, seeds: int) -> dict[str, Any]:
+    """Return the figures of the statistical tests, over the pixels of pictures with as many seeds."""
     gaussians, camera = statistic_scene()
     exact = gaussians.to(dtype=torch.float64)
     scene = raw_splats(gaussians.to(device))
-    figures: dict[str, Any] = {"z_samples": samples}
+    figures: dict[str, Any] = {"z_samples": samples, "z_seeds": seeds}
     moments = {"fragments": sample_moments(exact, camera), "points": point_moments(exact, camera)}
     for method in METHODS:
         mean, variance = moments[method]
-        sums = sampled(scene, camera, method, samples).cpu().double()
+        sums = torch.stack([sampled(scene, camera, method, samples, seed=seed).cpu().double() for seed in range(seeds)])
         z = (sums / samples - mean) / (variance / samples).sqrt()
         chance = mean[..., 3:4]
         # With fewer expected hits the mean is not normally distributed.
@@ -402,6 +402,7 @@ def main() -> None:
     parser = log.options(__doc__.splitlines()[0])
     parser.add_argument("--millions", type=float, nargs="+", help="sizes of the scenes; 1, 10, 50 and 106 with --full")
     parser.add_argument("--samples", type=int, default=4096, help="samples of the z test")
+    parser.add_argument("--seeds", type=int, default=16, help="pictures of the z test")
     parser.add_argument("--repetitions", type=int, help="frames of each timing")
     parser.add_argument("--bundle", type=Path, help="model of a replay, to score on its recording")
     parser.add_argument("--recording", type=Path, help="recording of the bundle")
@@ -417,7 +418,7 @@ def main() -> None:
         log.write("stochastic", chosen, {"recording": chosen.recording.name, **scored})
         return
     figures: dict[str, Any] = {"size_px": [camera.width_px, camera.height_px]}
-    figures |= statistics_of(device, chosen.samples)
+    figures |= statistics_of(device, chosen.samples, chosen.seeds)
     figures["quantised"] = quantisation(device)
     figures["huge_against_small"] = huge_against_small(camera, device, repetitions)
     for size in millions:
