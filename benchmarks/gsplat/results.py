@@ -341,5 +341,12 @@ def gsplat_text(folder: Path = FOLDER) -> str:
     for title, topic, section in SECTIONS:
         logs = logs_of(topic, folder)
         text = section(logs) if logs else ""
-        parts.append(f"## {title}\n\n" + (f"{text}\n\n{provenance({device: [log] for device, log in logs.items()})}" if text else "Not measured yet."))
+        parts.append(
+            f"## {title}\n\n"
+            + (
+                f"{text}\n\n{provenance({device: [log] for device, log in logs.items()})}"
+                if text
+                else "Not measured yet."
+            )
+        )
     return "\n\n".join(parts) + "\n"

@@ -135,12 +135,12 @@ METHODS = (
             figure("rigid motion with the published map: median error", "rigid_gaussianflow_median_px", "", 3, unit="px"),
             figure("5 % affine: p95", "affine_neighbours_p95_px", "at most 0.03", 5, unit="px"),
             figure(
-                "trained without depth: followed points", "fixed_seed0_flow_points_mm", "20 % below today", 2, unit="mm",
+                "trained without depth: followed points", "fixed_flow_points_mm", "20 % below today", 2, unit="mm",
                 note="likely the error of the depth, which flow of one fixed eye does not show",
             ),
-            figure("today", "fixed_seed0_today_points_mm", "", 2, unit="mm"),
-            figure("trained without depth: in the picture", "fixed_seed0_flow_points_px", "", 2, unit="px"),
-            figure("today, in the picture", "fixed_seed0_today_points_px", "", 2, unit="px"),
+            figure("today", "fixed_today_points_mm", "", 2, unit="mm"),
+            figure("trained without depth: in the picture", "fixed_flow_points_px", "", 2, unit="px"),
+            figure("today, in the picture", "fixed_today_points_px", "", 2, unit="px"),
         ),
     ),
     Method(
@@ -148,10 +148,10 @@ METHODS = (
         "flow-stereo",
         (
             figure(
-                "followed points", "stereo_seed0_flow_points_mm", "no worse than today", 3, unit="mm",
+                "followed points", "stereo_flow_points_mm", "no worse than today", 3, unit="mm",
                 note="worse, the cause is not known; the loss is no default",
             ),
-            figure("today", "stereo_seed0_today_points_mm", "", 3, unit="mm"),
+            figure("today", "stereo_today_points_mm", "", 3, unit="mm"),
         ),
     ),
     Method(

@@ -32,19 +32,17 @@ from gsplat_core.training.losses import LossContext
 from gsplat_core.training.observations import Observation
 from gsplat_core.transfers import HostCopy, tensor_of
 
-SMOOTH_PX = 0.1
-"""Flow error in pixels around which the loss changes from quadratic (smaller errors) to linear (larger errors)."""
+NOISE_PX = 0.6
+"""Flow error in pixels up to which nothing is penalised, because observed flow is not more accurate. Without it the loss
+increases the error of followed points where training on pictures is already more accurate than that."""
 KEPT_PAIRS = 256
 """Largest number of frame pairs whose observed flow is cached."""
 SEARCH_EVERY = 200
 """Number of loss evaluations after which the nearest splats of each splat, needed to render flow, are searched again."""
 
 
-NOISE_PX = 0.0
-
-
 class FlowLoss:
-    """Mean distance in pixels between rendered and observed flow, over pixels with reliable flow.
+    """Mean distance in pixels between rendered and observed flow beyond `NOISE_PX`, over pixels with reliable flow.
 
     The observed flow is DIS flow from the preceding or following frame to the observation, by turns. Where forward and
     backward flow disagree, where a tool is, and where nothing is rendered, nothing is compared. The scene at the other
@@ -82,8 +80,7 @@ class FlowLoss:
         rendered = render_flow(first, scene, before, after, neighbours=self._neighbours)
         known = target[..., 0].isfinite() & rendered.observed  # both components are NaN where flow is unreliable
         off = torch.where(known[..., None], rendered.flow - target, 0)
-        lengths = (off.square().sum(-1) + SMOOTH_PX**2).sqrt() - SMOOTH_PX
-        lengths = (lengths - NOISE_PX).clamp(min=0)
+        lengths = off.square().sum(-1).clamp(min=NOISE_PX**2).sqrt() - NOISE_PX
         return lengths.sum() / known.sum().clamp(min=1)
 
     def _other(self, observation: Observation, context: LossContext) -> Observation | None:

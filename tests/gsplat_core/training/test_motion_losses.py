@@ -13,7 +13,7 @@ from gsplat_core.errors import InvalidSetting
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.image_motion import consistent_flow
 from gsplat_core.training.losses import LossContext
-from gsplat_core.training.measured_losses import FlowLoss, TriangulationLoss, triangulate, triangulated
+from gsplat_core.training.measured_losses import NOISE_PX, FlowLoss, TriangulationLoss, triangulate, triangulated
 from gsplat_core.training.observations import Observation
 
 CAMERA = Camera.from_focal(110.0, 96, 80)
@@ -66,7 +66,7 @@ def test_flow_loss_moves_the_scene_as_the_pictures_show():
     wrong = value(still)
     wrong.backward()
     right = value(wall.means + shift)
-    expected = float(shift.norm()) / 40 * 110
+    expected = float(shift.norm()) / 40 * 110 - NOISE_PX
     assert abs(wrong.item() - expected) < 0.25 * expected and right.item() < 0.15 * wrong.item()
     along = (still.grad @ shift) / shift.norm()
     across = still.grad @ torch.tensor([0.5, 0.9, 0.0]) / shift.norm()
@@ -79,7 +79,16 @@ def test_flow_loss_compares_large_pictures_at_half_size():
     shift = torch.tensor([0.5, 0.0, 0.0])
     frames = [seen(wall, 0, camera), seen(at(wall, wall.means + shift), 1, camera)]
     value = FlowLoss()(wall, frames[1], LossContext(frames, lambda _: wall))
-    assert abs(float(value) - 0.5 / 40 * 280) < 0.5
+    assert abs(float(value) + NOISE_PX - 0.5 / 40 * 280) < 0.5
+
+
+def test_flow_loss_does_not_penalise_the_noise_of_flow():
+    wall = textured_wall()
+    frames = [seen(wall, 0), seen(wall, 1)]
+    near = (wall.means + torch.tensor([0.1, 0.0, 0.0])).requires_grad_()  # 0.3 px
+    value = FlowLoss()(at(wall, near), frames[1], LossContext(frames, lambda _: wall))
+    value.backward()
+    assert value.item() == 0 and not near.grad.any()
 
 
 def test_flow_loss_compares_with_both_neighbouring_frames_by_turns():
