@@ -212,8 +212,9 @@ def render_weighted_frame(
     colors = (spherical_harmonics(math.isqrt(sh.shape[1]) - 1, directions, sh) + 0.5).clamp(min=0)
     channels = torch.cat([colors, (depths / distance)[:, None]], 1)
     weights = (1 - depths / sigma).clamp(min=0) * factors[rows]
-    splats = (t[seen] for t in (means2d, conics, channels, opacities, weights))
-    sums = weighted_sums(*splats, view.width, view.height)
+    sums = weighted_sums(
+        means2d[seen], conics[seen], channels[seen], opacities[seen], weights[seen], view.width, view.height
+    )
     total = (sums[-1] + behind).clamp(min=least_total)
     color = sums[:3] if view.background is None else sums[:3] + (behind * view.background)[:, None, None]
     z = torch.where(sums[-1] > least_share, sums[3] / sums[-1] * distance, 0)
