@@ -7,8 +7,10 @@
 
 Metric-corrected descent with the Bures-Wasserstein metric moves the splats. Birth-death moves are the Fisher-Rao part of the
 gradient flow: the number of splats is constant, and each splat that dies makes place for a copy of another one. Probabilities
-follow from φ = ∂L/∂ln o, the change of the loss per relative change of a splat's opacity or mass (Rotskoff et al. 2019,
-"Neuron birth-death dynamics").
+follow from φ = ∂L/∂ln o, the change of the loss per relative change of a splat's opacity or mass. Copies are placed at points of
+the data, as the new particles of Rotskoff et al. 2019 ("Neuron birth-death dynamics") are drawn from a fixed distribution. Among
+several points, a copy takes the one where the loss changes most with its value, so that splats reach parts of the data in which
+no splat has a gradient.
 """
 
 from __future__ import annotations
@@ -83,10 +85,16 @@ def loss_and_gradients(splats: Splats, points: Tensor, targets: Tensor) -> tuple
     with torch.no_grad():
         off = splats(points) - targets
         loss = off.square().sum() / max(len(points), 1)
-        centres, factors, values = torch.ops.gsplat_core.splat_regression_backward(
-            points, splats.centres, splats.factors, splats.values, off * (2 / max(len(points), 1))
+        return loss, _backward(points, splats, off * (2 / max(len(points), 1)))
+
+
+def _backward(points: Tensor, splats: Splats, gradient: Tensor) -> Gradients:
+    """Return the gradients of Σ f · `gradient` over the points by the splats."""
+    return Gradients(
+        *torch.ops.gsplat_core.splat_regression_backward(
+            points, splats.centres, splats.factors, splats.values, gradient
         )
-        return loss, Gradients(centres, factors, values)
+    )
 
 
 @dataclass(frozen=True)
@@ -141,14 +149,14 @@ def births_and_deaths(phi: Tensor, rate: float, random: torch.Generator) -> Birt
 
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-8
-BIRTH_EVERY = 10
+BIRTH_EVERY = 5
 """Number of optimiser steps between two rounds in which splats die and are replaced by copies of others."""
 BIRTH_RATE = 0.5
 """Death rate per round of a splat whose ∂L/∂ln|v| is one standard deviation above the mean of all splats; v is its
 value. Each dead splat is replaced by a copy of a splat below the mean.
 """
-BIRTH_SPREAD = 2.0
-"""Factor on the random distance of a copied splat from its parent, which is drawn from the parent's normal density."""
+BIRTH_PLACES = 8
+"""Number of random points of the data among which the place of a copy is chosen."""
 
 
 @dataclass(frozen=True)
@@ -167,7 +175,7 @@ class FitOptions:
     """Divide the gradients of each splat by its mass (Bures-Wasserstein metric)."""
     birth_death: bool = True
     """Let splats die at random every `BIRTH_EVERY` steps, each replaced by a copy of a better one."""
-    birth_until: float = 0.7
+    birth_until: float = 0.3
     """Share of the steps after which no more splats die or are copied, so that the last copies are trained."""
     start_width: float = 0.05
     """Initial standard deviation of the splats, relative to the extent of the points."""
@@ -283,15 +291,28 @@ class _Fitting:
             parameter.addcdiv_(first, (second / second_scale).sqrt_().add_(EPSILON), value=-rate / first_scale)
 
     def _move(self, moves: BirthDeath) -> None:
-        """Replace each dying splat by a copy of its parent at a random distance. The parent's weight is divided equally among them."""
+        """Replace each dying splat by a copy of its parent at another place. The parent's weight is divided equally among them."""
         if len(moves.dying) == 0:
             return
         dying, parents = moves.dying, moves.parents
-        splats, dims = self._splats, self._splats.centres.shape[1]
-        copies = torch.bincount(parents, minlength=len(splats.values)) + 1
-        splats.values.div_(copies[:, None])
-        offsets = torch.randn(len(dying), dims, generator=self._random).to(splats.centres.device)
-        offsets = BIRTH_SPREAD * (splats.factors[parents] @ offsets[..., None])[..., 0]
+        copies = torch.bincount(parents, minlength=len(self._splats.values)) + 1
+        places = self._places(parents)
+        self._splats.values.div_(copies[:, None])
         for tensor in (*self._parameters, *self._first, *self._second):
             tensor[dying] = tensor[parents]
-        splats.centres[dying] += offsets
+        self._splats.centres[dying] = places
+
+    def _places(self, parents: Tensor) -> Tensor:
+        """Return the places of copies of the parents, [D, d]: of `BIRTH_PLACES` random points each, the one with the largest
+        gradient by the copy's value.
+        """
+        draws = torch.randint(len(self._points), (len(parents), BIRTH_PLACES), generator=self._random)
+        places = self._points[draws.to(self._points.device)]
+        candidates = Splats(
+            places.flatten(0, 1),
+            self._splats.factors[parents].repeat_interleave(BIRTH_PLACES, 0),
+            self._splats.values[parents].repeat_interleave(BIRTH_PLACES, 0),
+        )
+        off = self._splats(self._points) - self._values
+        slopes = _backward(self._points, candidates, off).values.norm(dim=1).view(-1, BIRTH_PLACES)
+        return places[torch.arange(len(places), device=places.device), slopes.argmax(1)]

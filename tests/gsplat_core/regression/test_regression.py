@@ -7,9 +7,10 @@ import math
 import pytest
 import torch
 
-from gsplat_core import InvalidInput, reference
+from gsplat_core import InvalidInput, reference, regression
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.regression import (
+    BirthDeath,
     FitOptions,
     Splats,
     births_and_deaths,
@@ -75,6 +76,53 @@ def test_births_replace_deaths():
     assert len(births_and_deaths(torch.ones(5), 0.5, torch.Generator()).dying) == 0
 
 
+def fitting(seed=5):
+    """A fit whose splats are all near the origin, with a target that is 0 but for one distant bump."""
+    g = torch.Generator().manual_seed(seed)
+    points = torch.rand(300, 2, generator=g)
+    values = torch.exp(-(points - torch.tensor([0.8, 0.7])).square().sum(-1, keepdim=True) / 0.005)
+    start = Splats(0.05 * torch.rand(6, 2, generator=g), 0.05 * torch.eye(2).repeat(6, 1, 1), torch.full((6, 1), 1e-3))
+    return regression._Fitting(points, values, start, FitOptions(), g), points, values
+
+
+def test_copies_are_placed_where_the_loss_changes_most_with_their_value(monkeypatch):
+    monkeypatch.setattr(regression, "BIRTH_PLACES", 300)
+    fit_, points, values = fitting()
+    parents = torch.tensor([2, 4])
+    state = fit_._random.get_state()
+    places = fit_._places(parents)
+    fit_._random.set_state(state)
+    drawn = points[torch.randint(300, (2, 300), generator=fit_._random)]
+    splats = fit_._splats
+    for place, candidates, parent in zip(places, drawn, parents, strict=True):
+        value = torch.zeros(300, 1, dtype=torch.float64, requires_grad=True)
+        alone = reference.splat_regression(
+            points.double(), candidates.double(), splats.factors[parent].double().repeat(300, 1, 1), value
+        )
+        off = splats(points).double() - values.double()
+        (slopes,) = torch.autograd.grad((off * alone).sum(), value)
+        assert torch.equal(place, candidates[slopes[:, 0].abs().argmax()])
+    assert ((places - torch.tensor([0.8, 0.7])).norm(dim=1) < 0.1).all()
+
+
+def test_copies_have_their_parents_shape_and_share_its_value():
+    fit_, points, _ = fitting()
+    before = fit_._splats.factors.clone(), fit_._splats.values.clone(), fit_._splats.centres.clone()
+    fit_._first[0][3], fit_._second[2][3] = 7.0, 9.0
+    fit_._move(BirthDeath(torch.tensor([0, 5, 1]), torch.tensor([3, 3, 4])))
+    splats = fit_._splats
+    torch.testing.assert_close(
+        splats.values[[0, 5, 3, 1, 4, 2]],
+        before[1][[3, 3, 3, 4, 4, 2]] / torch.tensor([[3.0], [3], [3], [2], [2], [1]]),
+    )
+    torch.testing.assert_close(splats.factors[[0, 5, 1]], before[0][[3, 3, 4]])
+    torch.testing.assert_close(splats.centres[2:5], before[2][2:5])
+    assert ((splats.centres[[0, 5, 1], None] == points).all(-1).sum(1) == 1).all()
+    assert (fit_._first[0][[0, 5]] == 7).all() and (fit_._second[2][[0, 5]] == 9).all()
+    fit_._move(BirthDeath(torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.int64)))
+    torch.testing.assert_close(splats.values, fit_._splats.values)
+
+
 @pytest.mark.slow
 def test_a_fit_from_one_corner_leaves_it(device):
     points, values = bumps(3, points=400)
@@ -87,7 +135,7 @@ def test_a_fit_from_one_corner_leaves_it(device):
     start = Splats(*(t.to(device) for t in (start.centres, start.factors, start.values)))
     points, values = points.to(device), values.to(device)
     fitted = fit(points, values, start=start, options=FitOptions(steps=600))
-    assert float(fitted.losses[-1]) < 0.2 * float(fitted.losses[0])
+    assert float(fitted.losses[-1]) < 0.01 * float(fitted.losses[0])
     again = fit(points, values, start=start, options=FitOptions(steps=600))
     assert torch.equal(fitted.losses, again.losses)
     torch.testing.assert_close((fitted.splats(points) - values).square().sum().cpu() / len(points), fitted.losses[-1])
@@ -98,7 +146,7 @@ def test_a_fit_without_a_start_in_every_dimension(dims):
     points, values = bumps(1, 200, dims, 3)
     fitted = fit(points, values, 30, FitOptions(steps=150, start_width=0.15))
     assert fitted.losses.shape == (151,)
-    assert float(fitted.losses[-1]) < 0.7 * float(fitted.losses[0])
+    assert float(fitted.losses[-1]) < 0.5 * float(fitted.losses[0])
 
 
 def test_wrong_arguments_are_refused():
