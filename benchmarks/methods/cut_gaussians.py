@@ -1,6 +1,6 @@
 """Pictures of polygons fitted by cut Gaussians and by Gaussians at equal bytes.
 
-    python benchmarks/methods/cut_gaussians.py [--pictures 6] [--splats 40] [--steps 500] [--full] [--device cpu|cuda] [--out FILE]
+    python benchmarks/methods/cut_gaussians.py [--pictures 8] [--splats 32] [--steps 1000] [--full] [--device cpu|cuda] [--out FILE]
 
 A picture has eight random triangles and quadrangles of uniform colours, antialiased by 8x8 samples. A Gaussian has 14 float32
 numbers (as a .ply of degree 0); each curve adds 8. Plain Gaussians get as many splats as give the same bytes. All splats start
@@ -11,8 +11,11 @@ in the same grid, on other pictures than the reported ones. The same search choo
 from __future__ import annotations
 
 import argparse
+import multiprocessing
 import statistics
 import time
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import cv2
@@ -65,11 +68,9 @@ def first_splats(count: int, size: int, picture: torch.Tensor, seed: int) -> Gau
     )  # fmt: skip
 
 
-def fitted_db(
-    picture: torch.Tensor, count: int, curves: int, factor: float, seed: int, chosen: argparse.Namespace
-) -> tuple[float, float]:
-    """Return the PSNR of the fit with edges of 1 pixel, and milliseconds of a step."""
-    size, steps = len(picture), chosen.steps
+def fitted_db(seed: int, count: int, curves: int, factor: float, chosen: argparse.Namespace) -> tuple[float, float]:
+    """Return the PSNR of the fit of a picture with edges of 1 pixel, and milliseconds of a step."""
+    size, steps, picture = chosen.size, chosen.steps, polygons(chosen.size, seed)
     camera = Camera(np.eye(3), size, size, model="ortho")
     scene = first_splats(count, size, picture, seed).to(chosen.device)
     if curves:
@@ -112,15 +113,16 @@ def save(path: Path, fitted: torch.Tensor, picture: torch.Tensor) -> None:
 
 def main() -> None:
     parser = log.options("Pictures of polygons fitted by cut Gaussians and by Gaussians at equal bytes.")
-    parser.add_argument("--pictures", type=int, default=6)
+    parser.add_argument("--pictures", type=int, default=8)
     parser.add_argument(
-        "--chosen-on", type=int, default=3, help="number of other pictures that the rates are chosen on"
+        "--chosen-on", type=int, default=2, help="number of other pictures that the rates are chosen on"
     )
-    parser.add_argument("--splats", type=int, default=40, help="number of cut Gaussians with one curve")
-    parser.add_argument("--curves", default="1,2")
-    parser.add_argument("--steps", type=int, default=500)
-    parser.add_argument("--size", type=int, default=96)
+    parser.add_argument("--splats", type=int, default=32, help="number of cut Gaussians with one curve")
+    parser.add_argument("--curves", default="2")
+    parser.add_argument("--steps", type=int, default=1000)
+    parser.add_argument("--size", type=int, default=64)
     parser.add_argument("--distance", type=float, default=1.5, help="of a curve at the start, in standard deviations")
+    parser.add_argument("--workers", type=int, default=2, help="processes; each fits one picture at a time")
     parser.add_argument("--save", default="", help="folder for the fitted pictures")
     chosen = parser.parse_args()
     if chosen.full:
@@ -129,19 +131,28 @@ def main() -> None:
     counts = {curves: numbers // (NUMBERS + PER_CURVE * curves) for curves in (0, *map(int, chosen.curves.split(",")))}
     others = range(FIRST_CHOICE, FIRST_CHOICE + chosen.chosen_on)
     db, ms, searched, best = {}, {}, {}, {}
-    for curves, count in counts.items():
-        searched[curves] = {
-            factor: round(statistics.mean(fitted_db(polygons(chosen.size, s), count, curves, factor, s, chosen)[0] for s in others), 2)
-            for factor in FACTORS
-        }  # fmt: skip
-        best[curves] = max(searched[curves], key=searched[curves].__getitem__)
-        print(f"{curves} curves: {searched[curves]} dB by the factor on the rates", flush=True)
-        each = [
-            fitted_db(polygons(chosen.size, s), count, curves, best[curves], s, chosen) for s in range(chosen.pictures)
-        ]
-        db[curves] = [round(value, 2) for value, _ in each]
-        ms[curves] = round(statistics.median(value for _, value in each), 1)
-        print(f"{curves} curves, {count} splats: {db[curves]} dB, {ms[curves]} ms a step", flush=True)
+    with ProcessPoolExecutor(chosen.workers, mp_context=multiprocessing.get_context("spawn")) as workers:
+
+        def fits(curves: int, factors: Sequence[float], seeds: Sequence[int]) -> list[tuple[float, float]]:
+            runs = [
+                workers.submit(fitted_db, s, counts[curves], curves, factor, chosen)
+                for factor in factors
+                for s in seeds
+            ]
+            return [run.result() for run in runs]
+
+        for curves, count in counts.items():
+            found = [value for value, _ in fits(curves, FACTORS, others)]
+            searched[curves] = {
+                factor: round(statistics.mean(found[k * chosen.chosen_on : (k + 1) * chosen.chosen_on]), 2)
+                for k, factor in enumerate(FACTORS)
+            }
+            best[curves] = max(searched[curves], key=searched[curves].__getitem__)
+            print(f"{curves} curves: {searched[curves]} dB by the factor on the rates", flush=True)
+            each = fits(curves, [best[curves]], range(chosen.pictures))
+            db[curves] = [round(value, 2) for value, _ in each]
+            ms[curves] = round(statistics.median(value for _, value in each), 1)
+            print(f"{curves} curves, {count} splats: {db[curves]} dB, {ms[curves]} ms a step", flush=True)
     gains = {curves: [round(a - b, 2) for a, b in zip(db[curves], db[0], strict=True)] for curves in db if curves}
     number = max(gains, key=lambda curves: searched[curves][best[curves]])
     log.write(
