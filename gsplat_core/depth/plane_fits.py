@@ -5,7 +5,7 @@ planes to inverse depth, which is linear in picture coordinates for a plane. `fi
 known inverse depths. It then fits local planes to the residual around each pixel, weighted by a wide and then a narrow
 Gaussian window.
 
-Reconstruction from stereo disparities (`with_matched_surface`) shrinks the residual of local planes. Errors of
+A surface through stereo disparities (`smooth_disparity`) shrinks the residual of local planes. Errors of
 disparities are below a tenth of a pixel but correlated over about ten pixels. That is harmless for depth but tilts a
 surface by up to 10 degrees. Planes are therefore fitted in larger windows; the disparity of a plane is linear in
 picture coordinates. The residual, folds and edges, is kept by the share of its variance that exceeds the noise
@@ -19,11 +19,6 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-
-from gsplat_core.depth.maps import possible_depth
-from gsplat_core.depth.stereo import reach_of, variance_px2
-from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.frames import Frame
 
 Sums = NDArray[np.floating[Any]]
 
@@ -225,30 +220,6 @@ pictures. It is added to the variance that the matcher estimates.
 """
 
 
-def with_matched_surface(frame: Frame, camera: Camera) -> Frame:
-    """Replace the stereo depth of a frame by a reconstructed surface.
-
-    Pixels without possible depth, such as tools and their surroundings, keep their depth and are ignored by the fit.
-
-    Args:
-        frame: frame with stereo depth and confidence.
-        camera: left camera.
-
-    Returns:
-        The frame with the depth of the surface; unchanged without depth, confidence or a pixel to fit.
-    """
-    if frame.depth is None or frame.depth_confidence is None:
-        return frame
-    known = (possible_depth(frame) > 0) & (frame.depth > 0) & (frame.depth_confidence > 0)
-    if not known.any():
-        return frame
-    reach = reach_of(frame, camera)
-    disparity = np.where(known, reach / np.where(known, frame.depth, 1), 0).astype(np.float32)
-    variance = variance_px2(np.where(known, frame.depth_confidence, 1), frame.width_px, ALIKE_PX2)
-    surface = smooth_disparity(disparity, known, variance)
-    return frame.with_fields(depth=np.where(known, reach / surface, frame.depth).astype(np.float32))
-
-
 def smooth_disparity(disparity: Plane, known: NDArray[np.bool_], variance: Plane) -> Plane:
     """Fit a surface to disparities.
 
@@ -263,32 +234,53 @@ def smooth_disparity(disparity: Plane, known: NDArray[np.bool_], variance: Plane
     least = float(variance[known].min())
     weight = np.where(known, least / variance, 0).astype(np.float32)
     values = np.where(known, disparity, 1).astype(np.float32)
-    rough = np.asarray(1 / filled_depth(np.asarray(1 / values, np.float32), known), np.float32)
-    surface = rough + _fitted_planes(values - rough, weight)
+    rough = rough_disparity(values, known)
+    surface = rough + fitted_planes(values - rough, weight, WINDOW)
     rest = np.where(known, values - surface, 0)
-    surface = surface + rest * _share_beyond_noise(rest, weight, least)
+    surface = surface + rest * share_beyond_noise(rest, weight, least)
     low, high = float(values[known].min()), float(values[known].max())
     return np.asarray(np.clip(surface, low / 2, 2 * high), np.float32)
 
 
-def _fitted_planes(values: Plane, weight: Plane) -> Plane:
-    """Return the weighted plane fit around each pixel, evaluated at the pixel [H, W]."""
+def rough_disparity(values: Plane, known: NDArray[np.bool_]) -> Plane:
+    """Return a smooth extrapolation of disparities [H, W], positive where known, to all pixels (`filled_depth`)."""
+    return np.asarray(1 / filled_depth(np.asarray(1 / values, np.float32), known), np.float32)
+
+
+def fitted_planes(values: Plane, weight: Plane, window: float) -> Plane:
+    """Return the weighted plane fit around each pixel, evaluated at the pixel.
+
+    Args:
+        values: float32 [H, W].
+        weight: float32 [H, W], 0 to 1.
+        window: standard deviation of the Gaussian window as a share of the width.
+
+    Returns:
+        float32 [H, W]; shrunk towards zero where little of the window is known.
+    """
     height, width = values.shape
-    cells = min(width, round(CELLS_A_WINDOW / WINDOW))
+    cells = min(width, max(1, round(CELLS_A_WINDOW / window)))
     grid = cells, max(1, round(cells * height / width))
     counted = np.asarray(cv2.resize(weight, grid, interpolation=cv2.INTER_AREA), np.float32)
     total = np.asarray(cv2.resize(values * weight, grid, interpolation=cv2.INTER_AREA), np.float32)
     mean = np.asarray(total / np.maximum(counted, 1e-9), np.float32)
-    plane = local_plane(mean, counted, max(1.0, WINDOW * cells))
+    plane = local_plane(mean, counted, max(1.0, window * cells))
     return np.asarray(cv2.resize(plane, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
 
 
-def _share_beyond_noise(rest: Plane, weight: Plane, least: float) -> Plane:
-    """Return the share of the residual that exceeds noise, 0 to 1 [H, W], from its locally weighted
-    variance and the noise variance `least`.
+def share_beyond_noise(rest: Plane, weight: Plane, noise: float) -> Plane:
+    """Return the share of a residual that exceeds noise, from its locally weighted variance.
+
+    Args:
+        rest: residual float32 [H, W].
+        weight: float32 [H, W], `noise` divided by the variance of the residual's noise; 0 where unknown.
+        noise: smallest variance of the noise.
+
+    Returns:
+        float32 [H, W], 0 to 1.
     """
     sigma = max(1.0, WINDOW * rest.shape[1] / 2)
     mean = lambda plane: cv2.GaussianBlur(plane.astype(np.float32), (0, 0), sigma, borderType=cv2.BORDER_CONSTANT)
-    # Weights are `least` / variance, so weight times squared noise has the mean `least` at every known pixel.
-    found, noise = mean(weight * rest * rest), least * mean((weight > 0).astype(np.float32))
-    return np.asarray(np.clip(1 - noise / np.maximum(found, 1e-12), 0, 1), np.float32)
+    # Weight times squared noise has the mean `noise` at every known pixel.
+    found, explained = mean(weight * rest * rest), noise * mean((weight > 0).astype(np.float32))
+    return np.asarray(np.clip(1 - explained / np.maximum(found, 1e-12), 0, 1), np.float32)

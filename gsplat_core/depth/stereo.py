@@ -430,7 +430,7 @@ class StereoDepth(Estimator):
         It combines the error of matching with that of the calibration. The calibration is assumed to be wrong along
         the rows by as much as across them, which the pictures show.
         """
-        beside = float(np.median(self._rows, axis=0)[0]) / _shrink(frame.width_px) if self._rows else 0.0
+        beside = float(np.median(self._rows, axis=0)[0]) / shrink_of(frame.width_px) if self._rows else 0.0
         return _depth_error(variance_px2(found.confidence, frame.width_px, beside**2), found.depth, frame, camera)
 
     def _look(self, left: NDArray[np.uint8], right: NDArray[np.uint8], frame: Frame, parallel_px: float) -> PairLook:
@@ -460,7 +460,7 @@ class StereoDepth(Estimator):
         """Return the search range of disparities with its margins, in pixels of the reduced pictures that are matched."""
         assert self._span is not None
         low, high = self._span
-        shrink = _shrink(width_px)
+        shrink = shrink_of(width_px)
         low, high = _widened((low, high))
         return Span.around(low / shrink, high / shrink)
 
@@ -476,8 +476,8 @@ class StereoDepth(Estimator):
         """Match the pair in the search range `span` and return depth and confidence, stacked as [2, H, W]."""
         assert self._span is not None
         rows = np.median(self._rows, axis=0)
-        aligned = _with_rows_of_left(right, rows, sum(self._span) / 2)
-        shrink = _shrink(frame.width_px)
+        aligned = with_rows_of_left(right, rows, sum(self._span) / 2)
+        shrink = shrink_of(frame.width_px)
         small = [shrunk(each, shrink) for each in (left, aligned, frame.image)]
         with self._on_own_stream():
             here, there, guide = _tensors_of(small, self._device)
@@ -547,7 +547,7 @@ def _widened(span: tuple[float, float]) -> tuple[float, float]:
     return span[0] - margin, span[1] + margin
 
 
-def _shrink(width_px: int) -> int:
+def shrink_of(width_px: int) -> int:
     """Return the integer factor by which pictures are reduced for matching."""
     return -(-width_px // MATCHED_WIDTH_PX)
 
@@ -564,7 +564,7 @@ def variance_px2(confidence: NDArray[np.float32], width_px: int, beside: float) 
         float32 [H, W] in squared pixels of pictures of `width_px`.
     """
     own = HALF_BELIEVED_PX**2 * (1 / np.maximum(confidence, np.float32(1e-6)) - 1)
-    return np.asarray(_shrink(width_px) ** 2 * (own + beside), np.float32)
+    return np.asarray(shrink_of(width_px) ** 2 * (own + beside), np.float32)
 
 
 def grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -621,7 +621,7 @@ def _why_wrong(found: DepthMap, look: PairLook, frame: Frame, camera: Camera, pa
         return None
     disparity = reach_of(frame, camera) / depth[known] + parallel_px
     spread = np.sqrt(variance_px2(confidence[known], frame.width_px, 0.0) + look.error_px**2)
-    spread = np.maximum(spread, HALF_BELIEVED_PX * _shrink(frame.width_px))
+    spread = np.maximum(spread, HALF_BELIEVED_PX * shrink_of(frame.width_px))
     outside = float((np.abs(disparity - look.disparities[known]) > HALF_OF_90 * spread).mean())
     chance = ONE_PERCENT * float(np.sqrt(outside * (1 - outside) / known.sum()))
     if outside - chance <= MOST_OUTSIDE:
@@ -679,7 +679,7 @@ def _off_along_rows(rows: NDArray[np.float64], height: int, width: int, device: 
     return torch.hypot(float(rows[1]) * height / width * y, float(rows[2]) * width / height * x)
 
 
-def _with_rows_of_left(right: NDArray[np.uint8], rows: NDArray[np.float64], disparity_px: float) -> NDArray[np.uint8]:
+def with_rows_of_left(right: NDArray[np.uint8], rows: NDArray[np.float64], disparity_px: float) -> NDArray[np.uint8]:
     """Warp the right picture so that points with this disparity are in the same row as in the left one. No change if
     the absolute values of `rows` (as in `PairLook`) sum up to less than `ROWS_FROM_PX`.
     """

@@ -77,7 +77,7 @@ MEASURED = DepthOrigin(
 )  # fmt: skip
 STEREO = DepthOrigin(
     "stereo", 0.0125, "calibrated", loss_weight_offline=10.0, right_share_offline=1.0, least_confidence=0.03,
-    edge_margin_px=2, tool_margin_px=4, surface="gsplat_core.depth.plane_fits:with_matched_surface",
+    edge_margin_px=2, tool_margin_px=4, surface="gsplat_core.depth.pair_surface:with_matched_surface",
 )  # fmt: skip
 PARALLAX = DepthOrigin("parallax", 0.05, is_of_still_tissue=True)
 LIGHT = DepthOrigin("light", 0.15, initialises_only=True)

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from gsplat_core.depth.maps import with_surface
-from gsplat_core.depth.plane_fits import ALIKE_PX2, smooth_disparity, with_matched_surface
+from gsplat_core.depth.pair_surface import with_matched_surface
+from gsplat_core.depth.plane_fits import ALIKE_PX2, smooth_disparity
 from gsplat_core.depth.stereo import variance_px2
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DEPTH_ORIGINS, Frame

@@ -118,22 +118,22 @@ def test_only_what_exceeds_noise_is_kept():
     rng = np.random.default_rng(0)
     weight, noise = np.ones((80, 120), np.float32), rng.normal(0, 1, (80, 120)).astype(np.float32)
     for factor, share in ((0.5, 0.0), (1.0, 0.0), (2.0, 0.75), (10.0, 0.99)):
-        found = plane_fits._share_beyond_noise(factor * noise, weight, 1.0)
+        found = plane_fits.share_beyond_noise(factor * noise, weight, 1.0)
         assert found[10:-10, 10:-10].mean() == pytest.approx(share, abs=0.08)
         assert found.min() >= 0 and found.max() <= 1
-    assert not plane_fits._share_beyond_noise(np.zeros((80, 120), np.float32), weight, 1.0).any()
+    assert not plane_fits.share_beyond_noise(np.zeros((80, 120), np.float32), weight, 1.0).any()
 
 
 @pytest.mark.parametrize("shape", [(80, 120), (120, 80), (12, 9)])
 def test_windows_of_a_plane_have_the_plane(shape):
     y, x = np.mgrid[: shape[0], : shape[1]].astype(np.float32)
     values, weight = 5 + 0.02 * x - 0.03 * y, np.ones(shape, np.float32)
-    found = plane_fits._fitted_planes(values, weight)
+    found = plane_fits.fitted_planes(values, weight, plane_fits.WINDOW)
     ratio = found / values  # a fiftieth less, as where little is known
     assert found.shape == shape and 0.9 < ratio.min() < 0.99 and ratio.max() < 1.01
     assert np.abs(np.median(ratio) - 1 / 1.02) < 0.005
     weight[:, : shape[1] // 2] = 0
-    assert np.isfinite(plane_fits._fitted_planes(values, weight)).all()
+    assert np.isfinite(plane_fits.fitted_planes(values, weight, plane_fits.WINDOW)).all()
 
 
 def test_a_plane_through_all_values_is_that_of_least_squares_and_level_where_few_are_known():

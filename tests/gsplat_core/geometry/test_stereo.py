@@ -265,7 +265,7 @@ def test_the_span_has_a_fifth_and_four_pixels_of_margin():
 
 @pytest.mark.parametrize(("width", "factor"), [(100, 1), (800, 1), (801, 2), (1600, 2), (1601, 3)])
 def test_pictures_wider_than_800_pixels_are_matched_smaller(width, factor):
-    assert stereo._shrink(width) == factor
+    assert stereo.shrink_of(width) == factor
 
 
 @pytest.mark.parametrize(("confidence", "width", "variance"), [(0.5, 640, 0.25), (0.2, 640, 1.0), (0.5, 1280, 1.0), (1.0, 640, 0.0)])  # fmt: skip
@@ -273,7 +273,7 @@ def test_variance_of_a_disparity_is_that_of_half_a_pixel_at_half_a_confidence(co
     found = stereo.variance_px2(np.full((1, 1), confidence, np.float32), width, 0.0)
     assert found[0, 0] == pytest.approx(variance)
     beside = stereo.variance_px2(np.full((1, 1), confidence, np.float32), width, 2.0)
-    assert beside[0, 0] == pytest.approx(variance + 2.0 * stereo._shrink(width) ** 2)
+    assert beside[0, 0] == pytest.approx(variance + 2.0 * stereo.shrink_of(width) ** 2)
 
 
 def right_camera(turn=0.0, up=0.0, focal=1.0, row=0.0, baseline=BASELINE_MM):
