@@ -120,9 +120,10 @@ def _compared_surface(frame: Frame, camera: Camera, disparity: Plane, known: Mas
     parallel_px = 0.0 if frame.right_camera is None else float(camera.K[0, 2] - frame.right_camera.K[0, 2])
     aligned = with_rows_of_left(right, look.rows, float(np.median(look.disparities)))
     shrink = shrink_of(frame.width_px)
-    matched = known & ~highlights(left)
+    bright = highlights(left)
+    matched = known & ~bright
     start = first_planes(disparity, matched if matched.any() else known, variance)
-    usable, hidden = known & ~grown(highlights(left), GROWN), grown(highlights(aligned), GROWN)
+    usable, hidden = known & ~grown(bright, GROWN), grown(highlights(aligned), GROWN)
     if frame.mask is not None:
         usable &= ~grown(frame.mask == 0, TOOL_MARGIN)
     reduced = lambda plane: shrunk_plane(plane, shrink)

@@ -394,8 +394,9 @@ def to_fit(frames: list[Frame], observation_of: Callable[[Frame], Observation], 
     """
     seen = observed(frames, observation_of)
     cameras = [each.camera for each in seen]
-    for number, (frame, camera) in enumerate(zip(frames, cameras, strict=True)):
-        surface = with_surface(frame, camera)
+    with ThreadPoolExecutor(usable_cores(), thread_name_prefix="surface") as pool:
+        surfaces = list(pool.map(with_surface, frames, cameras))
+    for number, (frame, surface) in enumerate(zip(frames, surfaces, strict=True)):
         if surface is not frame:
             frames[number], seen[number] = surface, observation_of(surface)
     estimator = None if depth is None else new_estimator(depth)
