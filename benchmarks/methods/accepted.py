@@ -112,7 +112,7 @@ METHODS = (
             figure("wall at 60°: error of ray depth", "wall 60 deg: ray depth, largest error %", "", unit="%", note="likely the limit to 3 standard deviations; not tested separately"),
             figure("stereo: depth against today", "stereo: ray_depth,normal_consistency, ray depth, RMS %", "at most 0.9 of today's", 3, unit="%"),
             figure("stereo: depth today", "stereo: today, ray depth, RMS %", "", 3, unit="%"),
-            figure("stereo: normals", "stereo: ray_depth,normal_consistency, normals of ray depth, mean deg", "at most 4.5", unit="°", note="on a CPU, 4 seeds of 160x128 and 600 steps: 5.40° with the losses in one of 4 steps, 5.38° in one of 8 (used), 6.25° without ([log](../logs/cpu-2026-11-27-ray-interval/stereo.jsonl))"),
+            figure("stereo: normals", "stereo: ray_depth,normal_consistency, normals of ray depth, mean deg", "at most 4.5", unit="°", note="on a CPU, 4 seeds of 160x128 and 600 steps: 4.29° with the losses, 5.27° without, depth 0.547 % and 0.594 % ([log](../logs/methods/surface-stereo-cpu.json)). Before the surface of stereo depth was fitted to the pictures of both eyes: 5.40° with the losses in one of 4 steps, 5.38° in one of 8 (used), 6.25° without ([log](../logs/cpu-2026-11-27-ray-interval/stereo.jsonl))"),
             figure("stereo: normals today", "stereo: today, normals of ray depth, mean deg", "", unit="°"),
             figure("stereo: third view against today", "stereo: ray_depth,normal_consistency, third view, dB", "at least -0.3 dB", unit="dB"),
             figure("stereo: third view today", "stereo: today, third view, dB", "", unit="dB"),
