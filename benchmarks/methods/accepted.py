@@ -282,8 +282,8 @@ def training(folder: Path) -> str:
         return ""
     lines = [
         "| recording | trained with | held out (dB) | neighbours' mean (dB) | depth RMS (%) | plane (%) | normals (°)"
-        " | followed points (mm) | command (s) |",
-        "|---" * 9 + "|",
+        " | followed points (mm) | step (ms) | command (s) |",
+        "|---" * 10 + "|",
     ]
     for name, variants in log.items():
         if not isinstance(variants, dict) or "alpha" not in variants:
@@ -292,7 +292,8 @@ def training(folder: Path) -> str:
             numbers = [
                 (found.get("heldout_db"), 1, 2), (found.get("neighbours_mean_db"), 1, 2),
                 (found.get("depth_rmse_share"), 100, 3), (found.get("plane_rmse_share"), 100, 2),
-                (found.get("normals_mean_deg"), 1, 2), (found.get("points_mean_mm"), 1, 3), (found.get("wall_s"), 1, 0),
+                (found.get("normals_mean_deg"), 1, 2), (found.get("points_mean_mm"), 1, 3),
+                (found.get("step_ms"), 1, 2), (found.get("wall_s"), 1, 0),
             ]  # fmt: skip
             cells = ["–" if value is None else f"{value * scale:.{digits}f}" for value, scale, digits in numbers]
             lines.append(f"| {name} | {variant} | " + " | ".join(cells) + " |")
