@@ -1,6 +1,6 @@
 """Depth of a narrow-baseline scene with and without a simulated range sensor.
 
-    python benchmarks/methods/range_sensors.py [--steps 300] [--full] [--device cpu|cuda] [--out FILE]
+    python benchmarks/methods/range_sensors.py [--steps N] [--full] [--device cpu|cuda] [--out FILE]
 
 A textured relief is seen by eight cameras within 1 mm at a distance of 60 mm; the scope turns about its axis between them. Training starts from a plane. The sensor has 256
 bins and Poisson noise; its true histograms come from the true depth maps. The depth-axis Chamfer distance is the mean of two
@@ -78,12 +78,13 @@ def chamfer(scene: Gaussians, extent: float) -> float:
 
 def main() -> None:
     parser = log.options("Depth of a narrow-baseline scene with and without a range sensor.")
-    parser.add_argument("--steps", type=int, default=300)
+    parser.add_argument("--steps", type=int, default=0, help="0 for 300, or 1,200 with --full")
     parser.add_argument("--photons", type=float, default=1000.0, help="expected returns of a column")
     parser.add_argument("--weight", type=float, default=RangeLoss.default_weight)
     parser.add_argument("--also", default="", help="further losses, with and without a sensor; comma-separated")
     parser.add_argument("--sensors", default="time_of_flight,structured_light,oct_line")
     chosen = parser.parse_args()
+    chosen.steps = chosen.steps or (1200 if chosen.full else 300)
     size, side = (256, 120) if chosen.full else (48, 30)
     device, extent = chosen.device, 26.0
     focal = size * 60.0 / 52.0
