@@ -55,7 +55,7 @@ class Method:
 SIZES = ("1M", "10M", "50M", "106M")
 TIMES = {
     "alpha": "alpha_ms", "stochastic, 1 sample": "stochastic_1_ms", "4 samples": "stochastic_4_ms",
-    "16 samples": "stochastic_16_ms", "points": "points_1_ms", "weighted sum": "weighted_sum_ms", "gsplat": "gsplat_ms",
+    "16 samples": "stochastic_16_ms", "points": "points_1_ms", "weighted sum": "weighted_sum_ms",
     "stochastic to 35 dB": "stochastic_to_35_db.ms", "points to 35 dB": "points_to_35_db.ms",
 }  # fmt: skip
 METHODS = (
@@ -247,23 +247,26 @@ def section(method: Method, folder: Path) -> str:
 
 
 def speed(folder: Path) -> str:
-    """Return the frame times by number of splats."""
+    """Return the frame times by number of splats. Those of gsplat are from the log of a run in which it was installed."""
     log = log_of("stochastic", "cuda", folder)
+    beside = log_of("stochastic-gsplat", "cuda", folder)
     if log is None:
         return ""
-    lines = ["| splats | " + " | ".join(TIMES) + " | peak memory (MB) |", "|---" * (len(TIMES) + 2) + "|"]
+    columns = [*TIMES, *(("gsplat", "alpha beside gsplat") if beside else ())]
+    lines = ["| splats | " + " | ".join(columns) + " | peak memory (MB) |", "|---" * (len(columns) + 2) + "|"]
     for size in SIZES:
-        cells = []
-        for path in TIMES.values():
-            value = value_at(log, (f"speed_{size}", path))
-            cells.append(f"{value:.1f}" if isinstance(value, int | float) else "–")
+        found = [value_at(log, (f"speed_{size}", path)) for path in TIMES.values()]
+        if beside:
+            found += [value_at(beside, (f"speed_{size}", path)) for path in ("gsplat_ms", "alpha_ms")]
+        cells = [f"{value:.1f}" if isinstance(value, int | float) else "–" for value in found]
         peak = value_at(log, (f"speed_{size}", "memory_stochastic_1.peak_mb"))
         lines.append(f"| {size} | " + " | ".join(cells) + f" | {'–' if peak is None else f'{peak:.0f}'} |")
     text = (
         "Milliseconds a frame of 1920x1080 on one GPU, of random scenes of degree 3. A dash: not measured in this run."
         " Required is one sample faster than alpha and gsplat from 10 million splats on."
     )
-    return "## Frame times\n\n" + text + "\n\n" + "\n".join(lines) + "\n\n" + provenance({"cuda": [log]})
+    logs = {"cuda": [log], **({"gsplat": [beside]} if beside else {})}
+    return "## Frame times\n\n" + text + "\n\n" + "\n".join(lines) + "\n\n" + provenance(logs)
 
 
 def training(folder: Path) -> str:
