@@ -248,7 +248,7 @@ def renderer_ms(name: str, model: Model, options: RendererOptions | None, repeti
 def gsplat_ms(gaussians: Gaussians, camera: Camera, device: str, repetitions: int) -> float | str:
     """Return the frame time of gsplat, if it is installed."""
     try:
-        rasterization = importlib.import_module("gsplat").rasterization
+        rasterization = importlib.import_module("gsplat.rendering").rasterization
     except ImportError:
         return "not installed"
     viewmat, K = camera.matrices(gaussians.device)
