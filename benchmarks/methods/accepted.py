@@ -163,7 +163,7 @@ METHODS = (
     Method(
         "7. Range sensors", "range_sensors",
         (
-            figure("time of flight: depth Chamfer against the camera alone", "time_of_flight_ratio", "at most 0.5", 3, note="at 256 pixels the parallax of 1 mm improves the camera alone: 1.71 mm after 300 steps, 1.52 after 1,200, 1.18 after 3,000; with the sensor 1.09, 0.80, 0.77"),
+            figure("time of flight: depth Chamfer against the camera alone", "time_of_flight_ratio", "at most 0.5", 3, note="at 256 pixels the parallax of 1 mm improves the camera alone: 1.71 mm after 300 steps, 1.52 after 1,200, 1.18 after 3,000; with the sensor 1.09, 0.80, 0.77 ([logs](../logs/h100-2026-11-28-methods))"),
             figure("structured light", "structured_light_ratio", "at most 0.5", 3),
             figure("OCT line", "oct_line_ratio", "at most 0.5", 3, note="one line constrains only the splats that it crosses"),
         ),
@@ -272,7 +272,8 @@ def speed(folder: Path) -> str:
         lines.append(f"| {size} | " + " | ".join(cells) + f" | {'–' if peak is None else f'{peak:.0f}'} |")
     text = (
         "Milliseconds a frame of 1920x1080 on one GPU, of random scenes of degree 3. A dash: not measured in this run."
-        " Required is one sample faster than alpha and gsplat from 10 million splats on."
+        " Required is one sample faster than alpha and gsplat from 10 million splats on. The times of weighted sums are from before"
+        " one op rendered their frame (section 3 has the present time at a million splats)."
     )
     logs = {"cuda": [log], **({"gsplat": [beside]} if beside else {})}
     return "## Frame times\n\n" + text + "\n\n" + "\n".join(lines) + "\n\n" + provenance(logs)
