@@ -59,6 +59,8 @@ def safetensors_pieces(tensors: Mapping[str, Tensor]) -> Iterator[bytes | memory
             yield values[first : first + PIECE_BYTES]
 
 
+RUN_MODEL = "model"
+"""Name of the model's folder in the folder of a run, which is proposed where the latter is given."""
 TENSORS, NEXT_TENSORS = "model.safetensors", "model.next.safetensors"
 MANIFEST, NEXT_MANIFEST = "manifest.json", "manifest.next.json"
 MAX_HEADER_BYTES = 1 << 20
@@ -128,6 +130,8 @@ def load_bundle(folder: str | Path) -> Model:
         raise BundleError(
             f"{folder} is a file, and a model is a folder with {TENSORS} and {MANIFEST}; give that folder"
         )
+    if not os.path.lexists(path) and os.path.isfile(folder / RUN_MODEL / TENSORS):
+        raise BundleError(f"{folder} is the folder of a run, whose model is {folder / RUN_MODEL}; give that folder")
     try:
         with open_model_file(path, folder) as file:
             size = os.fstat(file.fileno()).st_size

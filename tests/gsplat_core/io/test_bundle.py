@@ -147,6 +147,12 @@ def test_the_folder_holds_two_files_and_the_manifest_says_what_is_in_them(make_g
     assert manifest["tensors"]["bytes"] == (tmp_path / "model.safetensors").stat().st_size
 
 
+def test_the_folder_of_a_run_is_answered_by_that_of_its_model(make_gaussians, tmp_path):
+    save_bundle(make_model(make_gaussians(6)), tmp_path / "model")
+    with pytest.raises(BundleError, match=r"is the folder of a run, whose model is .*model; give that folder"):
+        load_bundle(tmp_path)
+
+
 def test_saving_again_replaces_the_model(make_gaussians, tmp_path):
     save_bundle(make_model(make_gaussians(6), version=1), tmp_path)
     save_bundle(make_model(make_gaussians(9), version=2), tmp_path)
