@@ -70,7 +70,7 @@ class WeightedSumRenderer:
     """
 
     has_whole_frame: ClassVar[bool] = True
-    """Whether `render_weighted_frame` computes the weights of this class."""
+    """True if the op `render_weighted_frame` renders the pictures of this class on a GPU, False if it has other weights."""
 
     def __init__(
         self, camera: Camera, device: torch.device, *, precision: Precision = "fp32", background: Tensor | None = None
