@@ -241,6 +241,7 @@ def provenance(logs: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
         log, machine = runs[0], runs[0]["machine"]
         name = machine.get("gpu") or f"{machine['cpu']}, {machine['cores']} cores"
         count = f", {len(runs)} runs" if len(runs) > 1 else ""
+        count += ", copied from the printed lines because the file was lost" if "copied_from" in log else ""
         parts.append(f"{device}: commit {log['commit']}, {log['date']}, {name}{count}, `{log['command']}`")
     return "; ".join(parts)
 
@@ -305,6 +306,7 @@ def training(folder: Path) -> str:
         f"`intrasplat reconstruct` with {log['steps']} steps, {log['together']} runs at a time. The synthetic recordings"
         " have exact depth. Depth and followed points of weighted sums are not evaluated: they have no depth along a ray."
     )
+    text += f" Missing: {log['missing']}." if "missing" in log else ""
     return "## Training\n\n" + text + "\n\n" + "\n".join(lines) + "\n\n" + provenance({"run": [log]})
 
 
