@@ -56,7 +56,7 @@ SIZES = ("1M", "10M", "50M", "106M")
 TIMES = {
     "alpha": "alpha_ms", "stochastic, 1 sample": "stochastic_1_ms", "4 samples": "stochastic_4_ms",
     "16 samples": "stochastic_16_ms", "points": "points_1_ms", "weighted sum": "weighted_sum_ms",
-    "stochastic to 35 dB": "stochastic_to_35_db.ms", "points to 35 dB": "points_to_35_db.ms",
+    "stochastic to 35 dB": "stochastic_to_35_db.ms", "points to 35 dB": "points_to_35_db.ms", "gsplat 1.5.3": "gsplat_ms",
 }  # fmt: skip
 METHODS = (
     Method(
@@ -257,27 +257,43 @@ def section(method: Method, folder: Path) -> str:
 
 
 def speed(folder: Path) -> str:
-    """Return the frame times by number of splats. Those of gsplat are from the log of a run in which it was installed."""
+    """Return the frame times by number of splats."""
     log = log_of("stochastic", "cuda", folder)
-    beside = log_of("stochastic-gsplat", "cuda", folder)
     if log is None:
         return ""
-    columns = [*TIMES, *(("gsplat", "alpha beside gsplat") if beside else ())]
-    lines = ["| splats | " + " | ".join(columns) + " | peak memory (MB) |", "|---" * (len(columns) + 2) + "|"]
+    lines = ["| splats | " + " | ".join(TIMES) + " | peak memory (MB) |", "|---" * (len(TIMES) + 2) + "|"]
     for size in SIZES:
         found = [value_at(log, (f"speed_{size}", path)) for path in TIMES.values()]
-        if beside:
-            found += [value_at(beside, (f"speed_{size}", path)) for path in ("gsplat_ms", "alpha_ms")]
         cells = [f"{value:.1f}" if isinstance(value, int | float) else "–" for value in found]
         peak = value_at(log, (f"speed_{size}", "memory_stochastic_1.peak_mb"))
         lines.append(f"| {size} | " + " | ".join(cells) + f" | {'–' if peak is None else f'{peak:.0f}'} |")
     text = (
         "Milliseconds a frame of 1920x1080 on one GPU, of random scenes of degree 3. A dash: not measured in this run."
-        " Required is one sample faster than alpha and gsplat from 10 million splats on. The times of weighted sums are from before"
-        " one op rendered their frame (section 3 has the present time at a million splats)."
+        " Required is one sample faster than alpha and gsplat from 10 million splats on."
     )
-    logs = {"cuda": [log], **({"gsplat": [beside]} if beside else {})}
-    return "## Frame times\n\n" + text + "\n\n" + "\n".join(lines) + "\n\n" + provenance(logs)
+    return "## Frame times\n\n" + text + "\n\n" + "\n".join(lines) + "\n\n" + provenance({"cuda": [log]})
+
+
+def unchanged(folder: Path) -> str:
+    """Return the comparison of rendering, replay and live with the commit before the methods."""
+    log = log_of("unchanged", "cuda", folder)
+    if log is None:
+        return ""
+    lines = ["| figure | before | now | worst before | worst now | now / before |", "|---|---|---|---|---|---|"]
+    for work, figures in log.items():
+        if not isinstance(figures, dict) or work == "machine":
+            continue
+        for what, row in figures.items():
+            cells = [
+                "–" if row.get(key) is None else f"{row[key]:.4g}"
+                for key in ("old", "new", "old_worst", "new_worst", "ratio")
+            ]
+            lines.append(f"| {work}: {what} | " + " | ".join(cells) + " |")
+    text = (
+        f"Medians of {log['runs']} runs in turn on one machine of {log['old_commit']}, the last commit before the methods, and of"
+        " the newer commit. Live and replay changed for other reasons too ([live.md](live.md))."
+    )
+    return "## Without the methods\n\n" + text + "\n\n" + "\n".join(lines) + "\n\n" + provenance({"cuda": [log]})
 
 
 def training(folder: Path) -> str:
@@ -319,5 +335,5 @@ def methods_text(folder: Path = FOLDER) -> str:
         " the losses ray_depth, normal_consistency, flow, triangulation and range were chosen on the synthetic scenes that"
         " these tables evaluate, so their figures may be too favourable for other scenes."
     )
-    parts = [head, *(section(method, folder) for method in METHODS), speed(folder), training(folder)]
+    parts = [head, *(section(method, folder) for method in METHODS), speed(folder), training(folder), unchanged(folder)]
     return "\n\n".join(part for part in parts if part) + "\n"
