@@ -31,7 +31,7 @@ if [ -n "${GSPLAT_WHEEL:-}" ]; then
   "$python" benchmarks/peers/build_gsplat.py "$GSPLAT_WHEEL" build/peers > "$out/build-gsplat.txt" 2>&1 &
   compiled+=" $!"
 fi
-benchmarks/gpu_tests.sh -q > "$out/tests.txt" 2>&1
+benchmarks/gpu_tests.sh > "$out/tests.txt" 2>&1
 echo "tests: exit code $?, at $((SECONDS - began)) s" | tee -a "$out/progress.txt"
 # shellcheck disable=SC2086 # a list of numbers
 [ -z "$compiled" ] || wait $compiled

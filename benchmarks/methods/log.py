@@ -42,6 +42,7 @@ def write(method: str, chosen: argparse.Namespace, figures: Mapping[str, Any], f
         return
     stated = re.sub(r" --out \S+", "", " ".join(["python", f"benchmarks/{folder}/{method}.py", *sys.argv[1:]]))
     stated = re.sub(r"\S*/recordings/", "{recordings}/", stated)
+    stated = re.sub(r"(?<= )/(?:\S*/)?([^/\s]+)", r"{\1}", stated)  # other folders of this machine
     about = {
         "benchmark": f"{folder}/{method}",
         "command": stated,
