@@ -151,7 +151,7 @@ def batch(
     json: JsonOption = False,
 ) -> int:
     """Replay every recording of a folder. A repeated call continues an interrupted batch."""
-    from services.cli.runs import batch_command
+    from services.cli.batch import batch_command
 
     return batch_command(folder, out, workers, options, as_json=json)
 

@@ -74,7 +74,7 @@ def given(monkeypatch, tmp_path):
         monkeypatch.setattr("operators.applications.reconstruct.ReconstructSettings", keep)
         monkeypatch.setattr("services.cli.runs.live_settings", keep)
         monkeypatch.setattr(
-            "services.cli.runs.batch_command", lambda folder, out, workers, options, **_: keep(**options)
+            "services.cli.batch.batch_command", lambda folder, out, workers, options, **_: keep(**options)
         )
         where = ["--out", str(tmp_path / "out")] if command in ("replay", "reconstruct") else []
         monkeypatch.setattr(

@@ -49,6 +49,12 @@ def test_importing_the_command_is_quick_because_it_imports_nothing_heavy():
     assert (done.stdout.splitlines()[0], done.stdout.splitlines()[-1]) == ("[]", "[]")
 
 
+def test_runs_do_not_load_the_database_of_the_service():
+    code = "import sys, services.cli.runs; print(sorted({'sqlalchemy', 'alembic', 'fastapi'} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
 def commands(group, path=()):
     """Yield the words of every command and its parameters."""
     for name, command in group.commands.items():

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from gsplat_core.errors import InvalidSetting
-from services.cli import runs
+from services.cli import batch
 from services.cli.terminal import BAD_INPUT, INTERRUPTED, NOTHING_SHOWN, OK
 from services.jobs.batch import Summary
 
@@ -41,12 +41,12 @@ def run(monkeypatch, tmp_path):
                 seen.update(settings=settings)
                 return summary
 
-        monkeypatch.setattr(runs, "Batch", Batch)
-        monkeypatch.setattr(runs, "new_runner", lambda _: None)
-        monkeypatch.setattr(runs, "_Asked", lambda: lambda: asked)
-        monkeypatch.setattr(runs, "_checked", lambda options: options)
-        monkeypatch.setattr(runs.os, "cpu_count", lambda: cores)
-        return runs.batch_command(tmp_path / "recs", None, workers, {"device": device}, as_json=False)
+        monkeypatch.setattr(batch, "Batch", Batch)
+        monkeypatch.setattr(batch, "new_runner", lambda _: None)
+        monkeypatch.setattr(batch, "_Asked", lambda: lambda: asked)
+        monkeypatch.setattr(batch, "_checked", lambda options: options)
+        monkeypatch.setattr(batch.os, "cpu_count", lambda: cores)
+        return batch.batch_command(tmp_path / "recs", None, workers, {"device": device}, as_json=False)
 
     start.seen = seen  # type: ignore[attr-defined]
     return start
@@ -85,11 +85,11 @@ def test_cores_are_shared_by_the_workers(run, cores, workers, device, expected):
 
 def test_the_summary_in_words_and_as_json(capsys):
     summary = Summary(counts(done=3, failed=1), 1, failed("bad\nname"), 2.04, [("y\x1b", "is no recording")])
-    runs._print(summary, Path("out"), as_json=False)
+    batch._print(summary, Path("out"), as_json=False)
     said = capsys.readouterr()
     assert said.out == "3 of 5 recordings have their result, 2 of them new, in 2.0 s\nout\n"
     assert said.err == "failed: r0: bad\\nname\nfailed: y\\x1b: is no recording\n"
-    runs._print(summary, Path("out"), as_json=True)
+    batch._print(summary, Path("out"), as_json=True)
     summary = json.loads(capsys.readouterr().out)
     assert summary == {
         **counts(done=3, failed=1), "already": 1, "seconds": 2.0,
@@ -99,8 +99,8 @@ def test_the_summary_in_words_and_as_json(capsys):
 
 def test_progress_is_said_every_few_seconds_and_at_the_end(capsys, monkeypatch):
     now = SimpleNamespace(s=100.0)
-    monkeypatch.setattr(runs, "time", SimpleNamespace(monotonic=lambda: now.s))
-    tell, quiet = runs._Teller(False), runs._Teller(True)
+    monkeypatch.setattr(batch, "time", SimpleNamespace(monotonic=lambda: now.s))
+    tell, quiet = batch._Teller(False), batch._Teller(True)
 
     def said(after_s: float, **given: int) -> str:
         now.s += after_s
@@ -118,4 +118,4 @@ def test_progress_is_said_every_few_seconds_and_at_the_end(capsys, monkeypatch):
 
 def test_a_wrong_option_is_named_as_the_command_names_it():
     with pytest.raises(InvalidSetting, match="steps_per_frame is -1; it must be from 1 to"):
-        runs._checked({"steps_per_frame": -1})
+        batch._checked({"steps_per_frame": -1})
