@@ -295,7 +295,14 @@ def unchanged(folder: Path) -> str:
         f"Medians of {log['runs']} runs in turn on one machine of {log['old_commit']}, the last commit before the methods, and of"
         " the newer commit. Live and replay changed for other reasons too ([live.md](live.md))."
     )
-    return "## Speed before and after the methods were added\n\n" + text + "\n\n" + "\n".join(lines) + "\n\n" + provenance({"cuda": [log]})
+    return (
+        "## Speed before and after the methods were added\n\n"
+        + text
+        + "\n\n"
+        + "\n".join(lines)
+        + "\n\n"
+        + provenance({"cuda": [log]})
+    )
 
 
 def training(folder: Path) -> str:
