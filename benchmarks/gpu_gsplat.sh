@@ -1,0 +1,65 @@
+#!/usr/bin/env bash
+# Run the CUDA tests and the comparisons with gsplat on one NVIDIA GPU, timed ones first and alone.
+# Usage: benchmarks/gpu_gsplat.sh OUT GSPLAT_WHEEL GSPLAT_SOURCES [EXAMPLES] [SCRIPT...]
+#   OUT              folder of the logs
+#   GSPLAT_WHEEL     gsplat-1.5.3-py3-none-any.whl, which is compiled (peers/build_gsplat.py)
+#   GSPLAT_SOURCES   unpacked source archive of gsplat 1.5.3, whose tests are run with this package
+#   EXAMPLES         folder with gsplat's simple_trainer.py, or "" to leave the trainer out
+#   SCRIPT           further scripts of timings, run with --module gsplat and with --module gsplat_core
+# Several processes need several GPUs: gsplat/processes.py. PYTHON is the interpreter (default python3). Each benchmark prints to OUT/NAME.txt; one that fails does not stop the others.
+set -uo pipefail
+cd "$(dirname "$0")/.."
+out=$(realpath -m "$1") wheel=$(realpath "$2") sources=$(realpath "$3") examples=${4:-}
+shift $(($# < 4 ? $# : 4))
+python=${PYTHON:-python3}
+mkdir -p "$out"
+export PYTHONPATH=$PWD${PYTHONPATH:+:$PYTHONPATH} PYTHONUNBUFFERED=1
+began=$SECONDS
+
+# Run a command. Its output is OUT/NAME.txt.
+run() {
+  local name=$1 start=$SECONDS code=0
+  shift
+  "$@" > "$out/$name.txt" 2>&1 || code=$?
+  echo "$name: exit code $code after $((SECONDS - start)) s, at $((SECONDS - began)) s" | tee -a "$out/progress.txt"
+}
+
+# Run the script of benchmarks/gsplat with the given options. Its log is OUT/NAME-cuda.json.
+compare() {
+  local name=$1 script=$2
+  shift 2
+  run "$name" "$python" "benchmarks/gsplat/$script.py" "$@" --device cuda --out "$out/$name-cuda.json"
+}
+
+run build benchmarks/gpu_build.sh || exit
+run build_gsplat "$python" benchmarks/peers/build_gsplat.py "$wheel" build/peers &
+building=$!
+run tests benchmarks/gpu_tests.sh
+wait $building
+peers=$PWD/build/peers
+
+PYTHONPATH=$peers:$PYTHONPATH run suite "$python" benchmarks/suite.py --device cuda --only render rasterization training deformation --out "$out"
+for script in "$@"; do
+  for module in gsplat gsplat_core; do
+    PYTHONPATH=$peers:$PYTHONPATH run "$(basename "$script" .py)-$module" "$python" "$script" --module "$module"
+  done
+done
+compare surfels surfels --full
+if [ -n "$examples" ]; then
+  PYTHONPATH=$peers:$PYTHONPATH compare trainer trainer "$examples" --full --steps 3000 --seeds 0 1 2
+  PYTHONPATH=$peers:$PYTHONPATH compare trainer_wide trainer "$examples" --full --wide --steps 1000 --seeds 0 --variants gsplat ours
+fi
+
+# These compare pictures, gradients and memory, so they share the GPU.
+compare own_tests own_tests --tests "$sources/tests" --oracle "$peers/gsplat" --timeout 250 &
+beside=$!
+{
+  compare calls calls
+  compare cameras cameras
+  compare thresholds thresholds
+  compare memory memory --full
+  compare strategies strategies --full --steps 3000
+} &
+beside+=" $!"
+# shellcheck disable=SC2086 # a list of numbers
+wait $beside
