@@ -161,20 +161,24 @@ def replay_graph(
         total = about.frame_count or done
         if scored is None:
             return Progress(stage, done, total)
-        previous_db, next_db = scored.previous_frame_db, scored.next_frame_db
         return Progress(
             stage,
             done,
             total,
-            psnr_tissue_db=scored.quality.psnr_tissue_db,
-            previous_frame_db=previous_db if math.isfinite(previous_db) else None,
-            next_frame_db=next_db if math.isfinite(next_db) else None,
+            psnr_tissue_db=_score(scored.quality.psnr_tissue_db),
+            previous_frame_db=_score(scored.previous_frame_db),
+            next_frame_db=_score(scored.next_frame_db),
             trained=scored.rendered.trained,
         )
 
     if progress is not None:
         progress(progressed(0, None))
     return graph
+
+
+def _score(psnr_db: float) -> float | None:
+    """Return a PSNR in dB for `Progress`; None for a frame without one, such as a withheld frame."""
+    return psnr_db if math.isfinite(psnr_db) else None
 
 
 def replay(

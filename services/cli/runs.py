@@ -184,11 +184,16 @@ class LiveStatus:
         state = "" if graph.display.state is None else graph.display.state.value
         line = (
             f"{state:<11} {rate:5.1f} pictures/s  age {graph.display.age_p50_ms:5.1f} ms"
-            f"  training error {scored.quality.psnr_tissue_db:5.2f} dB (previous frame {scored.previous_frame_db:5.2f} dB)"
+            f"  training error {_decibels(scored.quality.psnr_tissue_db)} (previous frame {_decibels(scored.previous_frame_db)})"
             f"  {graph.reconstruct.newest_gaussians} Gaussians"
         )
         print(f"\r{line}" if self._terminal else line, end="" if self._terminal else "\n", file=sys.stderr, flush=True)  # noqa: T201
         self._written = True
+
+
+def _decibels(psnr_db: float) -> str:
+    """Return a PSNR as text of constant width for the status line; a dash without one."""
+    return f"{psnr_db:5.2f} dB" if math.isfinite(psnr_db) else "    - dB"
 
 
 @contextmanager

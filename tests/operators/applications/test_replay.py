@@ -216,6 +216,17 @@ def test_progress_has_the_previous_frame_beside_the_training_error(settings):
     assert all(event.trained for event in events)
 
 
+def test_progress_of_a_withheld_frame_has_no_score(tiny, tmp_path):
+    folder = tmp_path / "images"
+    folder.mkdir()
+    for frame in open_recording(tiny):
+        picture = frame.image if frame.seq != 3 else np.zeros_like(frame.image)
+        cv2.imwrite(str(folder / f"{frame.seq:03d}.png"), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+    events = []
+    replay(ReplaySettings(recording=folder, out=tmp_path / "out", steps_per_frame=1, out_of_body="off"), events.append)
+    assert [event.psnr_tissue_db is None for event in events] == [True, False, False, False, True]
+
+
 def test_a_black_picture_is_withheld_as_in_a_live_stream(tiny, tmp_path):
     folder = tmp_path / "images"
     folder.mkdir()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -60,8 +61,6 @@ def test_a_run_without_predictions_has_no_empty_place_for_them(report):
 
 
 def test_each_picture_names_the_kind_of_its_error_and_the_baseline(report, scored):
-    from dataclasses import replace
-
     shown = lambda trained: text_of(
         render_html(report, [keyframe_pictures(replace(scored, rendered=replace(scored.rendered, trained=trained)))])
     )
@@ -97,14 +96,15 @@ def test_a_live_run_prints_the_same(predicted):
         assert all("training error" in line for line in page.splitlines() if figure in line), figure
 
 
-def test_the_status_line_says_it_too(scored, capsys):
+@pytest.mark.parametrize(("previous_db", "text"), [(36.0, "36.00 dB"), (np.nan, "    - dB")])
+def test_the_status_line_says_it_too(scored, capsys, previous_db, text):
     graph = SimpleNamespace(
         display=SimpleNamespace(pictures=3, state=PictureState.LIVE, age_p50_ms=12.0),
         reconstruct=SimpleNamespace(newest_gaussians=99),
     )
     with LiveStatus() as status:
-        status(graph, scored)
-    assert "training error 33.00 dB (previous frame 36.00 dB)" in capsys.readouterr().err
+        status(graph, replace(scored, previous_frame_db=previous_db))
+    assert f"training error 33.00 dB (previous frame {text})" in capsys.readouterr().err
 
 
 def test_a_result_without_frames_is_no_figure():
