@@ -229,6 +229,13 @@ class MaskFiles:
             if np.ptp(mask[..., :3], axis=2).any():
                 findings.problem(path, "the mask is a colour picture", "Save masks as grey PNG, 255 = tool, 0 = tissue")
                 return None
+            if mask.shape[2] == 4 and np.ptp(mask[..., 3]) and not np.ptp(mask[..., 0]):
+                findings.problem(
+                    path,
+                    f"all of its pixels are {mask[0, 0, 0]}, only their opacity differs",
+                    "Save masks as grey PNG without an alpha channel, 255 = tool, 0 = tissue",
+                )
+                return None
             mask = mask[..., 0]
         tool = mask != 0
         top = int(mask.max(initial=0))

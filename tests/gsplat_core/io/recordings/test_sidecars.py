@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -126,6 +127,16 @@ def test_a_cut_off_poses_file(video_folder: Path, refused: Refused) -> None:
     path = video_folder / "poses_bounds.npy"
     path.write_bytes(path.read_bytes()[:300])
     refused(video_folder, RecordingInvalid, "poses_bounds.npy", "not a plain NumPy array")
+
+
+def test_a_mask_in_the_alpha_channel(video_folder: Path, make: SimpleNamespace, refused: Refused) -> None:
+    mask = np.zeros((make.height, make.width, 4), np.uint8)
+    mask[:, :12, 3] = 255
+    assert cv2.imwrite(str(video_folder / "masks" / "000003.png"), mask)
+    refused(video_folder, RecordingInvalid, "masks/000003.png", "all of its pixels are 0", "alpha channel")
+    mask[..., :3] = mask[..., 3:]
+    assert cv2.imwrite(str(video_folder / "masks" / "000003.png"), mask)
+    assert validate_recording(video_folder).ok
 
 
 def test_depth_of_another_size(endonerf_folder: Path, make: SimpleNamespace, refused: Refused) -> None:
