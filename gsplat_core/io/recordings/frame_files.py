@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from gsplat_core.choices import SENSORS
 from gsplat_core.errors import InvalidSetting
-from gsplat_core.io.recordings.calibration import number, read_json
+from gsplat_core.io.recordings.calibration import MAX_LENGTH, number, read_json
 from gsplat_core.io.recordings.plain_files import (
     MAX_PIXELS,
     ArrayHeader,
@@ -174,6 +174,8 @@ SAMPLES = 16
 """Number of evenly spaced frames whose masks and depth are read when a recording is opened."""
 MAX_TOOL_SHARE = 0.5
 """Largest plausible share of tool pixels. Tools cover 5-35 %; a larger class is the tissue."""
+DEPTH_LIMITS_MM = (1e-6, MAX_LENGTH)
+"""Range of known depth. Beyond it float32 loses squares and reciprocals of lengths, and training diverges."""
 PLAUSIBLE_DEPTH_MM = (1.0, 1000.0)
 """Range of the median depth in front of an endoscope. Metres read as millimetres are below it, micrometres above it."""
 
@@ -287,14 +289,18 @@ class DepthFiles:
         if depth.shape != self._shape:
             findings.problem(path, self._other_shape(depth.shape), _DEPTH_ADVICE)
             return None
-        wrong = ~np.isfinite(depth) | (depth < 0)
+        wrong, why = ~np.isfinite(depth) | (depth < 0), "NaN, infinite or negative"
+        advice = "Write 0 where the depth is not known"
+        if not wrong.any():
+            low, high = (np.float32(limit) for limit in DEPTH_LIMITS_MM)
+            wrong, why = (depth > 0) & ~((depth >= low) & (depth <= high)), f"outside of {low:g} to {high:g} mm"
+            advice = f"{advice}, and give depth in millimetres"
         if wrong.any():
             row, column = np.argwhere(wrong)[0]
             findings.problem(
                 path,
-                f"{int(wrong.sum())} pixels are NaN, infinite or negative (first: {depth[row, column]} in row {row}, "
-                f"column {column})",
-                "Write 0 where the depth is not known",
+                f"{int(wrong.sum())} pixels are {why} (first: {depth[row, column]:.6g} in row {row}, column {column})",
+                advice,
             )
             return None
         return depth

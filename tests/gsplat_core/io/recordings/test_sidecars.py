@@ -156,6 +156,16 @@ def _npy_depths(folder: Path, depths: list[np.ndarray]) -> None:
         np.save(folder / "depth" / f"{index:06d}.npy", depth)
 
 
+@pytest.mark.parametrize(("value", "shown"), [(1e10, "1e+10"), (3e38, "3e+38"), (1e-9, "1e-09")])
+def test_depth_beyond_what_training_can_compute_with(
+    endonerf_folder: Path, refused: Refused, value: float, shown: str
+) -> None:
+    depths = [np.full((40, 48), 40.0, np.float32) for _ in range(6)]
+    depths[3][7, 9] = value
+    _npy_depths(endonerf_folder, depths)
+    refused(endonerf_folder, RecordingInvalid, "000003.npy", "1e-06 to 1e+09 mm", shown, "row 7, column 9")
+
+
 def test_float_depth(endonerf_folder: Path) -> None:
     depths = [np.full((40, 48), 40.125 + index, np.float64) for index in range(6)]
     _npy_depths(endonerf_folder, depths)
