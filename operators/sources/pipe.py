@@ -57,7 +57,7 @@ class RawFormat:
         self._planes = [(-(-width_px // across) * size, -(-height_px // down)) for across, down, size in PLANES[name]]
         self.frame_bytes = sum(row * rows for row, rows in self._planes)
         """Size of one picture in bytes."""
-        self._converter = PictureConverter(0)
+        self._converter = PictureConverter()
 
     def picture(self, data: memoryview | bytes) -> NDArray[np.uint8]:
         """Convert the bytes of one picture to a new uint8 RGB array [H, W, 3]."""

@@ -88,7 +88,7 @@ class Connection:
         self.has_an_end = bool(self._container.duration and self._container.duration > 0)
         """True if the stream states its duration. Its end is then regular, otherwise a lost connection."""
         try:
-            self._decoder, self._converter = PictureDecoder(stream, probe=False), PictureConverter(0)
+            self._decoder, self._converter = PictureDecoder(stream, probe=False), PictureConverter()
         except (av.FFmpegError, ValueError) as error:
             raise ConnectionFailed(f"its pictures cannot be decoded: {_words(error)}") from None
         self.skipped = 0

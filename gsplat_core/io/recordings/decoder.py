@@ -14,7 +14,7 @@ import logging
 import os
 import random
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
@@ -121,7 +121,6 @@ _STRICT = {"libdav1d": {"strict": "1"}}
 _WITHOUT_DELAY = frozenset({"vp8", "vp9", "av1", "mjpeg", "ffv1", "png", "huffyuv", "prores", "dnxhd"})
 """Codecs whose decoders return the picture of a packet before they need the next packet."""
 NO_PICTURE = "the decoder gave no picture for it"
-_QUARTER_TURNS = {90: 1, 180: 2, -180: 2, -90: 3, 270: 3}
 
 
 @contextmanager
@@ -219,6 +218,31 @@ def _context(known: av.VideoCodecContext, decoder: str | None) -> av.VideoCodecC
     return context
 
 
+class Orientation(NamedTuple):
+    """Change that makes the stored pictures of a video upright: mirrored left to right first, then turned."""
+
+    turns: int = 0
+    """Quarter turns, counter-clockwise."""
+    mirrored: bool = False
+    ignored_degrees: int = 0
+    """Rest of the stated angle, counter-clockwise, which is not applied."""
+
+
+def orientation_of(frame: av.VideoFrame) -> Orientation:
+    """Return the orientation that the display matrix of a frame states (ISO/IEC 14496-12, section 6.2.2)."""
+    side_data = cast(Mapping[str, bytes], frame.side_data)  # PyAV's stub declares it as a dict of one other key
+    if "DISPLAYMATRIX" not in side_data:
+        return Orientation()
+    # Row vectors [x, y, 1] are multiplied from the left: x' = a x + c y, y' = b x + d y.
+    (a, b), (c, d) = np.frombuffer(bytes(side_data["DISPLAYMATRIX"]), np.int32, 9).reshape(3, 3)[:2, :2] / 65536
+    mirrored = bool(a * d - b * c < 0)
+    if mirrored:
+        a, b = -a, -b
+    degrees = -np.degrees(np.arctan2(b, a))
+    turns = round(degrees / 90)
+    return Orientation(turns % 4, mirrored, round(degrees - 90 * turns))
+
+
 class PictureConverter:
     """Converter of a stream's frames to RGB; one instance per stream.
 
@@ -226,10 +250,10 @@ class PictureConverter:
     than decoding and starts a thread for every core.
     """
 
-    def __init__(self, rotation: int) -> None:
-        """Create a converter; `rotation` is counter-clockwise in degrees, ignored unless a multiple of 90."""
+    def __init__(self, orientation: Orientation | None = None) -> None:
+        """Create a converter that makes pictures upright; None leaves them as they are stored."""
         self._reformatter = VideoReformatter()
-        self._turns = _QUARTER_TURNS.get(rotation, 0)
+        self._orientation = orientation or Orientation()
 
     def picture(self, frame: av.VideoFrame) -> NDArray[np.uint8]:
         """Return an upright RGB uint8 picture [H, W, 3], with the same bytes as OpenCV."""
@@ -237,8 +261,10 @@ class PictureConverter:
         # because further threads take longer to wake than to convert.
         bgr = self._reformatter.reformat(frame, format="bgr24", interpolation=Interpolation.BICUBIC, threads=1)
         image = np.asarray(cv2.cvtColor(bgr.to_ndarray(), cv2.COLOR_BGR2RGB), dtype=np.uint8)
-        if self._turns:
-            image = np.rot90(image, self._turns)
+        if self._orientation.mirrored:
+            image = image[:, ::-1]
+        if self._orientation.turns:
+            image = np.rot90(image, self._orientation.turns)
         return np.ascontiguousarray(image)
 
 

@@ -12,16 +12,19 @@ from pathlib import Path
 from typing import BinaryIO
 
 import av
+from av.stream import Disposition
 
 from gsplat_core.io.recordings.decoder import (
     NO_PICTURE,
     Container,
+    Orientation,
     PictureConverter,
     PictureDecoder,
     UnusableContainer,
     captured_log,
     frame_rate,
     is_shown,
+    orientation_of,
     recognise,
 )
 from gsplat_core.io.recordings.plain_files import DEPENDS, MAX_PIXELS, Findings, Picture, UnreadableFile, open_plain
@@ -156,7 +159,7 @@ class VideoFrames:
         container: Container,
         index: VideoIndex,
         fps: float,
-        rotation: int,
+        orientation: Orientation,
         times: Sequence[float] | None = None,
     ) -> None:
         self.path = path
@@ -168,7 +171,7 @@ class VideoFrames:
         self.fps: float | None = fps
         self._container = container
         self._index = index
-        self._rotation = rotation
+        self._orientation = orientation
 
     def frames(self, findings: Findings) -> Iterator[Picture | None]:
         """Yield the pictures in order, with damaged ones marked.
@@ -229,7 +232,7 @@ class VideoFrames:
     def _decoded(self, spread: DamageSpread) -> Generator[tuple[int, Picture], None, None]:
         """Yield the decoded pictures with their display positions."""
         with _opened(self.path, self._container) as (container, stream):
-            decoder, converter = PictureDecoder(stream), PictureConverter(self._rotation)
+            decoder, converter = PictureDecoder(stream), PictureConverter(self._orientation)
             for number, packet in _numbered(container, stream):
                 shown = number < len(self._index.positions) and self._index.positions[number] >= 0
                 frames = decoder.decode(packet, number, shown)
@@ -344,6 +347,7 @@ def _inspect(
             "Scale it down",
         )
         return None
+    _warn_of_format(path, opened, stream, findings)
     fps = frame_rate(stream)
     index = read_index(opened, stream, container)
     times = _frame_times(index, stream, findings, path)
@@ -357,6 +361,31 @@ def _inspect(
         findings.warn(path, f"the container announces {fps} frames/s", "30 frames/s are assumed")
         fps, times = 30.0, None
     return _with_first_frame(path, container, index, fps, times, findings)
+
+
+_SQUARE_WITHIN = 0.01
+"""Largest deviation of the stated shape of pixels from a square that is ignored; 720x576 has 0.07 or more."""
+
+
+def _warn_of_format(
+    path: Path, opened: av.container.InputContainer, stream: av.VideoStream, findings: Findings
+) -> None:
+    """Warn of pixels that are not square and of further videos in the file."""
+    shape = stream.sample_aspect_ratio
+    if shape and abs(shape - 1) > _SQUARE_WITHIN:
+        findings.warn(
+            path,
+            f"its pixels are not square: {shape.numerator}:{shape.denominator} wide to high",
+            "They are read as if they were; scale the video (ffmpeg -i IN -vf scale=iw*sar:ih,setsar=1 OUT.mp4), or give a "
+            "camera with fx and fy",
+        )
+    others = [other for other in opened.streams.video if not other.disposition & Disposition.attached_pic]
+    if len(others) > 1:
+        findings.warn(
+            path,
+            f"it holds {len(others)} videos",
+            "The first one is read; write another one into a file of its own (ffmpeg -i IN -map 0:v:1 -c copy OUT.mkv)",
+        )
 
 
 def _frame_times(index: VideoIndex, stream: av.VideoStream, findings: Findings, path: Path) -> tuple[float, ...] | None:
@@ -389,14 +418,31 @@ def _is_edited(index: VideoIndex) -> bool:
     return any(position < 0 for position in index.positions)
 
 
-def _rotation(path: Path, container: Container) -> int:
-    """Return the counter-clockwise display rotation in degrees stated by the container; 0 if no frame can be decoded."""
+def _orientation(path: Path, container: Container, findings: Findings) -> Orientation:
+    """Return the orientation of the pictures as the container states it, with a warning about what is not corrected; the
+    stored one if no frame can be decoded.
+    """
     with _opened(path, container) as (opened, stream), captured_log():
         try:
             frame = next(opened.decode(stream), None)
         except av.FFmpegError:
             frame = None
-        return 0 if frame is None else frame.rotation
+    if frame is None:
+        return Orientation()
+    orientation = orientation_of(frame)
+    if orientation.ignored_degrees:
+        findings.warn(
+            path,
+            f"the container asks for a rotation by {orientation.ignored_degrees}° more, which is not a quarter turn",
+            "It is not applied",
+        )
+    if frame.interlaced_frame:
+        findings.warn(
+            path,
+            "the video is interlaced: its frames hold two moments each, and what moves has combed edges",
+            "Deinterlace it (ffmpeg -i IN -vf bwdif -c:v libx264 OUT.mp4)",
+        )
+    return orientation
 
 
 def _with_first_frame(
@@ -408,7 +454,7 @@ def _with_first_frame(
     findings: Findings,
 ) -> VideoFrames | None:
     """Return the video; None after a problem with its first frame, which must be intact to initialise the scene."""
-    video = VideoFrames(path, container, index, fps, _rotation(path, container), times)
+    video = VideoFrames(path, container, index, fps, _orientation(path, container, findings), times)
     first = video.look_at_first()
     if first is None:
         findings.problem(path, "no frame of the video can be decoded", _REENCODE)

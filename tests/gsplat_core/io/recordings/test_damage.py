@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import struct
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -186,6 +187,41 @@ def test_rotation_is_applied_as_opencv_does(codec: str, degrees: int, tmp_path: 
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     for frame in open_recording(path):
         assert np.array_equal(frame.image, capture.read()[1][..., ::-1])
+
+
+def _with_matrix(data: bytes, entries: tuple[float, float, float, float]) -> bytes:
+    """Replace a, b, c and d of the matrix in the track header of an MP4 (ISO/IEC 14496-12, section 8.3.2)."""
+    at = data.index(b"tkhd") + 44
+    a, b, c, d = (round(entry * 65536) for entry in entries)
+    return data[:at] + struct.pack(">9i", a, b, 0, c, d, 0, 0, 0, 1 << 30) + data[at + 36 :]
+
+
+@pytest.mark.parametrize(
+    ("entries", "upright"),
+    [
+        ((-1, 0, 0, 1), np.fliplr),
+        ((1, 0, 0, -1), np.flipud),
+        ((0, 1, 1, 0), lambda image: image.transpose(1, 0, 2)),
+        ((0, -1, -1, 0), lambda image: np.rot90(image, 2).transpose(1, 0, 2)),
+        ((-1, 0, 0, -1), lambda image: np.rot90(image, 2)),
+    ],
+)
+def test_a_mirrored_video_is_shown_as_players_do(
+    tmp_path: Path, entries: tuple[float, float, float, float], upright: Callable[[np.ndarray], np.ndarray]
+) -> None:
+    path = videos.encode(tmp_path / "v.mp4", "mpeg4")
+    stored = next(iter(open_recording(path))).image
+    path.write_bytes(_with_matrix(path.read_bytes(), entries))
+    assert np.array_equal(next(iter(open_recording(path))).image, upright(stored))
+
+
+def test_a_rotation_that_is_no_quarter_turn_is_noted(tmp_path: Path) -> None:
+    path = videos.encode(tmp_path / "v.mp4", "mpeg4")
+    stored = next(iter(open_recording(path))).image
+    path.write_bytes(_with_matrix(path.read_bytes(), (0.5, 0.75**0.5, -(0.75**0.5), 0.5)))
+    recording = open_recording(path)
+    assert any("rotation by 30° more" in note for note in recording.notes)
+    assert np.array_equal(next(iter(recording)).image, np.rot90(stored, 3))
 
 
 def test_a_damaged_jpeg_is_marked_and_a_damaged_png_refused(tmp_path: Path, refused: Refused) -> None:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Callable
+from fractions import Fraction
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import av
 import numpy as np
@@ -17,6 +19,7 @@ from gsplat_core.errors import RecordingInvalid, RecordingMissing
 from gsplat_core.io.recordings import Recording, open_recording, validate_recording
 from gsplat_core.io.recordings.decoder import PictureConverter
 from gsplat_core.scene.frames import FrameStatus
+from tests.gsplat_core.io.recordings import videos
 
 Refused = Callable[..., str]
 
@@ -228,7 +231,7 @@ def test_camera_of_a_frame_that_is_not_there(video_folder: Path) -> None:
 def test_one_conversion_for_frames_of_changing_size_and_format_gives_the_bytes_of_one_for_each(
     rng: np.random.Generator,
 ) -> None:
-    shared = PictureConverter(0)
+    shared = PictureConverter()
     for size in ((64, 48), (33, 17), (64, 48)):
         for pixels in ("yuv420p", "yuvj420p", "yuv422p", "yuv444p", "gray", "rgb24"):
             frame = av.VideoFrame(*size, pixels)
@@ -236,3 +239,36 @@ def test_one_conversion_for_frames_of_changing_size_and_format_gives_the_bytes_o
                 plane.update(rng.integers(0, 256, plane.buffer_size, dtype=np.uint8).tobytes())
             alone = frame.to_ndarray(format="bgr24", interpolation=Interpolation.BICUBIC)[..., ::-1]
             assert np.array_equal(shared.picture(frame), alone), (size, pixels)
+
+
+def _video_with(path: Path, streams: int = 1, pixel_shape: Fraction | None = None, options: str = "") -> Path:
+    with av.open(str(path), "w") as container:
+        encoders = [container.add_stream("libx264", rate=25, options={"x264-params": options}) for _ in range(streams)]
+        for encoder in encoders:
+            encoder.width, encoder.height, encoder.pix_fmt = 48, 40, "yuv420p"
+            if pixel_shape is not None:
+                encoder.codec_context.sample_aspect_ratio = pixel_shape
+        for encoder in encoders:
+            for image in videos.pictures(4, (48, 40)):
+                container.mux(encoder.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+            container.mux(encoder.encode(None))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("settings", "noted"),
+    [
+        ({}, None),
+        ({"pixel_shape": Fraction(1000, 1001)}, None),
+        ({"pixel_shape": Fraction(16, 15)}, "not square: 16:15"),
+        ({"options": "interlaced=1:tff=1"}, "interlaced"),
+        ({"streams": 2}, "holds 2 videos"),
+    ],
+)
+def test_a_format_that_changes_the_picture_is_noted(
+    tmp_path: Path, settings: dict[str, Any], noted: str | None
+) -> None:
+    notes = open_recording(_video_with(tmp_path / "v.mkv", **settings)).notes
+    for fragment in ("not square", "interlaced", "videos"):
+        assert any(fragment in note for note in notes) == (noted is not None and fragment in noted)
+    assert noted is None or any(noted in note for note in notes)
