@@ -26,6 +26,7 @@ from gsplat_core.io.recordings.plain_files import (
     UnreadableImage,
     decode_picture,
     decode_plane,
+    exif_orientation,
     frame_number,
     image_size,
     read_array,
@@ -182,6 +183,23 @@ PLAUSIBLE_DEPTH_MM = (1.0, 1000.0)
 
 def _sampled(count: int) -> list[int]:
     return [int(index) for index in np.unique(np.linspace(0, count - 1, SAMPLES).round())]
+
+
+def warn_of_rotation(files: Sequence[Path], findings: Findings) -> None:
+    """Warn if the Exif data of evenly spaced images state that viewers turn or mirror them."""
+    for index in _sampled(len(files)):
+        path = files[index]
+        try:
+            orientation = exif_orientation(path)
+        except (UnreadableFile, OSError):
+            continue  # reported when it is read
+        if orientation != 1:
+            findings.warn(
+                path,
+                f"its Exif data state the orientation {orientation}: viewers turn or mirror it",
+                "It is read as it is stored; turn the files themselves (mogrify -auto-orient) and their sidecars",
+            )
+            return
 
 
 class ImageFiles:

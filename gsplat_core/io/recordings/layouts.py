@@ -41,7 +41,7 @@ from gsplat_core.io.recordings.calibration import (
     rectified_by_file,
 )
 from gsplat_core.io.recordings.contents import DESCRIPTION_FILE, Beside, Contents, FrameImages
-from gsplat_core.io.recordings.frame_files import ImageFiles, check_sizes
+from gsplat_core.io.recordings.frame_files import ImageFiles, check_sizes, warn_of_rotation
 from gsplat_core.io.recordings.plain_files import (
     Findings,
     UnreadableFile,
@@ -161,6 +161,7 @@ def read_cameras_json(root: Path, findings: Findings) -> tuple[ImageFiles, Calib
     world_to_camera = invert_poses(np.stack(poses)[:, :3], path, findings)
     if world_to_camera is None or check_sizes(files, size, "image", findings) is None:
         return None
+    warn_of_rotation(files, findings)
     fps = stated = content.get("fps", content.get("fps_assumed"))
     if stated is not None:
         fps = number(stated)
@@ -288,6 +289,7 @@ def _inspect_folder(path: Path, findings: Findings) -> Contents | SessionContent
     times = frame_times(files, findings)
     if size is None or len(findings.problems) > known:
         return None
+    warn_of_rotation(files, findings)
     right = None
     if eyes is not None:
         if check_sizes(eyes.right, size, "right image", findings) is None or not all_stay_inside(

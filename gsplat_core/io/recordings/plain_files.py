@@ -447,6 +447,36 @@ def _jpeg_size(data: bytes) -> tuple[int, int]:
     raise UnreadableImage("the JPEG header holds no frame size")
 
 
+_EXIF_BYTES = 1 << 17
+_EXIF_ORIENTATION = 0x0112
+
+
+def exif_orientation(path: Path) -> int:
+    """Return the orientation in the Exif data of a JPEG or PNG, 1 to 8; 1 (upright) if none is stated.
+
+    Format: Exif 2.32, section 4.6 (TIFF's first directory).
+
+    Raises:
+        UnreadableFile: if it is no plain file.
+    """
+    with open_plain(path) as stream:
+        data = stream.read(_EXIF_BYTES)
+    mark = b"eXIf" if data.startswith(PNG_SIGNATURE) else b"Exif\0\0"
+    _, found, tiff = data.partition(mark)
+    order = {b"II*\0": "<", b"MM\0*": ">"}.get(tiff[:4])
+    if not found or order is None or len(tiff) < 8:
+        return 1
+    (at,) = struct.unpack(order + "I", tiff[4:8])
+    (count,) = struct.unpack(order + "H", tiff[at : at + 2].ljust(2, b"\0"))
+    for entry in range(at + 2, at + 2 + 12 * count, 12):
+        if len(tiff) < entry + 12:
+            break
+        tag, kind, _, value = struct.unpack(order + "HHIH2x", tiff[entry : entry + 12])
+        if tag == _EXIF_ORIENTATION and kind == 3 and 1 <= value <= 8:
+            return int(value)
+    return 1
+
+
 def decode_picture(path: Path) -> Picture:
     """Decode a frame to RGB uint8 [H, W, 3]; grey is replicated and alpha dropped.
 

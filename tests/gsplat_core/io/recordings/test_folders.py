@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import struct
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -197,3 +199,27 @@ def test_mirrored_pose_is_not_a_rotation(cameras_folder: Path, refused: Refused)
     content["frames"][2]["camera_to_world"] = np.diag([1.0, 1, -1, 1]).tolist()
     path.write_text(json.dumps(content))
     refused(cameras_folder, RecordingInvalid, "frame 2 is not a rotation")
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("suffix", ["jpg", "png"])
+@pytest.mark.parametrize("orientation", [1, 6])
+def test_exif_rotation_is_not_applied_and_noted(
+    tmp_path: Path, make: SimpleNamespace, order: str, suffix: str, orientation: int
+) -> None:
+    mark = b"II*\0" if order == "<" else b"MM\0*"
+    entries = struct.pack(order + "HHHIIHHIHH", 2, 0x010F, 4, 1, 7, 0x0112, 3, 1, orientation, 0)
+    exif = mark + struct.pack(order + "I", 8) + entries + bytes(4)
+    for index in range(3):
+        path = tmp_path / f"{index}.{suffix}"
+        make.image(path, make.frame_image(index))
+        data = path.read_bytes()
+        if suffix == "jpg":
+            part, at = b"\xff\xe1" + struct.pack(">H", len(exif) + 8) + b"Exif\0\0" + exif, 2
+        else:
+            part, at = struct.pack(">I", len(exif)) + b"eXIf" + exif, 33
+            part += struct.pack(">I", zlib.crc32(part[4:]))
+        path.write_bytes(data[:at] + part + data[at:])
+    recording = open_recording(tmp_path)
+    assert any("0." + suffix in note and "orientation 6" in note for note in recording.notes) == (orientation == 6)
+    assert next(iter(recording)).image.shape == (make.height, make.width, 3)
