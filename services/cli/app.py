@@ -15,6 +15,7 @@ from gsplat_core.errors import InvalidSetting
 from operators.settings import JobOptions, LiveOptions, ReconstructOptions, RenderOptions, ReplayOptions, TrainOptions
 from services.cli.ctl import ExpiresOption, KeyName, KeyStreamOption, RoleOption, ctl
 from services.cli.options import (
+    VIEW_SAMPLES,
     BatchOutOption,
     BenchVideoOption,
     CameraPathOption,
@@ -43,6 +44,7 @@ from services.cli.options import (
     SourceArgument,
     SupersamplingOption,
     SynthesizeOptions,
+    ViewSamplesOption,
     path_argument,
     path_option,
     renderer_options,
@@ -550,7 +552,7 @@ def view(
             show_default="drawn by the browser, extra viser",
         ),
     ] = None,
-    samples: SamplesOption = None,
+    samples: ViewSamplesOption = None,
     supersampling: SupersamplingOption = None,
     order: OrderOption = None,
     device: DeviceOption = "cpu",
@@ -560,7 +562,7 @@ def view(
 
     sampled = renderer is not None and renderer in RENDERERS and "samples" in RENDERERS[renderer].capabilities.options
     if sampled and samples is None:
-        samples = 1  # the picture gains samples while the camera stands still
+        samples = VIEW_SAMPLES
     if renderer is None and (samples, supersampling, order) != (None, None, None):
         raise InvalidSetting("the browser draws the model without a renderer; give --renderer with its options")
     options = renderer_options(renderer or "alpha", samples, supersampling, order)

@@ -132,16 +132,19 @@ def _annotation(each: Declared) -> Any:
     return Annotated[kind, typer.Option(*flags, help=help_of(each), show_default=shown)]
 
 
-def _shared(name: str) -> Any:
+def _shared(name: str, null: str | None = None) -> Any:
     """Return the typer declaration of an engine option, for a command whose other options are declared in this
-    module."""
+    module. `null` is the meaning of None where the command has another than the engine."""
     each = options_of(ReplayOptions)[name]
-    return typer.Option(help=help_of(each), show_default=each.option.null or True)
+    return typer.Option(help=help_of(each), show_default=null or each.option.null or True)
 
 
+VIEW_SAMPLES = 1
+"""Samples per pixel that `view` adds to a picture at a time; the picture gains samples while the camera stands still."""
 DeviceOption = Annotated[str, _shared("device")]
 RendererOption = Annotated[str, _shared("renderer")]
 SamplesOption = Annotated[int | None, _shared("samples")]
+ViewSamplesOption = Annotated[int | None, _shared("samples", null=str(VIEW_SAMPLES))]
 SupersamplingOption = Annotated[int | None, _shared("supersampling")]
 OrderOption = Annotated[str | None, _shared("order")]
 SeedOption = Annotated[int, _shared("seed")]

@@ -9,11 +9,14 @@ from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import pytest
+from typer.main import get_command
 
 from gsplat_core.errors import BundleError, InvalidSetting
 from gsplat_core.io.bundle import save_bundle
 from gsplat_core.rendering.renderer import RendererOptions
 from services.cli import models, serve
+from services.cli.app import app
+from services.cli.app import view as run_view
 from services.cli.models import bundle_in, view_command
 from services.cli.serve import igtl_command
 from services.cli.terminal import OK
@@ -155,3 +158,13 @@ def test_a_folder_is_used_in_place_and_a_packed_model_is_unpacked_for_the_time_o
     monkeypatch.setattr(models, "unpack", unpack)
     with pytest.raises(BundleError, match="cannot be read: No space left"), bundle_in(packed):
         pass
+
+
+def test_the_help_states_the_samples_of_a_view(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Pictures of `view` have fewer samples than those of other commands, because they add up while the camera stands still."""
+    made = []
+    monkeypatch.setattr(models, "view_command", lambda *arguments, options, **others: made.append(options) or OK)
+    run_view(tmp_path, host="127.0.0.1", port=8, renderer="stochastic", device="cpu")
+    (stated,) = (each for each in get_command(app).commands["view"].params if each.name == "samples")  # type: ignore[attr-defined]
+    assert stated.show_default == str(made[0].samples)
+    assert made[0].samples < RendererOptions().samples
