@@ -100,7 +100,11 @@ MODULES: Mapping[str, Mapping[str, str]] = {
     "gsplat._helper": {"load_test_data": "gsplat_core.as_gsplat.functions"},
     "gsplat.color_correct": {"color_correct_affine": _CONTRIB, "color_correct_quadratic": _CONTRIB},
     "gsplat.compression": {"PngCompression": "gsplat_core.io.png_compression"},
-    "gsplat.compression.png_compression": {"PngCompression": "gsplat_core.io.png_compression"},
+    "gsplat.compression.png_compression": {
+        "PngCompression": "gsplat_core.io.png_compression",
+        "inverse_log_transform": _FUNCTIONS,
+        "log_transform": _FUNCTIONS,
+    },
     "gsplat.contrib": {},
     "gsplat.contrib.dynamic": {
         "DeformNetwork": _CONTRIB,
@@ -140,10 +144,16 @@ MODULES: Mapping[str, Mapping[str, str]] = {
     },
     "gsplat.cuda._torch_impl_2dgs": {
         "_fully_fused_projection_2dgs": _PLAIN,
+        "_quat_scale_to_matrix": _PLAIN,
         "_rasterize_to_pixels_2dgs": _PLAIN,
         "accumulate_2dgs": "gsplat_core.ops.surfel_blending",
     },
-    "gsplat.cuda._wrapper": {**_CUDA, "CameraModel": "gsplat_core.scene.cameras"},
+    "gsplat.cuda._wrapper": {
+        **_CUDA,
+        "CameraModel": "gsplat_core.scene.cameras",
+        "_make_lazy_cuda_func": _FUNCTIONS,
+        "_make_lazy_cuda_obj": _FUNCTIONS,
+    },
     "gsplat.distributed": {**_COLLECTIVES, "cli": _DISTRIBUTED},
     "gsplat.exporter": {
         "export_splats": "gsplat_core.io.exports.export",
@@ -239,9 +249,7 @@ class AliasModule(ModuleType):
         elif full in self._children:
             value = importlib.import_module(full)
         else:
-            raise AttributeError(
-                f"module {self.__name__!r} has no attribute {name!r}: gsplat_core has {', '.join(self.__all__) or 'none'}"
-            )
+            raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}: {_advice(full)}")
         setattr(self, name, value)
         return value
 
@@ -266,9 +274,25 @@ def _with_options(value: Any, options: Mapping[str, Any] | None) -> Any:
 _EXTENSION = "gsplat.csrc"
 """Module name of gsplat's compiled extension, which programs import to test whether CUDA kernels exist."""
 _OF_0_1 = (
-    "_torch_impl", "cuda_legacy", "nd_rasterize", "project_gaussians", "rasterize", "rasterize_gaussians", "sh",
+    "_torch_impl", "bin_and_sort_gaussians", "compute_cov2d_bounds", "compute_cumulative_intersects", "cov2d_bounds",
+    "cuda_legacy", "get_tile_bin_edges", "map_gaussian_to_intersects", "nd_rasterize", "num_sh_bases", "project_gaussians",
+    "quat_to_rotmat", "rasterize", "rasterize_gaussians", "sh",
 )  # fmt: skip
 """Names of modules and functions of gsplat 0.1 that 1.5.3 does not have; their import error advises to use the newer API."""
+
+
+def _advice(fullname: str) -> str:
+    """Return what to use in place of a module of gsplat, or a name in one, that this package does not serve."""
+    parent, _, name = fullname.rpartition(".")
+    if fullname.split(".")[1] in _OF_0_1 or name in _OF_0_1:
+        return (
+            "it belongs to gsplat 0.1, and this package has the functions of 1.5.3; use gsplat.rasterization, or"
+            " gsplat.fully_fused_projection, isect_tiles and rasterize_to_pixels, gsplat.utils.normalized_quat_to_rotmat for"
+            " quat_to_rotmat, and (degree + 1) ** 2 for num_sh_bases"
+        )
+    known = parent if parent in MODULES else "gsplat"
+    children = [each.rpartition(".")[2] for each in MODULES if each.rpartition(".")[0] == known]
+    return f"{known} has {', '.join(sorted([*MODULES[known], *children]))}"
 
 
 def _absent(fullname: str) -> ModuleNotFoundError:
@@ -277,16 +301,7 @@ def _absent(fullname: str) -> ModuleNotFoundError:
     The error does not carry the name of the module, because `from gsplat import name` would then replace its message.
     """
     parent, _, name = fullname.rpartition(".")
-    if fullname.split(".")[1] in _OF_0_1:
-        advice = (
-            "it belongs to gsplat 0.1, and this package has the functions of 1.5.3; use gsplat.rasterization, or"
-            " gsplat.fully_fused_projection, isect_tiles and rasterize_to_pixels"
-        )
-    else:
-        known = parent if parent in MODULES else "gsplat"
-        children = [each.rpartition(".")[2] for each in MODULES if each.rpartition(".")[0] == known]
-        advice = f"{known} has {', '.join(sorted([*MODULES[known], *children]))}"
-    return ModuleNotFoundError(f"no module or name {name!r} in {parent} of gsplat_core: {advice}")
+    return ModuleNotFoundError(f"no module or name {name!r} in {parent} of gsplat_core: {_advice(fullname)}")
 
 
 class _Distribution(importlib.metadata.Distribution):

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -171,5 +172,29 @@ def load_test_data(
     return means, quats, scales, opacities, colors, viewmats, Ks, width, height
 
 
-_C = object()
-"""Stand-in for gsplat's compiled extension, without functions. It is not None because None means that there are no kernels."""
+class _Extension:
+    """Stand-in for gsplat's compiled extension, without functions."""
+
+    def __getattr__(self, name: str) -> Any:
+        raise AttributeError(
+            f"gsplat_core does not have {name!r} of gsplat's compiled extension; call the functions of gsplat.cuda._wrapper,"
+            " for example fully_fused_projection and rasterize_to_pixels"
+        )
+
+
+_C = _Extension()
+"""Not None, because programs take None to mean that there are no kernels."""
+
+
+def _make_lazy_cuda_obj(name: str) -> Any:
+    """Raise the AttributeError of `_C`. Programs import this function also where they do not call it."""
+    return getattr(_C, name)
+
+
+def _make_lazy_cuda_func(name: str) -> Callable[..., Any]:
+    """Return a function that raises the AttributeError of `_C` when it is called."""
+
+    def call(*arguments: Any, **options: Any) -> Any:
+        return _make_lazy_cuda_obj(name)(*arguments, **options)
+
+    return call

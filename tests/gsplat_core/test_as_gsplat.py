@@ -186,7 +186,26 @@ def test_an_unknown_name_is_reported_with_those_that_exist(installed):
         exec("from gsplat.project_gaussians import project_gaussians")
     with pytest.raises(ImportError, match=r"gsplat 0\.1, .*use gsplat\.rasterization"):
         exec("from gsplat import rasterize_gaussians")
+    with pytest.raises(ImportError, match=r"gsplat 0\.1, .*normalized_quat_to_rotmat for quat_to_rotmat"):
+        exec("from gsplat.cuda_legacy._torch_impl import quat_to_rotmat")
+    with pytest.raises(ImportError, match=r"gsplat 0\.1"):
+        exec("from gsplat.utils import bin_and_sort_gaussians")
+    with pytest.raises(AttributeError, match=r"'project_gaussians': it belongs to gsplat 0\.1"):
+        importlib.import_module("gsplat").project_gaussians  # noqa: B018
+    with pytest.raises(AttributeError, match=r"'compute_sh_forward': gsplat\.cuda has _backend"):
+        importlib.import_module("gsplat.cuda").compute_sh_forward  # noqa: B018
     assert not hasattr(importlib.import_module("gsplat"), "rasterize_gaussians")
+
+
+def test_functions_of_the_compiled_extension_are_refused_when_they_are_called(installed):
+    extension = importlib.import_module("gsplat.cuda._backend")._C
+    wrapper = importlib.import_module("gsplat.cuda._wrapper")
+    assert extension is not None and not hasattr(extension, "CameraModelType")
+    lazy = wrapper._make_lazy_cuda_func("rasterize_to_pixels_3dgs_fwd")
+    with pytest.raises(AttributeError, match=r"'rasterize_to_pixels_3dgs_fwd' of gsplat's compiled extension; call"):
+        lazy(torch.ones(1))
+    with pytest.raises(AttributeError, match=r"'CameraModelType' of gsplat's compiled extension"):
+        wrapper._make_lazy_cuda_obj("CameraModelType")
 
 
 def test_programs_that_ask_for_version_file_and_extension_get_answers(installed):
@@ -203,6 +222,9 @@ def test_names_that_gsplats_own_modules_import_are_found_in_them(installed):
     default = importlib.import_module("gsplat.strategy.default")
     assert default.remove is importlib.import_module("gsplat.strategy.ops").remove
     assert importlib.import_module("gsplat.rendering").depth_to_normal is depth_to_normal
+    assert importlib.import_module("gsplat.compression.png_compression").log_transform is utils.log_transform
+    plain = importlib.import_module("gsplat.cuda._torch_impl")
+    assert importlib.import_module("gsplat.cuda._torch_impl_2dgs")._quat_scale_to_matrix is plain._quat_scale_to_matrix
 
 
 def test_a_ply_file_is_read_back_as_splats(tmp_path):
