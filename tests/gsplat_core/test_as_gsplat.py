@@ -208,6 +208,12 @@ def test_functions_of_the_compiled_extension_are_refused_when_they_are_called(in
         wrapper._make_lazy_cuda_obj("CameraModelType")
 
 
+@pytest.mark.parametrize("name", ["strategy", "__version__"])
+def test_modules_and_version_of_gsplat_without_the_hook_are_refused_with_its_name(name):
+    with pytest.raises(AttributeError, match=rf"no attribute '{name}'; for gsplat's modules .*as_gsplat\.install\(\)"):
+        getattr(gsplat_core, name)
+
+
 def test_programs_that_ask_for_version_file_and_extension_get_answers(installed):
     module = importlib.import_module("gsplat")
     assert importlib.metadata.version("gsplat") == module.__version__
