@@ -104,7 +104,9 @@ def _print(summary: Summary, out: Path, as_json: bool) -> None:
         typer.echo(json.dumps(content, indent=2))
         return
     for each in failed:
-        typer.echo(f"failed: {printable(str(each['recording']))}: {printable(str(each['reason']))}", err=True)
+        # A reason names the operator in a second line. Other line ends come from names and stay escaped.
+        reason = str(each["reason"]).replace("\n  in operator ", " In operator ")
+        typer.echo(f"failed: {printable(str(each['recording']))}: {printable(reason)}", err=True)
     done, new = summary.counts["done"], summary.counts["done"] - summary.already
     typer.echo(
         f"{done} of {sum(summary.counts.values()) + len(summary.unusable)} recordings have their result, {new} of them new, in {summary.seconds:.1f} s"

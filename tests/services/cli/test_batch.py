@@ -83,6 +83,12 @@ def test_cores_are_shared_by_the_workers(run, cores, workers, device, expected):
     assert (settings.workers, settings.threads) == expected
 
 
+def test_a_reason_that_names_the_operator_is_one_line(capsys):
+    summary = Summary(counts(failed=1), 0, failed("d.npy: 1 pixels are NaN.\n  in operator source"), 1.0)
+    batch._print(summary, Path("out"), as_json=False)
+    assert capsys.readouterr().err == "failed: r0: d.npy: 1 pixels are NaN. In operator source\n"
+
+
 def test_the_summary_in_words_and_as_json(capsys):
     summary = Summary(counts(done=3, failed=1), 1, failed("bad\nname"), 2.04, [("y\x1b", "is no recording")])
     batch._print(summary, Path("out"), as_json=False)
