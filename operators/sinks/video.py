@@ -283,7 +283,7 @@ def side_by_side(rendered: RenderedFrame) -> NDArray[np.uint8]:
     _caption(canvas, 8, f"{frame.status.value}  frame {frame.seq}  {frame.time_s:.2f} s")
     right = f"reconstruction  model {rendered.model_version}"
     if not rendered.trained:
-        right += "  held out"
+        right += "  not trained on"
     _caption(canvas, middle + 8, right, _TEXT if rendered.trained else _HELD_OUT)
     canvas[:, middle - 1 : middle + 1] = _BACKGROUND
     return canvas

@@ -106,7 +106,7 @@ def pictures_section(keyframes: Sequence[KeyframePictures], worst_seq: int | Non
     for pictures in keyframes:
         rendered, quality = pictures.scored.rendered, pictures.scored.quality
         seq = rendered.frame.seq
-        tags = "" if rendered.trained else '<span class="tag held">held out</span>'
+        tags = "" if rendered.trained else '<span class="tag held">not trained on</span>'
         if seq == worst_seq:
             tags += '<span class="tag worst">lowest PSNR</span>'
         near_far = pictures.depth_range

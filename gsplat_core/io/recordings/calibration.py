@@ -308,6 +308,7 @@ def read_poses_bounds(
     if world_to_camera is None:
         return None
     camera = Camera.from_focal(focal_px, width_px, height_px, world_to_camera[0])
+    note_unusual_camera(path, camera, findings)
     return Calibration(camera, world_to_camera, path.name)
 
 
@@ -367,7 +368,35 @@ def read_pinhole(path: Path, content: dict[str, Any], findings: Findings) -> Cam
             f" {MAX_INTRINSICS_PX:g} px from 0, the model is one of {', '.join(CAMERA_MODELS)}",
         )
         return None
-    return Camera(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), int(width), int(height), model=model)
+    camera = Camera(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), int(width), int(height), model=model)
+    note_unusual_camera(path, camera, findings)
+    return camera
+
+
+USUAL_VIEW_DEG = (5, 165)
+"""Angles of view of a pinhole camera, across one side of the picture, outside which a note asks whether the camera is right."""
+
+
+def note_unusual_camera(path: Path, camera: Camera, findings: Findings) -> None:
+    """Warn of a principal point outside the picture, and of a pinhole camera's unusual angle of view."""
+    (cx, cy), (fx, fy) = camera.K[:2, 2], (camera.K[0, 0], camera.K[1, 1])
+    width, height = camera.width_px, camera.height_px
+    if not (0 <= cx <= width and 0 <= cy <= height):
+        findings.warn(
+            path,
+            f"the principal point ({cx:g}, {cy:g}) is outside the picture of {width}x{height} px",
+            "If the picture is no cut-out of a larger one, give cx and cy in pixels of this picture",
+        )
+    if camera.model != "pinhole":
+        return
+    for side, size, focal, middle in (("width", width, fx, cx), ("height", height, fy, cy)):
+        degrees = math.degrees(math.atan2(middle, focal) + math.atan2(size - middle, focal))
+        if not USUAL_VIEW_DEG[0] <= degrees <= USUAL_VIEW_DEG[1]:
+            findings.warn(
+                path,
+                f"the camera sees {degrees:.1f}° across the {side}: a focal length of {focal:g} px for {size} px",
+                "Give focal lengths in pixels of these pictures",
+            )
 
 
 MAX_DISTORTION = 1e3

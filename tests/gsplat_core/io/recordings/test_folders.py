@@ -223,3 +223,19 @@ def test_exif_rotation_is_not_applied_and_noted(
     recording = open_recording(tmp_path)
     assert any("0." + suffix in note and "orientation 6" in note for note in recording.notes) == (orientation == 6)
     assert next(iter(recording)).image.shape == (make.height, make.width, 3)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({}, None),
+        ({"cx": -3}, "principal point"),
+        ({"fx": 0.001}, "across the width"),
+        ({"fy": 1e6}, "across the height"),
+    ],
+)
+def test_an_unusual_camera_is_noted(cameras_folder: Path, change: dict[str, float], said: str | None) -> None:
+    path = cameras_folder / "cameras.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    notes = [note for note in open_recording(cameras_folder).notes if "cameras.json" in note]
+    assert [said in note for note in notes] == [True] if said else not notes
