@@ -181,6 +181,8 @@ def _along_path(model: Model, camera: Camera, file: Path) -> View:
 
 RESERVE_BYTES = 2**20
 VIDEO_SUFFIX = ".mp4"
+OTHER_SUFFIXES = (".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".gif", ".png", ".jpg", ".jpeg", ".tif", ".tiff")
+"""Suffixes of files that rendering does not write. A folder with such a name is likely a mistake."""
 
 
 def render_model(
@@ -233,6 +235,10 @@ def render_model(
     to_video = out.suffix.lower() == VIDEO_SUFFIX
     if to_video:
         check_video_path(inputs, out, overwrite)
+    elif out.suffix.lower() in OTHER_SUFFIXES:
+        raise OutputError(
+            f"{out}: files of this kind are not written; give a video that ends in {VIDEO_SUFFIX}, or a folder of images"
+        )
     check_device(device)
     check_renderer(renderer, device, options=options)
     model = load_model(bundle).to(device)

@@ -100,6 +100,9 @@ def test_nothing_is_written_where_it_does_not_belong(bundle, tmp_path):
     (tmp_path / "folder.mp4").mkdir()
     with pytest.raises(OutputError, match="is a folder"):
         render_model(bundle, tmp_path / "folder.mp4")
+    with pytest.raises(OutputError, match=r"give a video that ends in \.mp4"):
+        render_model(bundle, tmp_path / "v.AVI")
+    assert not (tmp_path / "v.AVI").exists()
 
 
 def test_an_unknown_renderer_is_refused_before_the_model_is_read(tmp_path):
