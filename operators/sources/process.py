@@ -313,6 +313,10 @@ class ChildLost(Exception):
     """The process that reads the source ended, does not respond, or sent an invalid message."""
 
 
+class ChildRefused(ChildLost):
+    """The source in the process raised a UserError while it was read, for example for a damaged file."""
+
+
 @dataclass(frozen=True)
 class Opening:
     """Function, address and options for opening a source in the process."""
@@ -452,8 +456,8 @@ class ProcessSource(LiveSource):
             hung_after_s: time without a message after which the process is replaced, in seconds.
             stuck_after_s: time without a frame of a stalled source after which the process is replaced, in seconds.
             open_timeout_s: timeout for opening the source, in seconds.
-            may_return: a source that is unavailable may return, such as a camera. Otherwise, as for a missing file, the
-                failure counts towards `MOST_FAILURES`.
+            may_return: a source that is unavailable may return, such as a camera. Otherwise a source that refuses its
+                address or content, as for a missing or damaged file, is given up at once.
 
         Raises:
             SourceUnavailable: the source cannot be opened; has the message of the process.
@@ -519,8 +523,10 @@ class ProcessSource(LiveSource):
         self._end()
 
     def frames(self) -> Iterator[Frame]:
-        """Yield the frames of the child process, and of its replacements after an exit, hang or failure. Raises SourceLost
-        after `MOST_FAILURES` failures without a frame.
+        """Yield the frames of the child process, and of its replacements after an exit, hang or failure.
+
+        Raises:
+            SourceLost: after `MOST_FAILURES` failures without a frame, or the first error of a source that cannot return.
         """
         backoff, crashes = Backoff(), 0
         try:
@@ -538,13 +544,16 @@ class ProcessSource(LiveSource):
                     self._earlier_counts.update(self._child_counts)
                     self._child_counts, self._child_state = {}, None
                     name = self.description.name
+                    if not self._may_return and isinstance(error, ChildRefused | SourceUnavailable):
+                        # Another process would find the same file, and repeat the frames before the error.
+                        raise SourceLost(str(error)) from error
                     delay_s = backoff.failed()
-                    # A missing camera may return. Missing files and repeated crashes are permanent.
+                    # A missing camera may return. Repeated crashes are permanent.
                     comes_back = isinstance(error, SourceUnavailable) and self._may_return
                     crashes = 0 if comes_back else crashes + 1
                     if crashes >= MOST_FAILURES:
                         raise SourceLost(
-                            f"{name} is given up after {crashes} attempts: {error}. Check the source and start again."
+                            f"{name} is given up after {crashes} attempts: {str(error).rstrip('.')}. Check the source and start again."
                         ) from error
                     self.count("process_restarts")
                     self.lost(f"the process that reads {name} failed ({error}); another one is started")
@@ -598,7 +607,9 @@ class ProcessSource(LiveSource):
         elif kind == "log":
             level = message.get("level")
             log.log(level if isinstance(level, int) else logging.INFO, "%s", message.get("text"))
-        elif kind in ("refused", "failed"):
+        elif kind == "refused":
+            raise ChildRefused(str(message.get("error")))
+        elif kind == "failed":
             raise ChildLost(str(message.get("error")))
 
     def _start(self) -> SourceDescription:

@@ -45,6 +45,8 @@ class StandIn(LiveSource):
             elif what == "raise":
                 time.sleep(0.3)
                 raise ValueError(value)
+            elif what == "refuse":
+                raise InvalidSetting(value)
             elif what == "lost":
                 self.lost(value)
             elif what == "log":

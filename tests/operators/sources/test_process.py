@@ -128,6 +128,23 @@ def test_an_exception_in_the_source_is_a_reason_to_start_again(stand_in, caplog)
     assert "ValueError: what is this" in caplog.text
 
 
+@pytest.mark.parametrize("frames", [0, 2])
+def test_a_file_that_is_damaged_ends_the_source_at_once_and_no_frame_is_repeated(stand_in, frames):
+    source = stand_in(f"frames={frames},refuse=frame 2 is damaged. Remove it.")
+    source.open()
+    assert [read(source).seq for _ in range(frames)] == list(range(frames))
+    with pytest.raises(SourceLost, match=r"^frame 2 is damaged\. Remove it\.$"):
+        source.read(SOON_S)
+    assert "process_restarts" not in source.counts()
+
+
+def test_a_camera_that_refuses_is_opened_again(stand_in, monkeypatch):
+    monkeypatch.setattr(process, "MOST_FAILURES", 2)
+    source = stand_in("frames=1,refuse=no signal.", may_return=True)
+    source.open()
+    assert [read(source).seq for _ in range(2)] == [0, 1]
+
+
 @pytest.mark.slow
 def test_a_process_that_says_nothing_is_replaced(stand_in):
     source = stand_in("frames=1,crash=SIGSTOP", hung_after_s=0.5)
