@@ -25,7 +25,7 @@ from gsplat_core.ops.arguments import TileGrid
 from gsplat_core.ops.tiles import bin_splats
 from gsplat_core.rendering.flow import projected
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.scene.gaussians import SH_C0, Gaussians, rotations
+from gsplat_core.scene.gaussians import SH_C0, Gaussians, inert_gaussians, rotations
 
 CURVES = "curves"
 """Key in `Gaussians.extra` of the control points of the splats' Bézier curves."""
@@ -276,6 +276,9 @@ def render_kernel(
         raise InvalidInput(
             f"the kernel {kernel.name!r} needs Gaussians with {', '.join(missing)}; add them by with_curves"
         )
+    if not gaussians.count:
+        # The lists of tiles are padded with the first splat, which must exist.
+        gaussians = inert_gaussians(gaussians, 1)
     rows = projected(gaussians, camera)
     opacities = gaussians.opacities
     grid = TileGrid(TILE_SIZE, -(-camera.width_px // TILE_SIZE), -(-camera.height_px // TILE_SIZE))

@@ -696,7 +696,10 @@ def blended_along_rays(
         first_rows = [0, *itertools.accumulate(counts)]
     else:
         first_rows = [n * image for image in range(images + 1)]
-    flat = lambda values, trailing: values.reshape(-1, *values.shape[values.dim() - trailing :])
+    # With the number of rows, because -1 is ambiguous for no Gaussians.
+    flat = lambda values, trailing: values.reshape(
+        math.prod(values.shape[: values.dim() - trailing]), *values.shape[values.dim() - trailing :]
+    )
     means2d, conics, opacities = flat(rows.means2d, 1), flat(rows.conics, 1), splats.opacities.reshape(-1)
     max_alpha = CONSTANTS[settings.constants].max_alpha
     distances, normals = [], []

@@ -281,6 +281,14 @@ def test_a_curve_moves_to_the_edge_of_a_picture():
     assert float(loss.detach()) < 2e-3
 
 
+@pytest.mark.parametrize("kernel", [*KERNELS])
+def test_no_gaussians_show_the_background(camera, kernel):
+    empty = with_curves(splats().select(slice(0)), 1, torch.Generator())
+    background = torch.tensor([0.2, 0.5, 0.7])
+    picture = render_kernel(empty, camera, KERNELS[kernel](), background)
+    assert torch.equal(picture, background.expand(camera.height_px, camera.width_px, 3))
+
+
 def test_wrong_arguments_are_refused(camera):
     with pytest.raises(InvalidInput, match="needs Gaussians with curves"):
         render_kernel(splats(), camera, KERNELS["cut"]())

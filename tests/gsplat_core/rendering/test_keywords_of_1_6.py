@@ -62,6 +62,20 @@ def test_the_distance_to_a_tilted_plate_is_that_along_each_ray():
 
 
 @pytest.mark.parametrize("packed", [False, True])
+@pytest.mark.parametrize("cameras", [1, 2])
+def test_no_gaussians_have_distances_and_normals_of_0(cameras: int, packed: bool):
+    given = scene(cameras=cameras)
+    for name in ("means", "quats", "scales", "opacities", "colors"):
+        given[name] = given[name][:0]
+    image, alphas, meta = rasterization(
+        **given, width=WIDTH, height=HEIGHT, render_mode="RGB-Ed", packed=packed, return_normals=True
+    )
+    assert image.shape == (cameras, HEIGHT, WIDTH, 4)
+    assert meta["normals"].shape == (cameras, HEIGHT, WIDTH, 3)
+    assert not any(bool(values.any()) for values in (image, alphas, meta["normals"]))
+
+
+@pytest.mark.parametrize("packed", [False, True])
 @pytest.mark.parametrize("mode", ["d", "RGB-Ed"])
 def test_pictures_and_gradients_are_the_references(mode: str, packed: bool):
     results = []
