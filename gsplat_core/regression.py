@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.errors import InvalidInput, InvalidSetting
-from gsplat_core.ops.arguments import require_float32
+from gsplat_core.ops.arguments import require_float32, require_shape
 from gsplat_core.ops.splat_regression import check_splats, splat_regression
 
 SMALLEST_MASS = 1e-4
@@ -81,9 +81,15 @@ def loss_and_gradients(splats: Splats, points: Tensor, targets: Tensor) -> tuple
         splats: the model.
         points: float32 [n, d].
         targets: y, float32 [n, m].
+
+    Raises:
+        InvalidInput: for targets of another shape than f at the points.
     """
     with torch.no_grad():
-        off = splats(points) - targets
+        found = splats(points)
+        # Other shapes would be broadcast.
+        require_shape("targets", targets, tuple(found.shape), "[n, m] as the splats' values at the points are")
+        off = found - targets
         loss = off.square().sum() / max(len(points), 1)
         return loss, _backward(points, splats, off * (2 / max(len(points), 1)))
 
@@ -223,7 +229,7 @@ def fit(
         The splats and the losses.
 
     Raises:
-        InvalidInput: for wrong shapes or dtypes, or without points.
+        InvalidInput: for wrong shapes or dtypes, values that are not finite, or without points.
     """
     options = FitOptions() if options is None else options
     require_float32("fit", points=points, values=values)
@@ -231,6 +237,9 @@ def fit(
         raise InvalidInput(
             f"points must be [n, d] and values [n, m] with n > 0, got {list(points.shape)} and {list(values.shape)}"
         )
+    if not bool(values.isfinite().all()):
+        wrong = int((~values.isfinite()).sum())
+        raise InvalidInput(f"{wrong} of {values.numel()} values are NaN or infinite; leave their points out")
     random = torch.Generator().manual_seed(options.seed)
     if start is None:
         if count < 1:

@@ -155,5 +155,12 @@ def test_wrong_arguments_are_refused():
         fit(points, values[:10])
     with pytest.raises(InvalidInput, match="count is 0"):
         fit(points, values, 0)
+    with pytest.raises(InvalidInput, match="1 of 300 values are NaN or infinite"):
+        fit(points, values.index_fill(0, torch.tensor([7]), math.nan))
+    two_channels = random_splats(channels=2)  # one channel of targets would be broadcast to both
+    with pytest.raises(InvalidInput, match=r"targets must be .* = \[300, 2\], got \[300, 1\]"):
+        fit(points, values, start=two_channels)
+    with pytest.raises(InvalidInput, match=r"targets must be .* got \[300\]"):
+        loss_and_gradients(random_splats(channels=1), points, values[:, 0])
     with pytest.raises(InvalidSetting, match="birth_until is 2"):
         FitOptions(birth_until=2)
