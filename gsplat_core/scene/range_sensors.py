@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from numbers import Integral
 from typing import ClassVar, Literal, get_args
 
 import numpy as np
@@ -43,8 +44,8 @@ class RangeSensor:
             raise InvalidSetting(
                 f"the sensor measures from {self.nearest} to {self.farthest}; give a range with 0 <= nearest < farthest"
             )
-        if not 1 <= self.bins <= 65536:
-            raise InvalidSetting(f"bins is {self.bins}; it must be 1 to 65536")
+        if not isinstance(self.bins, Integral) or not 1 <= self.bins <= 65536:
+            raise InvalidSetting(f"bins is {self.bins}; it must be a whole number from 1 to 65536")
         if self.form not in get_args(Form):
             raise InvalidSetting(f"form is {self.form!r}; choose {' or '.join(get_args(Form))}")
 
@@ -121,7 +122,7 @@ class RangeScan:
     """Measurement of a range sensor, taken at the same time and from the same place as a frame.
 
     Raises:
-        InvalidInput: for counts of another shape than the sensor's.
+        InvalidInput: for counts of another shape than the sensor's, or counts that are negative or not finite.
     """
 
     sensor: RangeSensor
@@ -137,6 +138,12 @@ class RangeScan:
             )
         if self.sensor.form == "image" and len(self.counts) != 1:
             raise InvalidInput(f"a scan of form image has one row of counts, got {len(self.counts)}")
+        wrong = int(np.count_nonzero(~((self.counts >= 0) & np.isfinite(self.counts))))
+        if wrong:
+            raise InvalidInput(
+                f"{wrong} of {self.counts.size} counts of a scan are negative, NaN or infinite; give 0 where nothing was"
+                " measured"
+            )
 
 
 def resized_scan(scan: RangeScan, width_px: int, scale: float) -> RangeScan:
@@ -152,7 +159,9 @@ def resized_scan(scan: RangeScan, width_px: int, scale: float) -> RangeScan:
     sums = np.concatenate([np.zeros((1, scan.counts.shape[1])), np.cumsum(scan.counts, 0, np.float64)])
     low = np.floor(edges).astype(int).clip(max=len(scan.counts) - 1)
     at_edges = sums[low] + (edges - low)[:, None] * (sums[low + 1] - sums[low])
-    return RangeScan(sensor, (np.diff(at_edges, axis=0) / np.diff(edges)[:, None]).astype(np.float32))
+    # Rounding can make a difference of the sums slightly negative.
+    counts = np.diff(at_edges, axis=0).clip(min=0) / np.diff(edges)[:, None]
+    return RangeScan(sensor, counts.astype(np.float32))
 
 
 def simulate_scan(
@@ -177,12 +186,18 @@ def simulate_scan(
         ambient: expected returns of ambient light per bin.
 
     Raises:
-        InvalidInput: for a depth map of another size than the camera's.
+        InvalidInput: for a depth map of another size than the camera's, or a negative number of photons, bins or returns.
     """
+    depth = np.asarray(depth)
     if depth.shape != (camera.height_px, camera.width_px):
         raise InvalidInput(
             f"the depth map is {list(depth.shape)}, the camera's picture {[camera.height_px, camera.width_px]}"
         )
+    if not photons >= 0:
+        raise InvalidInput(f"photons is {photons}; it must be 0 or more")
+    for name, value in (("jitter_bins", jitter_bins), ("ambient", ambient)):
+        if not 0 <= value < math.inf:
+            raise InvalidInput(f"{name} is {value}; it must be 0 or more, and finite")
     factors = sensor.factors(camera)
     ranges = depth if factors is None else depth * factors
     at = np.floor((ranges - sensor.nearest) / sensor.bin_width)

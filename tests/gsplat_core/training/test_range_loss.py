@@ -116,3 +116,26 @@ def test_wrong_arguments_are_refused(camera):
     observation = Observation(0, 0.0, camera, image, mask, None, ranges=scan)
     with pytest.raises(InvalidInput, match="5 columns, the picture 24"):
         RangeLoss()(wall(40.0), observation, LossContext([], lambda time_s: wall(40.0)))
+
+
+@pytest.mark.parametrize("value", [-1.0, np.nan, np.inf])
+def test_counts_that_no_sensor_gives_are_refused(value):
+    counts = np.zeros((4, 8), np.float32)
+    counts[2, 3] = value
+    with pytest.raises(InvalidInput, match="1 of 32 counts of a scan are negative, NaN or infinite"):
+        RangeScan(StructuredLight(1, 9, 8), counts)
+
+
+@pytest.mark.parametrize(
+    ("argument", "value"),
+    [("photons", -5.0), ("photons", np.nan), ("jitter_bins", -1.0), ("jitter_bins", np.nan), ("ambient", -1.0), ("ambient", np.inf)],
+)  # fmt: skip
+def test_a_simulation_names_a_number_out_of_range(camera, argument, value):
+    depth = np.full((camera.height_px, camera.width_px), 4.0)
+    with pytest.raises(InvalidInput, match=f"{argument} is {value}; it must be 0 or more"):
+        simulate_scan(depth, camera, StructuredLight(1, 9, 8), np.random.default_rng(0), **{argument: value})
+
+
+def test_bins_are_a_whole_number():
+    with pytest.raises(InvalidSetting, match=r"bins is 1\.5; it must be a whole number"):
+        StructuredLight(1, 9, 1.5)
