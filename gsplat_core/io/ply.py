@@ -36,7 +36,7 @@ from gsplat_core.io.model_files import (
     open_model_file,
     read_rows,
 )
-from gsplat_core.scene.gaussians import MAX_SH_DEGREE, SH_C0, Gaussians
+from gsplat_core.scene.gaussians import MAX_SH_DEGREE, SH_C0, Gaussians, require_gaussians
 
 POSITION, COLOUR = ("x", "y", "z"), ("f_dc_0", "f_dc_1", "f_dc_2")
 SCALE, ROTATION = ("scale_0", "scale_1", "scale_2"), ("rot_0", "rot_1", "rot_2", "rot_3")
@@ -50,6 +50,7 @@ def save_ply(gaussians: Gaussians, path: str | Path) -> None:
     Raises:
         OSError: if it cannot be written.
     """
+    require_gaussians("save_ply", gaussians)
     path = Path(path)
     draft = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     write_durably(draft, ply_pieces(gaussians))

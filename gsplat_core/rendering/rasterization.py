@@ -43,7 +43,7 @@ from gsplat_core.ops.tiles import bin_splats
 from gsplat_core.rendering.pipeline import Operations, camera_centers
 from gsplat_core.rendering.settings import PLAIN_TENSORS, TILE_SIZE, Arguments, RenderSettings, is_transformed
 from gsplat_core.scene.cameras import CAMERA_MODELS, Camera
-from gsplat_core.scene.gaussians import Gaussians
+from gsplat_core.scene.gaussians import Gaussians, require_gaussians
 from gsplat_core.transfers import HostCopy
 
 __all__ = ["RenderOutput", "rasterization", "render"]
@@ -326,6 +326,7 @@ def render(gaussians: Gaussians, camera: Camera, background: Tensor | None = Non
         background: colour [3]; None for black.
         depth: False skips the depth channel; `RenderOutput.depth` is then 0 (unknown).
     """
+    require_gaussians("render", gaussians)
     if background is not None:
         require_shape("background", background, (3,), "[3]")
     viewmat, intrinsics = camera.matrices(gaussians.device, gaussians.dtype)

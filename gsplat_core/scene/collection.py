@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.scene.gaussians import SH_C0, Gaussians
+from gsplat_core.scene.gaussians import SH_C0, Gaussians, require_gaussians
 
 
 def harmonic_bases(degree: int, dirs: Tensor) -> Tensor:
@@ -100,6 +100,7 @@ class GaussianCollection:
     """
 
     def __init__(self, gaussians: Gaussians) -> None:
+        require_gaussians("GaussianCollection", gaussians)
         self._gaussians = gaussians.detach()
 
     @property
@@ -222,9 +223,11 @@ class GaussianCollection:
         Of two degrees of spherical harmonics the higher one is kept; the other side's further coefficients are zeros.
 
         Raises:
-            InvalidInput: if dtype or device differ.
+            InvalidInput: if dtype, device or the shape of an extra tensor differ.
         """
-        mine, theirs = self._gaussians, other.gaussians if isinstance(other, GaussianCollection) else other.detach()
+        added = other.gaussians if isinstance(other, GaussianCollection) else other
+        require_gaussians("merge", added)
+        mine, theirs = self._gaussians, added.detach()
         bases = max(mine.sh.shape[1], theirs.sh.shape[1])
         mine, theirs = _with_bases(mine, bases), _with_bases(theirs, bases)
         if theirs.right_sh is not None:

@@ -51,6 +51,11 @@ class Gaussians:
     """Further parameters [N, ...] of a renderer or output by name, such as the logits of semantic classes."""
 
     def __post_init__(self) -> None:
+        for name, value in self.tensors().items():
+            if not isinstance(value, Tensor):
+                raise InvalidInput(
+                    f"gaussians: {name} must be a tensor, got {type(value).__name__}; convert it by torch.as_tensor"
+                )
         n = self.means.shape[0] if self.means.dim() else -1
         expected = {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "logit_opacities": (n,)}
         for name, shape in expected.items():
@@ -183,7 +188,7 @@ class Gaussians:
         `right_sh` and `extra` are kept if these Gaussians have them; missing values of `other` become 0.
 
         Raises:
-            InvalidInput: if SH degree, dtype or device differ.
+            InvalidInput: if SH degree, dtype, device or the shape of an extra tensor differ.
         """
         if other.sh_degree != self.sh_degree:
             raise InvalidInput(f"gaussians: cannot append SH degree {other.sh_degree} to degree {self.sh_degree}")
@@ -191,9 +196,25 @@ class Gaussians:
             raise InvalidInput(
                 f"gaussians: cannot append {other.dtype} on {other.device} to {self.dtype} on {self.device}"
             )
+        for name, tensor in self.extra.items():
+            added = other.extra.get(name, tensor)
+            if added.shape[1:] != tensor.shape[1:]:
+                raise InvalidInput(
+                    f"gaussians: cannot append extra {name!r} {list(added.shape)} to {list(tensor.shape)}; only the number of"
+                    " rows may differ"
+                )
         theirs = other.like(self).tensors()
         return Gaussians.from_tensors(
             {name: torch.cat([tensor, theirs[name]]) for name, tensor in self.tensors().items()}
+        )
+
+
+def require_gaussians(function: str, value: object) -> None:
+    """Raise InvalidInput unless an argument of the public function `function` is `Gaussians`."""
+    if not isinstance(value, Gaussians):
+        raise InvalidInput(
+            f"{function} takes Gaussians, got {type(value).__name__}; a Model gives them by at(time_s), a GaussianCollection as"
+            " gaussians"
         )
 
 

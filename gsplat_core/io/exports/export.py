@@ -31,7 +31,7 @@ from gsplat_core.io.ply import compressed_ply_pieces, ply_pieces
 from gsplat_core.io.spz import spz_pieces
 from gsplat_core.models import Model
 from gsplat_core.ops.arguments import require_shape
-from gsplat_core.scene.gaussians import Gaussians
+from gsplat_core.scene.gaussians import Gaussians, require_gaussians
 
 TIMES_FILE = "times.json"
 NODE_NAME = "reconstruction"
@@ -87,11 +87,15 @@ def save_gaussians(gaussians: Gaussians, path: str | Path, *, overwrite: bool = 
 
     Raises:
         InvalidSetting: for an ending without a format of Gaussians.
-        ExportError: if the format cannot represent the Gaussians.
+        ExportError: if the format cannot represent the Gaussians, or a value is not finite.
         BundleError: if the Gaussians cannot be shown, or there is a folder of this name.
         OSError: if the file cannot be written.
     """
+    require_gaussians("save_gaussians", gaussians)
     path = Path(path)
+    wrong = int((~gaussians.means.isfinite()).sum())
+    if wrong:
+        raise ExportError(f"means holds {wrong} values that are NaN or infinite; such a model is not exported")
     model = static_model(gaussians.detach().to("cpu", torch.float32), path)
     if path.suffix:
         wish = ExportWish(format_of(path))

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_core import Camera, Gaussians, InvalidInput, reference, render, save_gaussians
-from gsplat_core.errors import BundleError, InvalidSetting
+from gsplat_core import Camera, Gaussians, InvalidInput, reference, render, save_gaussians, save_ply
+from gsplat_core.errors import BundleError, ExportError, InvalidSetting
 from gsplat_core.io.model_sources import load_model
 from gsplat_core.scene.collection import GaussianCollection, harmonic_bases, rotated_harmonics
 
@@ -130,9 +130,14 @@ def test_wrong_edits_are_refused():
         (lambda: scene.transform(scale=0.0), "scale must be greater than 0 and finite, got 0.0"),
         (lambda: scene.recolour(colour=(2, 0, 0)), "from 0 to 1, got"),
         (lambda: scene.delete(torch.ones(3, dtype=torch.bool)), r"bool \[40\], got torch.bool \[3\]"),
+        (lambda: scene.merge("tool.ply"), "merge takes Gaussians, got str"),
+        (lambda: GaussianCollection(scene), "takes Gaussians, got GaussianCollection; .* as gaussians"),
     ]:
         with pytest.raises(InvalidInput, match=message):
             edit()
+    labelled = GaussianCollection(gaussians(semantics=torch.zeros(40, 4)))
+    with pytest.raises(InvalidInput, match=r"cannot append extra 'semantics' \[3, 5\] to \[40, 4\]"):
+        labelled.merge(gaussians(3, semantics=torch.zeros(3, 5)))
     with pytest.raises(InvalidInput, match="label must be from 0 to 3, got 4"):
         GaussianCollection(gaussians(semantics=torch.zeros(40, 4))).labelled(4)
 
@@ -149,6 +154,27 @@ def test_an_edited_collection_is_saved_and_loaded(tmp_path, name):
     with pytest.raises((OSError, BundleError)):
         save_gaussians(scene.gaussians, tmp_path / name)
     save_gaussians(scene.gaussians, tmp_path / name, overwrite=True)
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.spz", "a"])
+def test_positions_that_are_not_finite_are_named_and_not_saved(tmp_path, name):
+    scene = gaussians()
+    scene.means[3, 1] = math.nan
+    with pytest.raises(ExportError, match="means holds 1 values that are NaN or infinite"):
+        save_gaussians(scene, tmp_path / name)
+    assert not any(tmp_path.iterdir())
+
+
+def test_functions_of_gaussians_name_another_argument(tmp_path):
+    scene = GaussianCollection(gaussians())
+    camera = Camera.from_focal(40, 16, 16)
+    for name, call in {
+        "save_gaussians": lambda: save_gaussians(scene, tmp_path / "a.ply"),
+        "save_ply": lambda: save_ply(scene, tmp_path / "a.ply"),
+        "render": lambda: render(scene, camera),
+    }.items():
+        with pytest.raises(InvalidInput, match=f"{name} takes Gaussians, got GaussianCollection"):
+            call()
 
 
 def test_names_without_a_format_of_gaussians_are_refused(tmp_path):

@@ -69,6 +69,7 @@ def test_gradients_flow_and_detach_stops_them():
         ({"sh": torch.zeros(5, 3)}, r"sh must be \[N, K, 3\]"),
         ({"sh": torch.zeros(5, 5, 3)}, r"K one of \[1, 4, 9, 16, 25\], got \[5, 5, 3\]"),
         ({"quats": torch.zeros(5, 4).double()}, "one floating-point dtype"),
+        ({"quats": torch.zeros(5, 4).numpy()}, "quats must be a tensor, got ndarray; convert it"),
     ],
 )
 def test_wrong_shapes_are_refused(change, message):
