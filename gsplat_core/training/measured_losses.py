@@ -290,13 +290,21 @@ def triangulate(
     Returns:
         World points [P, 3], and which of them are reliable, bool [P]: at least two other views at 1.5° or more, in
         front of all views, and within 1 px (root mean square) of the matches.
+
+    Raises:
+        InvalidInput: unless there is a camera for each view of the matches.
     """
+    matches = np.asarray(matches, np.float64)
+    if matches.ndim != 3 or matches.shape[1:] != (len(cameras), 2) or not cameras:
+        raise InvalidInput(
+            f"matches must be [P, V, 2] with a camera for each of V views, got {list(matches.shape)} and {len(cameras)} cameras"
+        )
     P = np.stack([camera.K @ camera.world_to_camera[:3] for camera in cameras])
     scaled = P / np.linalg.norm(P, axis=(1, 2), keepdims=True)
     known: NDArray[np.bool_] = np.asarray(np.isfinite(matches).all(-1))
     pixels = np.where(known[..., None], matches, 0)
     rows = pixels[..., None] * scaled[None, :, 2:3] - scaled[None, :, :2]
-    rows = np.where(known[..., None, None], rows, 0).reshape(len(matches), -1, 4)
+    rows = np.where(known[..., None, None], rows, 0).reshape(len(matches), 2 * len(cameras), 4)
     _, _, v = np.linalg.svd(rows, full_matrices=rows.shape[1] < 4)
     homogeneous = v[:, 3]
     with np.errstate(divide="ignore", invalid="ignore"):

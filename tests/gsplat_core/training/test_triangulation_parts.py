@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_core.errors import InvalidSetting
+from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.training import initialisation, measured_losses
 from gsplat_core.training.losses import LossContext, loss_weights
@@ -90,6 +90,16 @@ def test_points_are_within_a_pixel_of_their_matches(off_px, reliable):
     pixels = matched(cameras, np.array([[0.0, 0, 40]]))
     pixels[0, :, 1] += np.array([1, -1, -1, 1]) * off_px * 0.5
     assert triangulate(pixels, cameras)[1].tolist() == [reliable]
+
+
+def test_no_points_are_triangulated_to_none_and_each_view_has_a_camera():
+    cameras = [at(-3.0), at(0.0), at(3.0)]
+    points, found = triangulate(np.zeros((0, 3, 2)), cameras)
+    assert points.shape == (0, 3) and found.shape == (0,)
+    pixels = matched(cameras, np.array([[0.0, 0, 40]]))
+    for wrong, given in ((pixels, cameras[:2]), (pixels[0], cameras), (pixels[:, :0], [])):
+        with pytest.raises(InvalidInput, match=f"with a camera for each of V views, got .* and {len(given)} cameras"):
+            triangulate(wrong, given)
 
 
 def test_points_behind_a_view_are_not_reliable():
