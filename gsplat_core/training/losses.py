@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.choices import LOSSES
-from gsplat_core.errors import InvalidSetting
+from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.ops.arguments import View
 from gsplat_core.ops.image_loss import image_loss
 from gsplat_core.ops.ray_losses import ray_depth_loss, ray_normal_loss
@@ -189,11 +189,20 @@ class WeightedLosses:
         return {name: rate for loss in extending for name, rate in loss.rates.items()}
 
     def __call__(self, scene: Gaussians, observation: Observation, context: LossContext) -> Tensor | None:
-        """Return the weighted sum, see `Loss.__call__`; None if no loss has anything to compare."""
+        """Return the weighted sum, see `Loss.__call__`; None if no loss has anything to compare.
+
+        Raises:
+            InvalidInput: for a loss that returns something else than one value.
+        """
         total = self.compare(rays_of(scene, observation)) if self.are_rays_due(observation) else None
         for loss, weight in self._terms:
             value = loss(scene, observation, context)
             if value is not None:
+                if not isinstance(value, Tensor) or value.dim():
+                    found = list(value.shape) if isinstance(value, Tensor) else type(value).__name__
+                    raise InvalidInput(
+                        f"the loss {loss.name!r} returned {found}; it must return a tensor of one value, or None"
+                    )
                 total = weight * value if total is None else total + weight * value
         return total
 

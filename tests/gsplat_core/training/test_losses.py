@@ -2,12 +2,13 @@
 
 import dataclasses
 
+import numpy as np
 import pytest
 import torch
 
 from gsplat_core.choices import LOSSES
 from gsplat_core.deformation import BasisField, HexPlaneField
-from gsplat_core.errors import InvalidSetting
+from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.training.config import LearningRates, ReconstructorConfig
 from gsplat_core.training.initialisation import gaussians_from_frame
 from gsplat_core.training.losses import EVERY, LossContext, loss_weights
@@ -128,6 +129,18 @@ def test_the_loss_value_is_added(small_opacities, make_step, make_frame, camera)
     scene = step.at(seen.time_s)
     expected = loss_and_gradients(scene, seen, LossWeights(depth=0.0)).loss + 0.5 * scene.logit_opacities.mean()
     torch.testing.assert_close(step(seen), expected)
+
+
+@pytest.mark.parametrize(
+    ("result", "found"), [(torch.zeros(3, 2), r"\[3, 2\]"), (0.5, "float"), (np.float32(0.5), "float32")]
+)
+def test_a_loss_that_returns_no_single_value_is_named(
+    small_opacities, make_step, make_frame, camera, monkeypatch, result, found
+):
+    monkeypatch.setattr(SmallOpacities, "__call__", lambda *arguments: result)
+    step = make_step(losses=("small_opacities",))
+    with pytest.raises(InvalidInput, match=f"the loss 'small_opacities' returned {found}; it must return a tensor"):
+        step(Observation.of(make_frame(4, shift_px=1), camera))
 
 
 def test_a_loss_without_anything_to_compare_changes_nothing(small_opacities, make_step, make_frame, camera):
