@@ -149,6 +149,11 @@ def sample_splats(
     require_float32("sample_splats", sums=sums)
     if sums.shape != (camera.height_px, camera.width_px, 5):
         raise InvalidInput(f"sums must be [{camera.height_px}, {camera.width_px}, 5], got {list(sums.shape)}")
+    for name, tensor in zip(scene._fields, scene, strict=True):
+        if tensor is not None and tensor.is_floating_point() and tensor.dtype != torch.float32:
+            raise InvalidInput(
+                f"{name} of the splats must be float32, got {tensor.dtype}; convert the Gaussians by .to(dtype=torch.float32)"
+            )
     for tensor in scene.tensors():
         if tensor.device != sums.device:
             raise InvalidInput(f"the splats are on {tensor.device} and the sums on {sums.device}; use one device")

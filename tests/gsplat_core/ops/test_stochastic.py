@@ -222,11 +222,12 @@ def test_wrong_arguments_are_refused():
         sample_splats(scene, fisheye, sums, pixel_order=True)
     with pytest.raises(InvalidInput, match=r"sums must be \[24, 32, 5\]"):
         sample_splats(scene, CAMERA, sums[:, :-1])
+    with pytest.raises(InvalidInput, match=r"means of the splats must be float32, got torch\.float64"):
+        sample_splats(scene._replace(means=scene.means.double()), CAMERA, sums)
     for change, message in [
         ({"quats": None}, "covars and opacities, or quats"),
         ({"sh": scene.sh[:, :3]}, "1, 4, 9, 16 or 25"),
         ({"file_index": torch.zeros(4, dtype=torch.int32)}, "index must have 5 rows"),
-        ({"means": scene.means.double()}, "means must be float32"),
     ]:
         with pytest.raises(RuntimeError, match=message):
             sample_splats(scene._replace(**change), CAMERA, sums)

@@ -158,6 +158,14 @@ def test_storages_show_the_same_scene_with_the_same_random_numbers(name):
     assert not torch.equal(raw, quantised)
 
 
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float16])
+def test_gaussians_of_another_precision_are_refused(dtype):
+    renderer = new_renderer("stochastic", CAMERA)
+    renderer.prepare(model_of(random_scene(20).to(dtype=dtype)))
+    with pytest.raises(InvalidInput, match=f"means of the splats must be float32, got {dtype}; convert the Gaussians"):
+        renderer.render(CAMERA, 0.0)
+
+
 def test_only_raw_storage_shows_moving_models():
     gaussians = random_scene(20)
     moving = dataclasses.replace(model_of(gaussians), field=new_field("basis", gaussians, (0.0, 1.0)).detached_copy())
