@@ -27,6 +27,10 @@ def require_shape(name: str, tensor: Tensor, shape: tuple[int, ...], meaning: st
         shape: required shape.
         meaning: symbolic shape for the message, such as "[..., N, 3]".
     """
+    if not isinstance(tensor, Tensor):
+        raise InvalidInput(
+            f"{name} must be a tensor {meaning}, got {type(tensor).__name__}; convert it by torch.as_tensor"
+        )
     if tuple(tensor.shape) != tuple(shape):
         raise InvalidInput(f"{name} must be {meaning} = {list(shape)}, got {list(tensor.shape)}")
 

@@ -177,6 +177,11 @@ def test_functions_of_gaussians_name_another_argument(tmp_path):
             call()
 
 
+def test_a_background_that_is_no_tensor_is_named():
+    with pytest.raises(InvalidInput, match=r"background must be a tensor \[3\], got list"):
+        render(gaussians(), Camera.from_focal(40, 16, 16), background=[1, 1, 1])
+
+
 def test_names_without_a_format_of_gaussians_are_refused(tmp_path):
     for name in ("cut.zip", "cut.txt"):
         with pytest.raises(InvalidSetting):
