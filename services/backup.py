@@ -284,8 +284,11 @@ def _refuse_target(places: Places, target: Path) -> None:
         raise BackupFailed(f"{target} is there already, and a backup replaces nothing; give a folder that is not there")
     if not target.absolute().parent.is_dir():
         raise BackupFailed(f"{target.absolute().parent} is no folder; make it, or give another place")
-    if not places.data.is_dir():
-        raise BackupFailed(f"{places.data} has no data of a service; give --config or --data as for `intrasplat serve`")
+    # A service creates these files at its first start. An empty folder may be the mount point of a missing disk.
+    if not any(path.is_file() for path in (places.database, places.data / KEYS_FILE, places.data / AUDIT_FILE)):
+        raise BackupFailed(
+            f"{places.data} has no data of a service; mount its disk, or give --config or --data as for `intrasplat serve`"
+        )
     for folder in (places.data, places.recordings, places.replays):
         if _is_within(target, folder):
             raise BackupFailed(f"{target} lies in {folder}, which is what is backed up; give a place on another disk")

@@ -363,6 +363,10 @@ def test_a_full_disk_leaves_nothing(service, tmp_path, monkeypatch):
 def test_a_place_without_a_service_is_no_backup(tmp_path):
     with pytest.raises(BackupFailed, match="no data of a service"):
         make_backup(ServiceSettings(paths={"data": tmp_path / "nope"}), tmp_path / "backup")
+    (tmp_path / "empty").mkdir()  # the mount point of a disk that is not mounted
+    with pytest.raises(BackupFailed, match="empty has no data of a service; mount its disk, or"):
+        make_backup(ServiceSettings(paths={"data": tmp_path / "empty"}), tmp_path / "backup")
+    assert not (tmp_path / "backup").exists()
 
 
 def test_what_other_stores_keep_is_said(tmp_path):
@@ -370,6 +374,7 @@ def test_what_other_stores_keep_is_said(tmp_path):
         paths={"data": tmp_path / "data"}, registry={"database": "postgresql://a@b/c", "blobs": "s3://bucket/x"}
     )
     (tmp_path / "data").mkdir()
+    KeyStore(tmp_path / "data" / KEYS_FILE).create("admin", Role.ADMIN)
     made = make_backup(settings, tmp_path / "backup")
     assert "pg_dump" in made.elsewhere[0] and "object store" in made.elsewhere[1]
     restore_backup(ServiceSettings(paths={"data": tmp_path / "new"}), tmp_path / "backup")
