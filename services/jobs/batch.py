@@ -29,6 +29,8 @@ from services.jobs.store import MOST_AT_ONCE, JobRecord, JobState, JobStore, New
 DATABASE = BATCH_DATABASE
 WHO = "batch"
 SAY_S = 0.5
+PATIENCE_S = 10.0
+"""Seconds for which writing to the database of the jobs is retried."""
 RECORDINGS = ".recordings.json"
 """File in the output folder with the fingerprint of each recording, by name."""
 MOST_NOTES_BYTES = 1 << 26
@@ -87,6 +89,9 @@ class Batch:
             settings: settings of the pool.
             say: called with the job counts every `SAY_S`.
             stop_requested: polled.
+
+        Raises:
+            StoreUnavailable: if the database of the jobs could not be written for `PATIENCE_S`, for example on a full disk.
         """
         began_s, said_s = time.monotonic(), 0.0
         left = True
@@ -101,7 +106,7 @@ class Batch:
             return not left or stop_requested()
 
         try:
-            JobPool(self._store.database, self._results, runner, settings).run(is_over)
+            JobPool(self._store.database, self._results, runner, settings).run(is_over, patience_s=PATIENCE_S)
             counts = self._store.counts()
             failed = self._store.newest(counts["failed"], state=str(JobState.FAILED)) if counts["failed"] else []
             return Summary(counts, self.already, failed[::-1], time.monotonic() - began_s, self.unusable)

@@ -7,6 +7,7 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
+import math
 import os
 import secrets
 import select
@@ -70,14 +71,23 @@ class JobPool:
         """Return the seconds since the last job ended, or 0 while jobs run."""
         return 0.0 if self._running else time.monotonic() - self._busy_s
 
-    def run(self, is_over: Callable[[], bool]) -> None:
-        """Run until `is_over` returns True, then stop running attempts and requeue their jobs.
-        Database failures are retried."""
+    def run(self, is_over: Callable[[], bool], *, patience_s: float = math.inf) -> None:
+        """Run until `is_over` returns True, then stop running attempts and requeue their jobs. Failures of the database are
+        retried for `patience_s`.
+
+        Raises:
+            StoreUnavailable: if the database failed for longer.
+        """
+        failing_since_s: float | None = None
         try:
             while not is_over():
                 try:
                     self.step()
+                    failing_since_s = None
                 except StoreUnavailable as error:
+                    failing_since_s = failing_since_s or time.monotonic()
+                    if time.monotonic() - failing_since_s >= patience_s:
+                        raise
                     log.warning("%s", error)
                     time.sleep(AGAIN_S)
                 time.sleep(STEP_S)

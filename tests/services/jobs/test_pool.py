@@ -145,6 +145,19 @@ def test_a_database_that_does_not_answer_is_waited_for(store, runner, new_pool, 
     assert len(looks) == 2
 
 
+def test_a_database_that_fails_without_end_ends_a_pool_with_patience(store, runner, new_pool, monkeypatch):
+    submitted(store)
+    pool: JobPool = new_pool()
+    monkeypatch.setattr("services.jobs.pool.AGAIN_S", 0.0)
+
+    def never():
+        raise StoreUnavailable("its disk is full; free space")
+
+    pool.step = never
+    with pytest.raises(StoreUnavailable, match="disk is full"):
+        pool.run(lambda: False, patience_s=0.1)
+
+
 @pytest.mark.parametrize("file", ["report.json", "model.isplat"])
 def test_a_removed_result_is_gone(new_pool, tmp_path, file):
     pool = new_pool()
