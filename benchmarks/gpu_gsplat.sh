@@ -16,12 +16,13 @@ mkdir -p "$out"
 export PYTHONPATH=$PWD${PYTHONPATH:+:$PYTHONPATH} PYTHONUNBUFFERED=1
 began=$SECONDS
 
-# Run a command. Its output is OUT/NAME.txt.
+# Run a command and return its exit code. Its output is OUT/NAME.txt.
 run() {
   local name=$1 start=$SECONDS code=0
   shift
   "$@" > "$out/$name.txt" 2>&1 || code=$?
   echo "$name: exit code $code after $((SECONDS - start)) s, at $((SECONDS - began)) s" | tee -a "$out/progress.txt"
+  return "$code"
 }
 
 # Run the script of benchmarks/gsplat with the given options. Its log is OUT/NAME-cuda.json.

@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import Any
 
 FOLDER = Path(__file__).resolve().parents[1] / "logs" / "methods"
+ALONE = FOLDER.parent / "h200-2026-11-28-methods" / "training_step_ms.jsonl"
+"""Times of training steps that had the GPU for themselves: recording, variant, milliseconds."""
 DEVICES = ("cpu", "cuda")
 
 
@@ -307,13 +309,15 @@ def unchanged(folder: Path) -> str:
 
 def training(folder: Path) -> str:
     """Return the comparison of losses and renderers in training."""
+    timed = [json.loads(line) for line in ALONE.read_text(encoding="utf-8").splitlines()]
+    alone = {(name, variant): step_ms for name, variant, step_ms in timed}
     log = log_of("training", "cuda", folder) or log_of("training", "cpu", folder)
     if log is None:
         return ""
     lines = [
         "| recording | trained with | held out (dB) | neighbours' mean (dB) | depth RMS (%) | plane (%) | normals (°)"
-        " | followed points (mm) | step (ms) | command (s) |",
-        "|---" * 10 + "|",
+        " | followed points (mm) | step (ms) | step alone (ms) | command (s) |",
+        "|---" * 11 + "|",
     ]
     for name, variants in log.items():
         if not isinstance(variants, dict) or "alpha" not in variants:
@@ -323,16 +327,15 @@ def training(folder: Path) -> str:
                 (found.get("heldout_db"), 1, 2), (found.get("neighbours_mean_db"), 1, 2),
                 (found.get("depth_rmse_share"), 100, 3), (found.get("plane_rmse_share"), 100, 2),
                 (found.get("normals_mean_deg"), 1, 2), (found.get("points_mean_mm"), 1, 3),
-                (found.get("step_ms"), 1, 2), (found.get("wall_s"), 1, 0),
+                (found.get("step_ms"), 1, 2), (alone.get((name, variant)), 1, 2), (found.get("wall_s"), 1, 0),
             ]  # fmt: skip
             cells = ["–" if value is None else f"{value * scale:.{digits}f}" for value, scale, digits in numbers]
             lines.append(f"| {name} | {variant} | " + " | ".join(cells) + " |")
     text = (
         f"`intrasplat reconstruct` with {log['steps']} steps, {log['together']} runs at a time. The synthetic recordings"
-        " have exact depth. Depth and followed points of weighted sums are not evaluated: they have no depth along a ray. Two other"
-        " benchmarks shared the GPU with these runs, with the times of steps too; a step alone takes about as long, 3.7, 3.8, 25.9 and"
-        " 11.4 ms on `cutting` and 5.2, 5.4, 28.1 and 14.6 ms on the first synthetic recording"
-        " ([log](../logs/h200-2026-11-28-methods/training_step_ms.jsonl))."
+        " have exact depth. Depth and followed points of weighted sums are not evaluated: they have no depth along a ray. Other"
+        " benchmarks shared the GPU with these runs and with the times of their steps; the steps alone were timed afterwards"
+        f" until the loan ended ([log](../{ALONE.relative_to(FOLDER.parents[1])}))."
     )
     return "## Training\n\n" + text + "\n\n" + "\n".join(lines) + "\n\n" + provenance({"run": [log]})
 
