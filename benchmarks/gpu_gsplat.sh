@@ -1,12 +1,13 @@
 #!/usr/bin/env bash
-# Run the CUDA tests and the comparisons with gsplat on one NVIDIA GPU, timed ones first and alone.
+# Run the CUDA tests and the comparisons with gsplat on one or two NVIDIA GPUs.
 # Usage: benchmarks/gpu_gsplat.sh OUT GSPLAT_WHEEL GSPLAT_SOURCES [EXAMPLES] [SCRIPT...]
 #   OUT              folder of the logs
 #   GSPLAT_WHEEL     gsplat-1.5.3-py3-none-any.whl, which is compiled (peers/build_gsplat.py)
 #   GSPLAT_SOURCES   unpacked source archive of gsplat 1.5.3, whose tests are run with this package
 #   EXAMPLES         folder with gsplat's simple_trainer.py, or "" to leave the trainer out
 #   SCRIPT           further scripts of timings, run with --module gsplat and with --module gsplat_core
-# Several processes need several GPUs: gsplat/processes.py. PYTHON is the interpreter (default python3). Each benchmark prints to OUT/NAME.txt; one that fails does not stop the others.
+# With one GPU, timed benchmarks run first and alone. With two, they have the first GPU alone, the others run on the second
+# at the same time, and processes.py runs on both. PYTHON is the interpreter (default python3). Each benchmark prints to OUT/NAME.txt; one that fails does not stop the others.
 set -uo pipefail
 cd "$(dirname "$0")/.."
 out=$(realpath -m "$1") wheel=$(realpath "$2") sources=$(realpath "$3") examples=${4:-}
@@ -32,35 +33,52 @@ compare() {
   run "$name" "$python" "benchmarks/gsplat/$script.py" "$@" --device cuda --out "$out/$name-cuda.json"
 }
 
-run build benchmarks/gpu_build.sh || exit
-run build_gsplat "$python" benchmarks/peers/build_gsplat.py "$wheel" build/peers &
-building=$!
-run tests benchmarks/gpu_tests.sh
-wait $building
+gpus=$(nvidia-smi --list-gpus | wc -l)
 peers=$PWD/build/peers
 
-PYTHONPATH=$peers:$PYTHONPATH run suite "$python" benchmarks/suite.py --device cuda --only render rasterization training deformation --out "$out"
-for script in "$@"; do
-  for module in gsplat gsplat_core; do
-    PYTHONPATH=$peers:$PYTHONPATH run "$(basename "$script" .py)-$module" "$python" "$script" --module "$module"
-  done
-done
-compare surfels surfels --full
-if [ -n "$examples" ]; then
-  PYTHONPATH=$peers:$PYTHONPATH compare trainer trainer "$examples" --full --steps 3000 --seeds 0 1 2
-  PYTHONPATH=$peers:$PYTHONPATH compare trainer_wide trainer "$examples" --full --wide --steps 1000 --seeds 0 --variants gsplat ours
-fi
-
-# These compare pictures, gradients and memory, so they share the GPU.
-compare own_tests own_tests --tests "$sources/tests" --oracle "$peers/gsplat" --timeout 250 &
-beside=$!
-{
+# What compares pictures, gradients and memory, and may share a GPU.
+untimed() {
+  export CUDA_VISIBLE_DEVICES=$((gpus > 1 ? 1 : 0))
+  compare own_tests own_tests --tests "$sources/tests" --oracle "$peers/gsplat" --peer "$peers" --together 10 --timeout 400 &
+  local beside=$!
   compare calls calls
   compare cameras cameras
   compare thresholds thresholds
   compare memory memory --full
   compare strategies strategies --full --steps 3000
-} &
-beside+=" $!"
-# shellcheck disable=SC2086 # a list of numbers
-wait $beside
+  compare static static --full --steps 3000
+  wait "$beside"
+}
+
+timed() {
+  local module script
+  PYTHONPATH=$peers:$PYTHONPATH run suite "$python" benchmarks/suite.py --device cuda --only render rasterization training deformation --out "$out"
+  for script in "$@"; do
+    for module in gsplat gsplat_core; do
+      PYTHONPATH=$peers:$PYTHONPATH run "$(basename "$script" .py)-$module" "$python" "$script" --module "$module"
+    done
+  done
+  PYTHONPATH=$peers:$PYTHONPATH compare surfels surfels --full --gsplat
+  if [ -n "$examples" ]; then
+    PYTHONPATH=$peers:$PYTHONPATH compare trainer trainer "$examples" --full --steps 3000 --seeds 0 1 2
+    PYTHONPATH=$peers:$PYTHONPATH compare trainer_wide trainer "$examples" --full --wide --steps 1000 --seeds 0 --variants gsplat ours
+  fi
+}
+
+run build benchmarks/gpu_build.sh || exit
+run build_gsplat "$python" benchmarks/peers/build_gsplat.py "$wheel" "$peers" &
+building=$!
+if [ "$gpus" -gt 1 ]; then
+  compare processes processes
+fi
+run tests benchmarks/gpu_tests.sh
+wait "$building"
+
+if [ "$gpus" -gt 1 ]; then
+  untimed &
+  CUDA_VISIBLE_DEVICES=0 timed "$@"
+  wait
+else
+  timed "$@"
+  untimed
+fi

@@ -34,8 +34,6 @@ import log
 
 ROOT = Path(__file__).resolve().parents[2]
 FILES = ("test_basic.py", "test_rasterization.py", "test_strategy.py", "test_2dgs.py", "test_compression.py")
-EXCEPTIONS: dict[str, str] = {}
-"""Reason for each test that cannot pass, with its proof in float64."""
 NERFACC = """
 import torch
 
@@ -223,22 +221,17 @@ def main() -> None:
     failed = {name: about.get("why", "") for name, about in tests.items() if about["outcome"] == "failed"}
     for test, why in failed.items():
         print(f"FAILED {test}: {why}")
-    exceptions = {test: EXCEPTIONS[test] for test in failed if test in EXCEPTIONS}
     oracle = "gsplat's functions in plain torch" if chosen.oracle else "this package's reference"
     figures = {
         "gsplat": "1.5.3",
         "compared_with": oracle,
         "scene": scene,
         "files": files,
-        "exceptions": exceptions,
         "tests": tests,
         "failed_with_gsplat": failed_with_peer if chosen.peer else None,
     }
     for test in failed_with_peer:
         print(f"FAILED with gsplat itself: {test}")
-    # A file that did not end says nothing about its tests.
-    for test in sorted(name for name in set(failed) & set(failed_with_peer) if "::" in name):
-        exceptions[test] = "the compiled gsplat fails this test on this machine, too"
     places = {str(chosen.tests): "TESTS", str(chosen.oracle): "GSPLAT", str(chosen.peer): "PEER"}
     sys.argv[1:] = [places.get(word, word) for word in sys.argv[1:]]
     log.write("own_tests", chosen, figures, "gsplat")

@@ -43,11 +43,41 @@ def own_tests(logs: Logs) -> str:
         if log.get("failed_with_gsplat") is not None:
             names = ", ".join(f"`{test}`" for test in log["failed_with_gsplat"])
             scenes.append(
-                f"{device}: the same files with gsplat itself: {names + ' failed' if names else 'no test failed'}."
+                f"{device}: the same files with the compiled gsplat: {names + ' failed' if names else 'no test failed'}."
             )
-    notes = [f"- `{test}`: {why}" for log in logs.values() for test, why in log.get("exceptions", {}).items()]
+    notes = [note for device, log in logs.items() for note in _exceptions(device, log)]
     text = "\n\n".join([table(("file", "device", "passed", "failed", "skipped"), rows), *scenes])
-    return text + ("\n\nNamed exceptions:\n\n" + "\n".join(dict.fromkeys(notes)) if notes else "")
+    return text + ("\n\nNamed exceptions:\n\n" + "\n".join(notes) if notes else "")
+
+
+def _exceptions(device: str, log: Log) -> list[str]:
+    """Return a line for each function of which tests failed on the device, with its proof in float64 or without one."""
+    failed: dict[str, list[str]] = {}
+    for test, about in log["tests"].items():
+        if about["outcome"] == "failed" and "::" in test:
+            name, _, case = test.partition("::")[2].partition("[")
+            failed.setdefault(name, []).append(f"`{case.rstrip(']')}`" if case else "the test")
+    proofs = logs_of("thresholds").get(device, {})
+    lines = []
+    for name, cases in failed.items():
+        line = f"- {device}, `{name}`: {', '.join(cases)}."
+        if name in proofs:
+            runs = proofs[name]["runs"]
+            most, unexplained = (max(run[key] for run in runs) for key in ("different", "largest_unexplained"))
+            line += f" Rounding of float32: of {runs[0]['values']:,} values of a picture at most {most} differ from float64 by more than the tolerance,"
+            line += (
+                f" those that no threshold decides by at most {unexplained:.1e}"
+                if unexplained
+                else " all of these decided by a threshold"
+            )
+            line += " ([table](#rounding-near-the-thresholds-of-blending))."
+        if log.get("failed_with_gsplat") is not None:
+            also = [test for test in log["failed_with_gsplat"] if test.partition("::")[2].partition("[")[0] == name]
+            line += (
+                f" With the compiled gsplat, {len(also) or 'none'} of these cases fail{'s' if len(also) == 1 else ''}."
+            )
+        lines.append(line)
+    return lines
 
 
 def thresholds(logs: Logs) -> str:
@@ -180,7 +210,9 @@ def surfels(logs: Logs) -> str:
     for device, log in logs.items():
         for what, words in (("forward", "picture"), ("step", "picture and gradients")):
             ours, other = log[f"surfels_{what}_ms"], log[f"gaussians_{what}_ms"]
-            times.append([words, device, f"{ours:.1f} ms", f"{other:.1f} ms", f"{log[f'{what}_ratio']:.2f}"])
+            peer = log.get(f"gsplat_{what}_ms")
+            beside = ["not run", ""] if peer is None else [f"{peer:.2f} ms", f"{ours / peer:.2f}"]
+            times.append([words, device, f"{ours:.2f} ms", f"{other:.2f} ms", f"{log[f'{what}_ratio']:.2f}", *beside])
         for name, each in log["planes"].items():
             planes.append(
                 [
@@ -198,10 +230,13 @@ def surfels(logs: Logs) -> str:
     head = ("plane at a distance of 40", "device", "depth", "median depth", "normal", "normal of the depth")
     said = (
         f"`rasterization_2dgs` next to `rasterization` with the same inputs, both with depth: {sizes}. On the CPU the times are"
-        " processor time, with one thread. gsplat's 2DGS needs CUDA and was not run. Depth is that of the surfels' centres, as in"
+        " processor time, with one thread. gsplat's 2DGS needs CUDA. Depth is that of the surfels' centres, as in"
         " gsplat, so its error on a tilted plane is proportional to the standard deviation of the surfels."
     )
-    both = table(("", "device", "surfels", "Gaussians", "ratio"), times), table(head, planes)
+    both = (
+        table(("", "device", "surfels", "Gaussians", "ratio", "gsplat's surfels", "surfels to gsplat's"), times),
+        table(head, planes),
+    )
     return f"{said}\n\n{both[0]}\n\nMean errors on a plane:\n\n{both[1]}"
 
 

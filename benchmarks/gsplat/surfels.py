@@ -1,14 +1,16 @@
 """Time of surfels (2D Gaussian Splatting) beside that of 3D Gaussians, and the error of depth and normal on a plane.
 
     python benchmarks/gsplat/surfels.py
-    python benchmarks/gsplat/surfels.py --device cuda --full
+    PYTHONPATH=build/peers python benchmarks/gsplat/surfels.py --device cuda --full --gsplat
 
-Both renderers get the same centres, rotations, scales and opacities. They take turns, and each time is the median. On the
-CPU it is processor time, which other programs of the machine do not lengthen.
+Both renderers, and with `--gsplat` gsplat's `rasterization_2dgs`, too, get the same centres, rotations, scales and
+opacities. They take turns, and each time is the median. On the CPU it is processor time, which other programs of the
+machine do not lengthen.
 """
 
 from __future__ import annotations
 
+import importlib
 import math
 import statistics
 import sys
@@ -64,10 +66,13 @@ def seconds(call: Callable[[], object], device: str) -> float:
     return time.perf_counter() - start
 
 
-def times(values: dict[str, Any], device: str, repeats: int) -> dict[str, float]:
-    """Return median times in ms of both renderers, forward and with gradients, and their ratios."""
+def times(values: dict[str, Any], device: str, repeats: int, gsplat: bool) -> dict[str, float]:
+    """Return median times in ms of the renderers, forward and with gradients, and ratios of surfels to Gaussians."""
     calls: dict[str, Callable[[], object]] = {}
-    for name, function in (("gaussians", rasterization), ("surfels", rasterization_2dgs)):
+    renderers = {"gaussians": rasterization, "surfels": rasterization_2dgs}
+    if gsplat:
+        renderers["gsplat"] = importlib.import_module("gsplat").rasterization_2dgs
+    for name, function in renderers.items():
 
         def forward(function: Callable[..., Any] = function) -> object:
             with torch.no_grad():
@@ -77,7 +82,7 @@ def times(values: dict[str, Any], device: str, repeats: int) -> dict[str, float]
             leaves = {leaf: values[leaf].clone().requires_grad_() for leaf in LEAVES}
             image, alphas, *rest = function(**{**values, **leaves}, packed=False, render_mode="RGB+ED")
             loss = image.mean() + alphas.mean()
-            if function is rasterization_2dgs:
+            if function is not rasterization:
                 loss = loss + rest[0].mean() + rest[2].mean()
             loss.backward()
             return loss
@@ -132,7 +137,9 @@ def plane_errors(tilt_deg: float, spacing: float, device: str) -> dict[str, floa
 
 def main() -> None:
     """Measure, print and log."""
-    chosen = log.options("surfels beside Gaussians").parse_args()
+    parser = log.options("surfels beside Gaussians")
+    parser.add_argument("--gsplat", action="store_true", help="time gsplat's rasterization_2dgs, too; needs CUDA")
+    chosen = parser.parse_args()
     count, width, height = (50_000, 640, 512)
     values = scene(count, width, height, chosen.device)
     figures: dict[str, Any] = {
@@ -142,7 +149,7 @@ def main() -> None:
         "threads": torch.get_num_threads(),
         "constants": "1.6",
     }
-    figures |= times(values, chosen.device, 50 if chosen.full else 9)
+    figures |= times(values, chosen.device, 50 if chosen.full else 9, chosen.gsplat)
     figures["planes"] = {
         f"{tilt} deg, surfels of {spacing}": plane_errors(tilt, spacing, chosen.device)
         for tilt in PLANE_TILTS_DEG
