@@ -184,7 +184,7 @@ MODULES: Mapping[str, Mapping[str, str]] = {
         **_RENDERING,
         **_CUDA,
         **_COLLECTIVES,
-        "depth_to_normal": "gsplat_core.rendering.depth_maps",
+        "depth_to_normal": "gsplat_core.ops.depth_to_normal",
         "get_projection_matrix": _FUNCTIONS,
         "RasterizeMode": "gsplat_core.rendering.settings",
         "RenderMode": "gsplat_core.rendering.settings",
@@ -197,7 +197,7 @@ MODULES: Mapping[str, Mapping[str, str]] = {
     "gsplat.strategy.ops": _ROW_OPERATIONS,
     "gsplat.training": {"TwoStageScheduleStep": _CONTRIB, "TwoStageScheduler": _CONTRIB},
     "gsplat.utils": {
-        "depth_to_normal": "gsplat_core.rendering.depth_maps",
+        "depth_to_normal": "gsplat_core.ops.depth_to_normal",
         "depth_to_points": "gsplat_core.rendering.depth_maps",
         "get_projection_matrix": _FUNCTIONS,
         "inverse_log_transform": _FUNCTIONS,

@@ -302,6 +302,10 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "isect_offsets, Tensor flatten_ids, int width, int height, Tensor v_sums) -> (Tensor v_means2d, Tensor v_conics, Tensor "
       "v_channels, Tensor v_opacities, Tensor v_weights)");
 
+  // Unit normals [I, H, W, 3] in world axes of depth maps [I, H, W]; the backward pass returns dL/ddepths.
+  m.def("depth_to_normal(Tensor depths, Tensor camtoworlds, Tensor Ks) -> Tensor");
+  m.def("depth_to_normal_backward(Tensor v_normals, Tensor depths, Tensor camtoworlds, Tensor Ks) -> Tensor");
+
   // Structural similarity per pixel and channel of [H, W, C] images.
   m.def("ssim_map(Tensor image, Tensor target) -> Tensor");
   m.def("ssim_map_backward(Tensor gradient, Tensor image, Tensor target) -> Tensor");

@@ -14,6 +14,18 @@ from gsplat_core.scene.cameras import Camera
 
 LARGEST_JUMP = 0.02
 """Largest change of depth to a neighbouring pixel, relative to the depth, across which a normal is computed."""
+LEAST_LENGTH = 1e-18
+"""Length of a cross product up to which `depth_to_normal` returns 0, in squared units of the scene."""
+
+
+def check_depth_maps(depths: Tensor, camtoworlds: Tensor, Ks: Tensor) -> tuple[int, ...]:
+    """Return the leading dimensions of depths [..., H, W, 1] with cameras [..., 4, 4] and [..., 3, 3]."""
+    if depths.dim() < 3 or depths.shape[-1] != 1:
+        raise InvalidInput(f"depths must be [..., H, W, 1], got {list(depths.shape)}")
+    leading = tuple(depths.shape[:-3])
+    require_shape("camtoworlds", camtoworlds, (*leading, 4, 4), "[..., 4, 4]")
+    require_shape("Ks", Ks, (*leading, 3, 3), "[..., 3, 3]")
+    return leading
 
 
 def depth_to_points(depths: Tensor, camtoworlds: Tensor, Ks: Tensor, z_depth: bool = True) -> Tensor:
@@ -25,11 +37,7 @@ def depth_to_points(depths: Tensor, camtoworlds: Tensor, Ks: Tensor, z_depth: bo
         Ks: intrinsic matrices [..., 3, 3].
         z_depth: True for depth along the camera's axis, False for distance along the ray.
     """
-    if depths.dim() < 3 or depths.shape[-1] != 1:
-        raise InvalidInput(f"depths must be [..., H, W, 1], got {list(depths.shape)}")
-    leading = tuple(depths.shape[:-3])
-    require_shape("camtoworlds", camtoworlds, (*leading, 4, 4), "[..., 4, 4]")
-    require_shape("Ks", Ks, (*leading, 3, 3), "[..., 3, 3]")
+    leading = check_depth_maps(depths, camtoworlds, Ks)
     height, width = depths.shape[-3:-1]
     x = torch.arange(width, device=depths.device, dtype=depths.dtype) + 0.5
     y = torch.arange(height, device=depths.device, dtype=depths.dtype) + 0.5
@@ -39,20 +47,21 @@ def depth_to_points(depths: Tensor, camtoworlds: Tensor, Ks: Tensor, z_depth: bo
     local = torch.stack([across, down, torch.ones_like(across)], -1)
     if not z_depth:
         local = torch.nn.functional.normalize(local, dim=-1)
-    turned = (camtoworlds[..., None, None, :3, :3] @ local[..., None])[..., 0]
+    turned = (local.flatten(-3, -2) @ camtoworlds[..., :3, :3].mT).unflatten(-2, (height, width))
     return camtoworlds[..., None, None, :3, 3] + depths * turned
 
 
 def depth_to_normal(depths: Tensor, camtoworlds: Tensor, Ks: Tensor, z_depth: bool = True) -> Tensor:
-    """Return the unit normals [..., H, W, 3] in world axes of depth maps; 0 at the border of one pixel.
-
-    Arguments as in `depth_to_points`. A normal is the cross product of the differences of the neighbours below and above,
-    and to the right and left.
-    """
+    """Return what `gsplat_core.ops.depth_to_normal` returns, in plain torch and for any floating dtype."""
     points = depth_to_points(depths, camtoworlds, Ks, z_depth)
+    if min(points.shape[-3:-1]) < 3:
+        return 0 * points
     down = points[..., 2:, 1:-1, :] - points[..., :-2, 1:-1, :]
     across = points[..., 1:-1, 2:, :] - points[..., 1:-1, :-2, :]
-    inner = torch.nn.functional.normalize(torch.linalg.cross(down, across), dim=-1)
+    cross = torch.linalg.cross(down, across)
+    length = torch.linalg.vector_norm(cross, dim=-1, keepdim=True)
+    empty = length <= LEAST_LENGTH
+    inner = torch.where(empty, 0, cross / torch.where(empty, 1, length))
     return torch.nn.functional.pad(inner, (0, 0, 1, 1, 1, 1))
 
 

@@ -17,15 +17,14 @@ from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.arguments import (
     DenseSurfels,
     PackedSurfels,
-    TileGrid,
     check_surfel_arguments,
     pack_surfels,
 )
+from gsplat_core.ops.depth_to_normal import depth_to_normal
 from gsplat_core.ops.surfel_blending import rasterize_to_pixels_2dgs
 from gsplat_core.ops.surfel_projection import fully_fused_projection_2dgs, sparse_gradients
-from gsplat_core.ops.tiles import bin_splats
-from gsplat_core.rendering.depth_maps import depth_to_normal
-from gsplat_core.rendering.pipeline import Meta, Signal, check_shapes, isect_ids_of, view_colors
+from gsplat_core.ops.tiles import isect_offset_encode, isect_tiles
+from gsplat_core.rendering.pipeline import Meta, Signal, check_shapes, view_colors
 from gsplat_core.rendering.rasterization import in_plain_mode, step_by_step
 from gsplat_core.rendering.settings import (
     CONSTANTS,
@@ -165,9 +164,10 @@ def rasterization_2dgs(
     if backgrounds is not None:
         backgrounds = pad(backgrounds, (0, channels.shape[-1] - backgrounds.shape[-1])) if settings.has_colors else None
     tile_width, tile_height = settings.tile_grid
-    tiles_per_gauss, flatten_ids, isect_offsets = bin_splats(
-        rows.means2d, rows.radii, rows.depths, TileGrid(tile_size, tile_width, tile_height), **packing
+    tiles_per_gauss, isect_ids, flatten_ids = isect_tiles(
+        rows.means2d, rows.radii, rows.depths, tile_size, tile_width, tile_height, **packing
     )
+    isect_offsets = isect_offset_encode(isect_ids, math.prod(dims), tile_width, tile_height)
     isect_offsets = isect_offsets.reshape(*dims, tile_height, tile_width)
     densify = torch.zeros_like(rows.means2d, requires_grad=True)
     image, alphas, normals, distortions, medians = rasterize_to_pixels_2dgs(
@@ -194,7 +194,7 @@ def rasterization_2dgs(
         "tile_width": tile_width,
         "tile_height": tile_height,
         "tiles_per_gauss": tiles_per_gauss,
-        "isect_ids": isect_ids_of(flatten_ids, isect_offsets, rows.depths, tile_width * tile_height),
+        "isect_ids": isect_ids,
         "flatten_ids": flatten_ids,
         "isect_offsets": isect_offsets,
         "width": width,

@@ -18,7 +18,8 @@ from gsplat_core import as_gsplat
 from gsplat_core.as_gsplat import __main__ as run
 from gsplat_core.as_gsplat import functions as utils
 from gsplat_core.as_gsplat import install
-from gsplat_core.rendering.depth_maps import depth_to_normal, depth_to_points
+from gsplat_core.ops.depth_to_normal import depth_to_normal
+from gsplat_core.rendering.depth_maps import depth_to_points
 
 PROGRAM = """
 import sys
