@@ -65,7 +65,7 @@ VARIANTS = {
     "ours-selective": Variant(True, ("--visible_adam",)),
     "gsplat-selective": Variant(False, ("--visible_adam",)),
 }
-USUAL = ("gsplat", "ours", "ours-selective")
+USUAL = ("gsplat", "ours", "gsplat-selective", "ours-selective")
 
 
 def command(strategy: str, variant: Variant, seed: int, scene: Path, folder: Path, chosen: Any) -> list[str]:

@@ -78,7 +78,7 @@ def main() -> None:
     runpy.run_path(script, run_name="__main__")
     gsplat = importlib.import_module("gsplat")
     found = {
-        "gsplat": str(gsplat.__version__) if getattr(gsplat, "__file__", None) else "gsplat_core",
+        "gsplat": "gsplat_core" if Path(str(gsplat.__file__)).parent.name == "as_gsplat" else str(gsplat.__version__),
         "replaced": replaced,
         "waiting_s": waited["train"],
         "peak_memory_kib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
