@@ -17,14 +17,15 @@ from gsplat_core.training.strategies.strategy import (
     Optimizers,
     Params,
     Plan,
+    Rows,
     Strategy,
     StrategyKind,
     change_rows,
-    duplicate,
     every_of,
+    multiplied,
+    rearrange,
     remove,
     reset_opa,
-    split,
     views_of,
 )
 
@@ -125,8 +126,7 @@ class DefaultStrategy(Strategy):
         self._update_state(params, state, info, packed=packed)
         paused = step % self.reset_every < self.pause_refine_after_reset
         if step > self.refine_start_iter and step % self.refine_every == 0 and not paused:
-            duplicated, divided = self._grow_gs(params, optimizers, state, step)
-            removed = self._prune_gs(params, optimizers, state, step)
+            duplicated, divided, removed = self._refine(params, optimizers, state, step)
             if self.verbose:
                 print(  # noqa: T201
                     f"step {step}: {duplicated} Gaussians duplicated, {divided} split, {removed} removed;"
@@ -194,17 +194,35 @@ class DefaultStrategy(Strategy):
             state["radii"].scatter_reduce_(0, rows, radii.amax(-1) * extent_scale, "amax")
 
     @torch.no_grad()
+    def _refine(self, params: Params, optimizers: Optimizers, state: dict[str, Any], step: int) -> tuple[int, int, int]:
+        """Duplicate, split and remove Gaussians as `_grow_gs` and `_prune_gs` do, but replace every tensor only once.
+
+        Replacements of the two methods are called. Returns the numbers of duplicated, split and removed ones; synchronises.
+        """
+        if tuple(getattr(method, "__func__", None) for method in (self._grow_gs, self._prune_gs)) != SEPARATE:
+            return *self._grow_gs(params, optimizers, state, step), self._prune_gs(params, optimizers, state, step)
+        grown, copies, splits = self._grown(params, state, step)
+        tested = {name: grown.of(name, params[name]) for name in ("opacities", "scales")}
+        rows = grown.select(~self._to_prune(tested, state, step, grown.sources))
+        removed = len(grown.sources) - len(rows.sources)
+        if copies or splits or removed:
+            rearrange(params, optimizers, state, rows)
+        return copies, splits, removed
+
+    @torch.no_grad()
     def _grow_gs(self, params: Params, optimizers: Optimizers, state: dict[str, Any], step: int) -> tuple[int, int]:
         """Duplicate and split Gaussians. Returns the numbers of duplicated and of split ones; synchronises."""
-        copied, divided = self._to_grow(params, state, step)
-        copies, splits = int(torch.count_nonzero(copied)), int(torch.count_nonzero(divided))
-        if copies:
-            duplicate(params, optimizers, state, copied)
-            # The new rows of the duplicates are not split.
-            divided = torch.cat([divided, divided.new_zeros(copies)])
-        if splits:
-            split(params, optimizers, state, divided, self.revised_opacity, generator=self.generator)
+        grown, copies, splits = self._grown(params, state, step)
+        if copies or splits:
+            rearrange(params, optimizers, state, grown)
         return copies, splits
+
+    def _grown(self, params: Params, state: dict[str, Any], step: int) -> tuple[Rows, int, int]:
+        """Return the Gaussians after growth, and the numbers of duplicated and of split ones."""
+        grown = multiplied(params, *self._to_grow(params, state, step), self.revised_opacity, self.generator)
+        present = len(params["means"])
+        splits = present - grown.old
+        return grown, len(grown.sources) - present - splits, splits
 
     def _to_grow(self, params: Params, state: dict[str, Any], step: int) -> tuple[Tensor, Tensor]:
         """Return the Gaussians to duplicate and those to split, bool [N] each."""
@@ -218,21 +236,32 @@ class DefaultStrategy(Strategy):
     @torch.no_grad()
     def _prune_gs(self, params: Params, optimizers: Optimizers, state: dict[str, Any], step: int) -> int:
         """Remove transparent and, after the first reset, oversized Gaussians. Returns their number; synchronises."""
-        leaving = params["opacities"].flatten().sigmoid() < self.prune_opa
-        if step > self.reset_every:
-            leaving |= params["scales"].exp().amax(-1) > self.prune_scale3d * state["scene_scale"]
-            if step < self.refine_scale2d_stop_iter:
-                leaving |= state["radii"] > self.prune_scale2d
+        leaving = self._to_prune(params, state, step)
         removed = int(torch.count_nonzero(leaving))
         if removed:
             remove(params, optimizers, state, leaving)
         return removed
+
+    def _to_prune(
+        self, params: Params | dict[str, Tensor], state: dict[str, Any], step: int, rows: Tensor | slice = slice(None)
+    ) -> Tensor:
+        """Return the Gaussians to remove, bool [M]; their statistics are in the rows `rows` of `state`."""
+        leaving = params["opacities"].flatten().sigmoid() < self.prune_opa
+        if step > self.reset_every:
+            leaving |= params["scales"].exp().amax(-1) > self.prune_scale3d * state["scene_scale"]
+            if step < self.refine_scale2d_stop_iter:
+                leaving |= state["radii"][rows] > self.prune_scale2d
+        return leaving
 
     @staticmethod
     def _needed(info: dict[str, Any], name: str) -> Any:
         if name not in info:
             raise InvalidParameters(f"info lacks {name!r}; pass the third result of rasterization")
         return info[name]
+
+
+SEPARATE = (DefaultStrategy._grow_gs, DefaultStrategy._prune_gs)
+"""Methods that `DefaultStrategy` replaces by one pass, unless a program overrides one of them."""
 
 
 @dataclass

@@ -30,7 +30,7 @@ from gsplat_core.training.strategies.strategy import (
     change_rows,
     every_of,
     inject_noise_to_position,
-    relocate,
+    relocate_rows,
     sample_add,
     views_of,
 )
@@ -118,11 +118,13 @@ class MCMCStrategy(Strategy):
     def _relocate_gs(self, params: Params, optimizers: Optimizers, binoms: Tensor) -> int:
         """Move dead Gaussians to visible places. Returns their number; synchronises."""
         # A Gaussian whose opacity is NaN counts as dead, too.
-        dead = ~(params["opacities"].flatten().sigmoid() > self.min_opacity)
-        count = int(torch.count_nonzero(dead))
-        self._check_alive(len(dead) - count)
+        live = params["opacities"].flatten().sigmoid() > self.min_opacity
+        alive = live.nonzero()[:, 0]
+        self._check_alive(len(alive))
+        count = len(live) - len(alive)
         if count:
-            relocate(params, optimizers, {}, dead, binoms, self.min_opacity, generator=self.generator)
+            dead = (~live).nonzero()[:, 0]
+            relocate_rows(params, optimizers, {}, dead, alive, binoms, self.min_opacity, self.generator)
         return count
 
     @torch.no_grad()

@@ -156,7 +156,7 @@ def compute_relocation(opacities: Tensor, scales: Tensor, ratios: Tensor, binoms
     sums = [(factors[n - 1] * a[:, None].expand(-1, len(binoms)).cumprod(1)).sum(1) for a, n in parts]
     total = torch.cat(sums)
     # An invisible Gaussian keeps its size: the quotient's limit for o = 0 is 1.
-    ratio = torch.where(before > 0, before / torch.where(before > 0, total, 1.0), 1.0)
+    ratio = torch.where(before > 0, before / total, 1.0)
     return after.to(opacities.dtype).reshape(opacities.shape), (ratio[:, None] * scales.double()).to(scales.dtype)
 
 
@@ -208,10 +208,86 @@ def update_rows(
             optimizer.state[new] = kept
 
 
+@dataclass(frozen=True)
+class Rows:
+    """Sources and values of all M Gaussians after a change of their number."""
+
+    sources: Tensor
+    """Present row of which each Gaussian is a copy, int64 [M]."""
+    old: int
+    """Number of the first Gaussians that keep their moments; the others start with zeros."""
+    changed: Mapping[str, Tensor] = field(default_factory=dict)
+    """Parameters [M, ...] that differ from those of the sources."""
+
+    def of(self, name: str, parameter: Tensor) -> Tensor:
+        """Return the new values of a parameter."""
+        return self.changed[name] if name in self.changed else parameter.index_select(0, self.sources)
+
+    def select(self, mask: Tensor) -> Rows:
+        """Return the rows of the Gaussians in `mask`, bool [M]; synchronises."""
+        kept = mask.nonzero()[:, 0]
+        changed = {name: values.index_select(0, kept) for name, values in self.changed.items()}
+        return Rows(self.sources[kept], int(torch.count_nonzero(mask[: self.old])), changed)
+
+
+@torch.no_grad()
+def rearrange(params: Params, optimizers: Optimizers, state: State, rows: Rows) -> None:
+    """Replace the Gaussians by `rows`. Statistics are those of the sources."""
+    old = rows.sources[: rows.old]
+
+    def moments(_: str, values: Tensor) -> Tensor:
+        moved = values.new_empty(len(rows.sources), *values.shape[1:])
+        torch.index_select(values, 0, old, out=moved[: rows.old])
+        moved[rows.old :].zero_()
+        return moved
+
+    update_rows(
+        lambda name, tensor: Parameter(rows.of(name, tensor), tensor.requires_grad), moments, params, optimizers
+    )
+    for name, values in _rows_of(state):
+        state[name] = values[rows.sources]
+
+
+@torch.no_grad()
+def multiplied(
+    params: Params, copied: Tensor, divided: Tensor, revised_opacity: bool, generator: torch.Generator | None
+) -> Rows:
+    """Return the Gaussians after those in `copied` are duplicated and those in `divided` split, bool [N] each.
+
+    The order is: Gaussians that are not split, duplicates, first samples, second samples. Synchronises. See `split`.
+    """
+    parts = torch.stack([~divided, copied, divided, divided])
+    sources, old = parts.nonzero()[:, 1], int(torch.count_nonzero(parts[0]))
+    splits = len(divided) - old
+    return Rows(sources, old, _sampled(params, sources, splits, revised_opacity, generator) if splits else {})
+
+
+def _sampled(
+    params: Params, sources: Tensor, splits: int, revised_opacity: bool, generator: torch.Generator | None
+) -> dict[str, Tensor]:
+    """Draw samples of split Gaussians. Return the parameters of all Gaussians `sources` [M] that differ in samples.
+
+    The last `splits` rows are second samples, and as many rows before them the first samples of the same Gaussians.
+    """
+    parents, samples = sources[-splits:], slice(-2 * splits, None)
+    names = ("means", "scales", *(("opacities",) if revised_opacity else ()))
+    changed = {name: params[name].index_select(0, sources) for name in names}
+    scales = params["scales"][parents].exp()
+    noise = torch.randn(2, splits, 3, device=sources.device, dtype=scales.dtype, generator=generator)
+    axes = rotations(params["quats"][parents])
+    changed["means"][samples] += torch.einsum("nij,nj,bnj->bni", axes, scales, noise).reshape(-1, 3)
+    log_scales = (scales / SHRINK).log()
+    changed["scales"][samples] = torch.cat([log_scales, log_scales])
+    if revised_opacity:
+        logits = torch.logit(1 - (1 - params["opacities"][parents].sigmoid()).sqrt())
+        changed["opacities"][samples] = torch.cat([logits, logits])
+    return changed
+
+
 @torch.no_grad()
 def duplicate(params: Params, optimizers: Optimizers, state: State, mask: Tensor) -> None:
     """Append a copy of each Gaussian in `mask`, bool [N]. Copies start with zero moments."""
-    chosen, _ = _divided(params, mask)
+    chosen = _checked(params, mask).nonzero()[:, 0]
     _append(params, optimizers, chosen, lambda name, tensor: tensor[chosen])
     for name, rows in _rows_of(state):
         state[name] = torch.cat([rows, rows[chosen]])
@@ -239,45 +315,15 @@ def split(
         revised_opacity: give the samples the opacity 1 - √(1 - o), which keeps the picture (Rota Bulò et al. 2024).
         generator: source of the random numbers, on the device of `mask`.
     """
-    chosen, rest = _divided(params, mask)
-    scales = params["scales"][chosen].exp()
-    noise = torch.randn(2, len(chosen), 3, device=mask.device, dtype=scales.dtype, generator=generator)
-    axes = rotations(params["quats"][chosen])
-    offsets = torch.einsum("nij,nj,bnj->bni", axes, scales, noise)
-
-    def samples(name: str, tensor: Tensor) -> Tensor:
-        parents = tensor[chosen]
-        if name == "means":
-            return (parents + offsets).reshape(-1, 3)
-        if name == "scales":
-            parents = (scales / SHRINK).log()
-        elif name == "opacities" and revised_opacity:
-            parents = torch.logit(1 - (1 - parents.sigmoid()).sqrt())
-        return torch.cat([parents, parents])
-
-    def moments(_: str, values: Tensor) -> Tensor:
-        return torch.cat([values[rest], values.new_zeros(2 * len(chosen), *values.shape[1:])])
-
-    update_rows(
-        lambda name, tensor: Parameter(torch.cat([tensor[rest], samples(name, tensor)]), tensor.requires_grad),
-        moments, params, optimizers,
-    )  # fmt: skip
-    for name, rows in _rows_of(state):
-        state[name] = torch.cat([rows[rest], rows[chosen], rows[chosen]])
+    mask = _checked(params, mask)
+    rearrange(params, optimizers, state, multiplied(params, torch.zeros_like(mask), mask, revised_opacity, generator))
 
 
 @torch.no_grad()
 def remove(params: Params, optimizers: Optimizers, state: State, mask: Tensor) -> None:
     """Remove the Gaussians in `mask`, bool [N]; the others keep their order and moments."""
-    _, rest = _divided(params, mask)
-    update_rows(
-        lambda _, tensor: Parameter(tensor[rest], tensor.requires_grad),
-        lambda _, values: values[rest],
-        params,
-        optimizers,
-    )
-    for name, rows in _rows_of(state):
-        state[name] = rows[rest]
+    rest = (~_checked(params, mask)).nonzero()[:, 0]
+    rearrange(params, optimizers, state, Rows(rest, len(rest)))
 
 
 @torch.no_grad()
@@ -317,7 +363,23 @@ def relocate(
         min_opacity: smallest opacity after the move.
         generator: source of the random numbers, on the device of `mask`.
     """
-    dead, alive = _divided(params, mask)
+    mask = _checked(params, mask)
+    dead, alive = mask.nonzero()[:, 0], (~mask).nonzero()[:, 0]
+    relocate_rows(params, optimizers, state, dead, alive, binoms, min_opacity, generator)
+
+
+@torch.no_grad()
+def relocate_rows(
+    params: Params,
+    optimizers: Optimizers,
+    state: State,
+    dead: Tensor,
+    alive: Tensor,
+    binoms: Tensor,
+    min_opacity: float,
+    generator: torch.Generator | None,
+) -> None:
+    """Move the Gaussians in the rows `dead` to places of those in `alive`, int64 each; otherwise as `relocate`."""
     weights = params["opacities"][alive].sigmoid().flatten()
     places = alive[draw(weights, len(dead), generator)]
     shared = _shared(params, places, binoms, min_opacity)
@@ -437,18 +499,19 @@ def _shared(params: Params, places: Tensor, binoms: Tensor, min_opacity: float) 
 
     A Gaussian is copied as often as its index occurs in `places`.
     """
+    copies = places.new_ones(len(params["opacities"])).index_add_(0, places, torch.ones_like(places))
     opacities, scales = compute_relocation(
         params["opacities"][places].sigmoid(),
         params["scales"][places].exp(),
-        torch.bincount(places, minlength=len(params["opacities"]))[places] + 1,
+        copies[places],
         binoms,
     )
     most = 1 - torch.finfo(torch.float32).eps
     return {"opacities": torch.logit(opacities.clamp(min_opacity, most)), "scales": scales.log()}
 
 
-def _divided(params: Params, mask: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the indices of the Gaussians in `mask`, and those of all other Gaussians, int64 each.
+def _checked(params: Params, mask: Tensor) -> Tensor:
+    """Return `mask` as bool [N].
 
     Raises:
         InvalidParameters: if `mask` is not a bool with one value per Gaussian.
@@ -458,8 +521,7 @@ def _divided(params: Params, mask: Tensor) -> tuple[Tensor, Tensor]:
         raise InvalidParameters(
             f"mask must be bool [N] with N = {count} Gaussians, got {mask.dtype} {list(mask.shape)}"
         )
-    mask = mask.flatten()
-    return mask.nonzero()[:, 0], (~mask).nonzero()[:, 0]
+    return mask.flatten()
 
 
 def _has_rows(value: Any) -> bool:

@@ -265,6 +265,104 @@ def test_adc_resets_opacities_except_as_1_5_3(compat, expected):
     assert resets == expected
 
 
+class OneByOne(DefaultStrategy):
+    """Refinement by the row operations, one after the other."""
+
+    def _grow_gs(self, params, optimizers, state, step):
+        copied, divided = self._to_grow(params, state, step)
+        ops.duplicate(params, optimizers, state, copied)
+        longer = torch.cat([divided, divided.new_zeros(int(copied.sum()))])
+        ops.split(params, optimizers, state, longer, self.revised_opacity, generator=self.generator)
+        return int(copied.sum()), int(divided.sum())
+
+
+def refined(strategy, optimizer=lambda p: torch.optim.Adam([p]), column=False, step=40):
+    """Refine a scene, and return its parameters, optimisers' states and statistics by name."""
+    params, _ = scene(300)
+    if column:
+        params["opacities"] = torch.nn.Parameter(params["opacities"].detach()[:, None])
+    optimizers = {name: optimizer(p) for name, p in params.items() if p.requires_grad}
+    random = torch.Generator().manual_seed(1)
+    for name, each in optimizers.items():
+        params[name].grad = torch.randn(params[name].shape, generator=random)
+        each.step()
+    state = strategy.initialize_state()
+    state |= {name: torch.rand(300, generator=random) for name in ("grad2d", "count", "radii", "further")}
+    centres = torch.zeros(1, 300, 2, requires_grad=True)
+    centres.grad = torch.zeros(1, 300, 2)
+    info = {"means2d": centres, "radii": torch.zeros(1, 300, 2), "width": 48, "height": 32, "n_cameras": 1}
+    strategy.generator = torch.Generator().manual_seed(5)
+    strategy.step_post_backward(params, optimizers, state, step, info)
+    values = {name: p.detach() for name, p in params.items()} | {f"state {name}": v for name, v in state.items()}
+    for name, each in optimizers.items():
+        assert each.param_groups[0]["params"][0] is params[name] and set(each.state) <= {params[name]}
+        values |= {f"{name} {key}": value for key, value in each.state.get(params[name], {}).items()}
+    return values
+
+
+@pytest.mark.parametrize(
+    "optimizer",
+    [
+        lambda p: torch.optim.Adam([p]),
+        lambda p: torch.optim.SGD([p], lr=0.1),
+        lambda p: torch.optim.NAdam([p]),
+    ],
+    ids=["adam", "sgd", "nadam"],
+)
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {
+            "revised_opacity": True,
+            "refine_scale2d_stop_iter": 100,
+            "grow_scale2d": 0.5,
+            "prune_scale2d": 0.9,
+            "reset_every": 30,
+            "prune_scale3d": 0.5,
+        },
+        {"reset_every": 30, "compat": "1.5.3", "prune_scale3d": 0.15},
+        {"grow_grad2d": 1e9, "prune_opa": 0.0},
+        {"grow_grad2d": -1.0, "prune_opa": 1.1},
+    ],
+    ids=["plain", "radii", "oversized", "nothing", "everything"],
+)
+@pytest.mark.parametrize("column", [False, True])
+def test_adc_refines_in_one_pass_as_its_row_operations_do(optimizer, options, column, capsys):
+    options = {
+        "refine_start_iter": 1, "refine_every": 20, "reset_every": 60, "grow_grad2d": 0.6, "grow_scale3d": 0.1,
+        "prune_opa": 0.4, "verbose": True,
+    } | options  # fmt: skip
+    expected = refined(OneByOne(**options), optimizer, column)
+    report = capsys.readouterr().out
+    found = refined(DefaultStrategy(**options), optimizer, column)
+    assert capsys.readouterr().out == report != ""
+    assert found.keys() == expected.keys()
+    for name, value in expected.items():
+        assert torch.equal(found[name], value) if isinstance(value, torch.Tensor) else found[name] == value
+
+
+def test_adc_replaces_every_tensor_once_unless_a_program_replaces_a_part(monkeypatch):
+    replaced, calls = [], []
+    own = ops.update_rows
+    monkeypatch.setattr(ops, "update_rows", lambda *args: (replaced.append(1), own(*args)))
+    options = {"refine_start_iter": 1, "refine_every": 20, "grow_grad2d": 0.6, "grow_scale3d": 0.1, "prune_opa": 0.4}
+    refined(DefaultStrategy(**options))
+    assert len(replaced) == 1
+    refined(OneByOne(**options))
+    assert len(replaced) == 1 + 3
+
+    class Keeping(DefaultStrategy):
+        def _prune_gs(self, params, optimizers, state, step):
+            calls.append(step)
+            return 0
+
+    assert len(refined(Keeping(**options))["means"]) > 300 and calls == [40]
+    strategy = DefaultStrategy(**options)
+    strategy._grow_gs = lambda params, optimizers, state, step: (calls.append(step), 0)
+    assert len(refined(strategy)["means"]) < 300 and calls == [40, 40]
+
+
 def test_adc_removes_transparent_and_after_the_first_reset_oversized_gaussians():
     params, optimizers = scene()
     with torch.no_grad():
