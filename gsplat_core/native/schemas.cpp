@@ -6,10 +6,11 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
   m.def("active_isa() -> int");
 
   // In-place Adam step of one dense tensor; `step` counts from 1. Rows of row_size values with a non-finite gradient
-  // are skipped. Returns the number of skipped rows (int64 scalar).
+  // are skipped. Returns the number of skipped rows (int64 scalar). Rows that are false in `shown` (bool) are left unchanged
+  // and not counted.
   m.def(
       "adam_(Tensor(a!) parameter, Tensor gradient, Tensor(b!) first_moment, Tensor(c!) second_moment, int step, "
-      "float learning_rate, float beta1, float beta2, float epsilon, int row_size) -> Tensor");
+      "float learning_rate, float beta1, float beta2, float epsilon, int row_size, Tensor? shown=None) -> Tensor");
 
   // In-place Adam step of one dense tensor, with the learning rate (float32) and step (int64) read from device memory.
   // The number of skipped rows is added to `skipped` (int64).

@@ -54,18 +54,21 @@ def require_same_kind(**tensors: Tensor | None) -> None:
 
 def require_float32(op: str, **tensors: Tensor | None) -> None:
     """Raise InvalidInput unless all tensors are float32 on one device with compiled kernels for `op`."""
-    given = {name: tensor for name, tensor in tensors.items() if tensor is not None}
-    first = next(iter(given.values()), None)
-    for name, tensor in given.items():
+    device = None
+    for name, tensor in tensors.items():
+        if tensor is None:
+            continue
         if tensor.dtype != torch.float32:
             raise InvalidInput(
                 f"{op}: {name} must be float32, got {tensor.dtype}; convert it, or use gsplat_core.reference, which takes"
                 " any floating-point dtype"
             )
-        if first is not None and tensor.device != first.device:
-            found = ", ".join(f"{name}: {tensor.device}" for name, tensor in given.items())
+        if device is None:
+            device = tensor.device
+            require_kernels(op, name, tensor)
+        elif tensor.device != device:
+            found = ", ".join(f"{name}: {each.device}" for name, each in tensors.items() if each is not None)
             raise InvalidInput(f"{op}: all inputs must be on one device, got {found}")
-        require_kernels(op, name, tensor)
 
 
 def require_kernels(op: str, name: str, tensor: Tensor) -> None:

@@ -41,6 +41,7 @@ def adam_step_queued(
     betas: tuple[float, float] = (0.9, 0.999),
     epsilon: float = 1e-8,
     row_size: int = 1,
+    shown: Tensor | None = None,
 ) -> Tensor:
     """Update `parameter` and its moments in place as torch.optim.Adam does, without host sync on CUDA.
 
@@ -57,19 +58,28 @@ def adam_step_queued(
         betas: decay rates of the moments.
         epsilon: term added to the denominator.
         row_size: number of consecutive values that form a row; divides the number of values.
+        shown: bool, one value per row; rows that are False keep their parameters and moments. None: all rows are updated.
 
     Returns:
-        Number of skipped rows, int64 [] on the device.
+        Number of rows skipped for their gradients, int64 [] on the device.
 
     Raises:
-        InvalidInput: if shapes or devices differ, a tensor is not float32 or not contiguous, or step is below 1.
+        InvalidInput: if shapes or devices differ, a tensor is not float32 or not contiguous, `shown` has another
+            number of values or dtype, or step is below 1.
             `gsplat_core.reference.training` accepts any floating dtype.
     """
     _check(parameter, gradient, first_moment, second_moment, row_size)
     if step < 1:
         raise InvalidInput(f"step counts from 1, got step {step}")
+    if shown is not None and (
+        shown.dtype != torch.bool or shown.numel() * row_size != gradient.numel() or shown.device != gradient.device
+    ):
+        raise InvalidInput(
+            f"shown must be bool on {gradient.device} with one value for each of {gradient.numel() // row_size} rows,"
+            f" got {shown.dtype} {list(shown.shape)} on {shown.device}"
+        )
     return torch.ops.gsplat_core.adam_(
-        parameter.detach(), gradient, first_moment, second_moment, step, learning_rate, *betas, epsilon, row_size
+        parameter.detach(), gradient, first_moment, second_moment, step, learning_rate, *betas, epsilon, row_size, shown
     )
 
 
@@ -120,10 +130,11 @@ def adam_step_at_(
 
 
 def _check(parameter: Tensor, gradient: Tensor, first_moment: Tensor, second_moment: Tensor, row_size: int) -> None:
+    shape = gradient.shape
     for name, tensor in (("parameter", parameter), ("first_moment", first_moment), ("second_moment", second_moment)):
-        if tensor.shape != gradient.shape or not tensor.is_contiguous():
+        if tensor.shape != shape or not tensor.is_contiguous():
             raise InvalidInput(
-                f"{name} must be contiguous and of the gradient's shape {list(gradient.shape)},"
+                f"{name} must be contiguous and of the gradient's shape {list(shape)},"
                 f" got {list(tensor.shape)} with strides {list(tensor.stride())}"
             )
     require_float32(

@@ -24,22 +24,24 @@ __device__ __forceinline__ AdamStep step_of(const AdamAt& at) {
   return {rate, inv_bias2, at.fresh1, at.fresh2, at.epsilon, at.row_size};
 }
 
-// Each block first flags its rows that contain a non-finite squared gradient, then updates the other rows.
+// Each block first flags its rows that are not shown or contain a non-finite squared gradient, then updates the other
+// rows. It counts only those with such a gradient.
 template <class Step>
 __global__ void __launch_bounds__(kThreads)
-    adam_rows(float* __restrict__ p, const float* __restrict__ g, float* __restrict__ m, float* __restrict__ v, int64_t rows,
-              int rows_per_block, Step source, unsigned long long* skipped) {
+    adam_rows(float* __restrict__ p, const float* __restrict__ g, float* __restrict__ m, float* __restrict__ v,
+              const bool* __restrict__ shown, int64_t rows, int rows_per_block, Step source, unsigned long long* skipped) {
   const AdamStep step = step_of(source);
   __shared__ int unusable[kMostRows];
   const int64_t first = int64_t(blockIdx.x) * rows_per_block;
   const int count = int(rows - first < rows_per_block ? rows - first : rows_per_block);
   const int64_t at = first * step.row_size, size = count * step.row_size;
-  for (int r = threadIdx.x; r < count; r += kThreads) unusable[r] = 0;
+  for (int r = threadIdx.x; r < count; r += kThreads) unusable[r] = shown != nullptr && !shown[first + r];
   __syncthreads();
   for (int64_t i = threadIdx.x; i < size; i += kThreads) {
+    int& flag = unusable[count == 1 ? 0 : int(i) / int(step.row_size)];
+    if (flag) continue;  // gradients of rows that are not shown are not read
     const float x = g[at + i];
-    if (!isfinite(x * x))
-      unusable[count == 1 ? 0 : int(i) / int(step.row_size)] = 1;  // a benign race: all threads write the same value
+    if (!isfinite(x * x)) flag = 1;  // a benign race: all threads write 1
   }
   __syncthreads();
   for (int64_t i = threadIdx.x; i < size; i += kThreads) {
@@ -51,29 +53,31 @@ __global__ void __launch_bounds__(kThreads)
     v[k] = v_new;
     p[k] -= step.rate * m_new / (sqrtf(v_new) * step.inv_bias2 + step.epsilon);
   }
+  // Integer sums do not depend on the order.
   for (int r = threadIdx.x; r < count; r += kThreads)
-    if (unusable[r]) atomicAdd(skipped, 1ULL);  // integer sums do not depend on the order
+    if (unusable[r] && (shown == nullptr || shown[first + r])) atomicAdd(skipped, 1ULL);
 }
 
 template <class Step>
-void launch(float* p, const float* g, float* m, float* v, int64_t rows, const Step& step, int64_t* skipped, cudaStream_t stream) {
+void launch(float* p, const float* g, float* m, float* v, const bool* shown, int64_t rows, const Step& step, int64_t* skipped,
+            cudaStream_t stream) {
   if (rows == 0) return;
   const int64_t fit = (rows * step.row_size <= kFew ? kThreads : kChunk) / step.row_size;
   const int64_t per_block = fit < 1 ? 1 : fit < kMostRows ? fit : kMostRows;
-  adam_rows<<<blocks_for(rows, per_block), kThreads, 0, stream>>>(p, g, m, v, rows, int(per_block), step,
+  adam_rows<<<blocks_for(rows, per_block), kThreads, 0, stream>>>(p, g, m, v, shown, rows, int(per_block), step,
                                                                   reinterpret_cast<unsigned long long*>(skipped));
 }
 
 }  // namespace
 
-void adam_on_device(float* p, const float* g, float* m, float* v, int64_t rows, const AdamStep& step, int64_t* skipped,
-                    cudaStream_t stream) {
-  launch(p, g, m, v, rows, step, skipped, stream);
+void adam_on_device(float* p, const float* g, float* m, float* v, const bool* shown, int64_t rows, const AdamStep& step,
+                    int64_t* skipped, cudaStream_t stream) {
+  launch(p, g, m, v, shown, rows, step, skipped, stream);
 }
 
 void adam_at_on_device(float* p, const float* g, float* m, float* v, int64_t rows, const AdamAt& at, int64_t* skipped,
                        cudaStream_t stream) {
-  launch(p, g, m, v, rows, at, skipped, stream);
+  launch(p, g, m, v, nullptr, rows, at, skipped, stream);
 }
 
 }  // namespace gsplat::adam

@@ -27,13 +27,15 @@ struct AdamAt {
 
 // CPU kernels.
 struct Kernels {
-  // Updates parameters with gradients, first and second moments of `rows` rows; returns the number of skipped rows.
-  int64_t (*step)(float* p, const float* g, float* m, float* v, int64_t rows, const AdamStep& step);
+  // Updates parameters with gradients, first and second moments of `rows` rows; returns the number of rows skipped for
+  // their gradients. Rows that are false in `shown` are left unchanged and not counted; null: all
+  // rows are shown.
+  int64_t (*step)(float* p, const float* g, float* m, float* v, const bool* shown, int64_t rows, const AdamStep& step);
 };
 
 // Adam steps on CUDA. All pointers are device memory; the number of skipped rows is added to `skipped`.
-void adam_on_device(float* p, const float* g, float* m, float* v, int64_t rows, const AdamStep& step, int64_t* skipped,
-                    cudaStream_t stream);
+void adam_on_device(float* p, const float* g, float* m, float* v, const bool* shown, int64_t rows, const AdamStep& step,
+                    int64_t* skipped, cudaStream_t stream);
 void adam_at_on_device(float* p, const float* g, float* m, float* v, int64_t rows, const AdamAt& at, int64_t* skipped,
                        cudaStream_t stream);
 

@@ -34,7 +34,7 @@ static void update(float* __restrict__ p, const float* __restrict__ g, float* __
   }
 }
 
-static int64_t step(float* p, const float* g, float* m, float* v, int64_t rows, const AdamStep& step) {
+static int64_t step_rows(float* p, const float* g, float* m, float* v, int64_t rows, const AdamStep& step) {
   const int64_t size = step.row_size, block = size < kBlock ? kBlock / size : 1;
   int64_t skipped = 0;
   for (int64_t row = 0; row < rows; row += block) {
@@ -49,6 +49,19 @@ static int64_t step(float* p, const float* g, float* m, float* v, int64_t rows, 
       else
         ++skipped;
     }
+  }
+  return skipped;
+}
+
+static int64_t step(float* p, const float* g, float* m, float* v, const bool* shown, int64_t rows, const AdamStep& step) {
+  if (shown == nullptr) return step_rows(p, g, m, v, rows, step);
+  int64_t skipped = 0;
+  for (int64_t row = 0; row < rows;) {
+    int64_t end = row;
+    while (end < rows && shown[end]) ++end;
+    const int64_t at = row * step.row_size;
+    skipped += step_rows(p + at, g + at, m + at, v + at, end - row, step);
+    row = end + 1;  // row `end` is not shown, or past the last
   }
   return skipped;
 }

@@ -15,12 +15,14 @@ struct Options {
 // Checked parameter, gradient and moments of one call.
 struct Rows {
   Tensor gradient;
+  OptionalTensor shown_rows;
   float *p, *m, *v;
+  const bool* shown;  // [count], false for rows that are left unchanged; null: all rows are updated
   int64_t count;
 
   Rows(const Call& call, const Tensor& parameter, const Tensor& gradient_, const Tensor& first_moment,
-       const Tensor& second_moment, int64_t row_size)
-      : gradient(call.floats(gradient_, "gradient")) {
+       const Tensor& second_moment, int64_t row_size, const OptionalTensor& shown_ = std::nullopt)
+      : gradient(call.floats(gradient_, "gradient")), shown_rows(call.take_optional(shown_, ScalarType::Bool, "shown")) {
     const int64_t values = gradient.numel();
     const auto updated = [&](const Tensor& t, const char* name) {
       call.in_place(t, name);
@@ -30,6 +32,9 @@ struct Rows {
     p = updated(parameter, "parameter"), m = updated(first_moment, "first_moment"), v = updated(second_moment, "second_moment");
     check(row_size >= 1 && values % row_size == 0, "row_size must divide the ", values, " values, got ", row_size);
     count = values / row_size;
+    shown = shown_rows.has_value() ? shown_rows->const_data_ptr<bool>() : nullptr;
+    check(shown == nullptr || shown_rows->numel() == count, "shown must have one value for each of the ", count, " rows, got ",
+          shown != nullptr ? shown_rows->numel() : 0);
   }
 };
 
@@ -48,7 +53,7 @@ AdamStep step_of(int64_t step, double learning_rate, const Options& o) {
 #if defined(GSPLAT_CUDA)
 
 void update(const Call& call, const Rows& rows, const AdamStep& step, int64_t* skipped) {
-  adam_on_device(rows.p, data(rows.gradient), rows.m, rows.v, rows.count, step, skipped, call.stream);
+  adam_on_device(rows.p, data(rows.gradient), rows.m, rows.v, rows.shown, rows.count, step, skipped, call.stream);
 }
 
 void update_at(const Call& call, const Rows& rows, const float* rate, const int64_t* step, const Options& o, int64_t* skipped) {
@@ -64,7 +69,8 @@ void update(const Call&, const Rows& rows, const AdamStep& step, int64_t* skippe
   const int64_t grain = 1 + (1 << 14) / step.row_size;
   torch::stable::parallel_for(0, rows.count, grain, [&](int64_t begin, int64_t end) {
     const int64_t at = begin * step.row_size;
-    left_alone += kernels().step(rows.p + at, data(rows.gradient) + at, rows.m + at, rows.v + at, end - begin, step);
+    left_alone += kernels().step(rows.p + at, data(rows.gradient) + at, rows.m + at, rows.v + at,
+                                 rows.shown != nullptr ? rows.shown + begin : nullptr, end - begin, step);
   });
   *skipped += left_alone;
 }
@@ -76,9 +82,9 @@ void update_at(const Call& call, const Rows& rows, const float* rate, const int6
 #endif
 
 Tensor adam_(Tensor parameter, Tensor gradient, Tensor first_moment, Tensor second_moment, int64_t step, double learning_rate,
-             double beta1, double beta2, double epsilon, int64_t row_size) {
+             double beta1, double beta2, double epsilon, int64_t row_size, OptionalTensor shown) {
   const Call call(parameter);
-  const Rows rows(call, parameter, gradient, first_moment, second_moment, row_size);
+  const Rows rows(call, parameter, gradient, first_moment, second_moment, row_size, shown);
   Tensor skipped = call.zeros({}, ScalarType::Long);
   update(call, rows, step_of(step, learning_rate, {beta1, beta2, epsilon, row_size}), skipped.mutable_data_ptr<int64_t>());
   call.finish("adam_");

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from gsplat_core import InvalidInput
-from gsplat_core.ops.adam import adam_step, adam_step_at_
+from gsplat_core.ops.adam import adam_step, adam_step_at_, adam_step_queued
 from gsplat_core.reference.training import adam_step as reference_adam_step
 from gsplat_core.training.steps.optimiser import FusedAdam
 
@@ -28,10 +28,37 @@ def test_equals_the_reference_where_gradients_are_not_finite(gpu, rows, row_size
             torch.testing.assert_close(actual.cpu().double(), wanted, rtol=1e-5, atol=2e-6)
 
 
+@pytest.mark.parametrize("row_size", [1, 3, 48, 5000])
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+def test_rows_that_are_not_shown_keep_their_bits_and_are_not_counted(gpu, row_size, share):
+    generator = torch.Generator().manual_seed(4)
+    rows = 2003
+    shown = torch.rand(rows, generator=generator) < share
+    start = torch.randn(rows, row_size, generator=generator)
+    ours, marked = ([start.to(gpu), *torch.zeros(2, rows, row_size, device=gpu)] for _ in range(2))
+    exact = [t.double().cpu() for t in ours]
+    for step in range(1, 4):
+        gradient = torch.randn(rows, row_size, generator=generator)
+        gradient[::7, row_size // 2] = torch.nan
+        unshown_is_nan = gradient.masked_fill(~shown[:, None], torch.nan)
+        skipped = adam_step_queued(
+            ours[0], gradient.to(gpu), *ours[1:], step, 0.1, row_size=row_size, shown=shown.to(gpu)
+        )
+        assert skipped.item() == shown[::7].sum()
+        adam_step(marked[0], unshown_is_nan.to(gpu), *marked[1:], step, 0.1, row_size=row_size)
+        reference_adam_step(exact[0], unshown_is_nan.double(), *exact[1:], step, 0.1, row_size=row_size)
+    assert torch.equal(ours[0][~shown.to(gpu)].cpu(), start[~shown])
+    for now, then, wanted in zip(ours, marked, exact, strict=True):
+        assert torch.equal(now, then)
+        torch.testing.assert_close(now.cpu().double(), wanted, rtol=1e-5, atol=2e-6)
+
+
 def test_devices_must_agree(gpu):
     on_gpu, here = torch.zeros(4, device=gpu), torch.zeros(4)
     with pytest.raises(InvalidInput, match="one device"):
         adam_step(on_gpu, here, on_gpu.clone(), on_gpu.clone(), 1, 0.1)
+    with pytest.raises(InvalidInput, match="shown must be bool on cuda"):
+        adam_step_queued(*(on_gpu.clone() for _ in range(4)), 1, 0.1, shown=here.bool())
 
 
 @pytest.mark.parametrize("row_size", [1, 3, 5000])
@@ -65,9 +92,10 @@ def test_a_captured_step_reads_rate_and_step_anew(gpu, row_size):
 def test_opcheck(gpu):
     parameter, gradient, first, second = (torch.ones(10, 3, device=gpu) for _ in range(4))
     rate, step, skipped = torch.ones(1, device=gpu), *torch.ones(2, 1, dtype=torch.int64, device=gpu).unbind()
-    torch.library.opcheck(
-        torch.ops.gsplat_core.adam_.default, (parameter, gradient, first, second, 2, 0.1, 0.9, 0.999, 1e-8, 3)
-    )
+    shown = torch.arange(10, device=gpu) % 2 == 0
+    arguments = (parameter, gradient, first, second, 2, 0.1, 0.9, 0.999, 1e-8, 3)
+    torch.library.opcheck(torch.ops.gsplat_core.adam_.default, arguments)
+    torch.library.opcheck(torch.ops.gsplat_core.adam_.default, (*arguments, shown))
     torch.library.opcheck(
         torch.ops.gsplat_core.adam_at_,
         (parameter, gradient, first, second, rate, step.clone(), 0.9, 0.999, 1e-8, 3, skipped.clone()),

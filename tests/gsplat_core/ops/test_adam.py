@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.adam import adam_step, adam_step_at_
+from gsplat_core.ops.adam import adam_step, adam_step_at_, adam_step_queued
 from gsplat_core.reference.training import adam_step as reference_adam_step
 
 
@@ -61,15 +61,38 @@ def test_a_skipped_row_keeps_its_bits():
         assert (now[[0, 1, 3, 4]] != then[[0, 1, 3, 4]]).all()
 
 
+@pytest.mark.parametrize("row_size", [1, 3, 4000])
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.95, 1.0])
+def test_rows_that_are_not_shown_keep_their_bits_and_are_not_counted(row_size, share):
+    generator = torch.Generator().manual_seed(4)
+    rows = 12 if row_size == 4000 else 3000
+    shown = torch.rand(rows, generator=generator) < share
+    ours, marked = state(rows, row_size), state(rows, row_size)
+    exact = [t.double() for t in ours]
+    for step in range(1, 4):
+        gradient = torch.randn(rows, row_size, generator=generator)
+        gradient[::7, row_size // 2] = torch.nan
+        unshown_is_nan = gradient.masked_fill(~shown[:, None], torch.nan)
+        skipped = adam_step_queued(ours[0], gradient, *ours[1:], step, 0.1, row_size=row_size, shown=shown)
+        assert skipped == shown[::7].sum()
+        adam_step(marked[0], unshown_is_nan, *marked[1:], step, 0.1, row_size=row_size)
+        reference_adam_step(exact[0], unshown_is_nan.double(), *exact[1:], step, 0.1, row_size=row_size)
+    for now, then, wanted, start in zip(ours, marked, exact, state(rows, row_size), strict=True):
+        assert torch.equal(now, then) and torch.equal(now[~shown], start[~shown])
+        torch.testing.assert_close(now.double(), wanted, rtol=1e-5, atol=2e-6)
+
+
 def test_the_number_of_threads_does_not_change_a_bit():
     gradient = torch.randn(100_003, generator=torch.Generator().manual_seed(3))
     gradient[::101] = torch.nan
+    shown = torch.rand(100_003, generator=torch.Generator().manual_seed(4)) < 0.7
     before = torch.get_num_threads()
     results = []
     for threads in (1, 2):
         torch.set_num_threads(threads)
         tensors = state(100_003)
-        results.append((*tensors, torch.tensor(adam_step(tensors[0], gradient, *tensors[1:], 1, 0.1))))
+        counts = [adam_step_queued(tensors[0], gradient, *tensors[1:], 1, 0.1, shown=rows) for rows in (None, shown)]
+        results.append((*tensors, *counts))
     torch.set_num_threads(before)
     for a, b in zip(*results, strict=True):
         assert torch.equal(a, b)
@@ -78,9 +101,9 @@ def test_the_number_of_threads_does_not_change_a_bit():
 @pytest.mark.slow
 def test_opcheck():
     parameter, first, second = state(10, 3)
-    torch.library.opcheck(
-        torch.ops.gsplat_core.adam_, (parameter, torch.ones(10, 3), first, second, 1, 0.1, 0.9, 0.999, 1e-8, 3)
-    )
+    arguments = (parameter, torch.ones(10, 3), first, second, 1, 0.1, 0.9, 0.999, 1e-8, 3)
+    torch.library.opcheck(torch.ops.gsplat_core.adam_, arguments)
+    torch.library.opcheck(torch.ops.gsplat_core.adam_, (*arguments, torch.arange(10) % 2 == 0))
 
 
 def test_what_it_cannot_take_is_refused():
@@ -96,6 +119,14 @@ def test_what_it_cannot_take_is_refused():
         adam_step(parameter, gradient, first, second, 1, 0.1, row_size=5)
     with pytest.raises(InvalidInput, match="step 0"):
         adam_step(parameter, gradient, first, second, 0, 0.1)
+    with pytest.raises(InvalidInput, match=r"each of 4 rows, got torch.bool \[3\]"):
+        adam_step_queued(parameter, gradient, first, second, 1, 0.1, row_size=3, shown=torch.ones(3).bool())
+    with pytest.raises(InvalidInput, match=r"shown must be bool .*float32"):
+        adam_step_queued(parameter, gradient, first, second, 1, 0.1, row_size=3, shown=torch.ones(4))
+    with pytest.raises(RuntimeError, match="one value for each of the 4 rows, got 3"):
+        torch.ops.gsplat_core.adam_(
+            parameter, gradient, first, second, 1, 0.1, 0.9, 0.999, 1e-8, 3, torch.ones(3, dtype=torch.bool)
+        )
 
 
 def test_a_step_told_by_tensors_is_the_step_told_by_numbers():
