@@ -310,6 +310,9 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
   // Structural similarity per pixel and channel of [H, W, C] images.
   m.def("ssim_map(Tensor image, Tensor target) -> Tensor");
   m.def("ssim_map_backward(Tensor gradient, Tensor image, Tensor target) -> Tensor");
+  // Mean of the map without the pixels that are closer to the edge than `border`.
+  m.def("ssim_mean(Tensor image, Tensor target, int border) -> Tensor");
+  m.def("ssim_mean_backward(Tensor gradient, Tensor image, Tensor target, int border) -> Tensor");
 
   // Loss over tissue pixels and its gradients: (loss, [l1 or squared error, 1 - ssim, inverse-depth l1], dL/dimage,
   // dL/ddepth or empty).

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
+from torch.autograd import Function
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.native import register_gradient
+from gsplat_core.ops.native import differentiable_once, register_gradient
 
 MAX_CHANNELS = 32
 WINDOW_RADIUS_PX = 5
@@ -34,12 +37,16 @@ def ssim_map(image: Tensor, target: Tensor) -> Tensor:
             f"image and target must both be [H, W, C] with 1 to {MAX_CHANNELS} channels,"
             f" got {list(image.shape)} and {list(target.shape)}"
         )
+    _require_float32(image, target)
+    return torch.ops.gsplat_core.ssim_map(image, target)
+
+
+def _require_float32(image: Tensor, target: Tensor) -> None:
     for name, tensor in (("image", image), ("target", target)):
         if tensor.dtype != torch.float32:
             raise InvalidInput(
                 f"{name} must be float32, got {tensor.dtype}; gsplat_core.reference has ssim_map for other types"
             )
-    return torch.ops.gsplat_core.ssim_map(image, target)
 
 
 def fused_ssim(img1: Tensor, img2: Tensor, padding: str = "same", train: bool = True) -> Tensor:
@@ -65,15 +72,44 @@ def fused_ssim(img1: Tensor, img2: Tensor, padding: str = "same", train: bool = 
             f"fused_ssim takes two tensors [B, C, H, W] larger than {2 * border} pixels, got {list(img1.shape)} and"
             f" {list(img2.shape)}"
         )
+    _require_float32(img1, img2)
     if not train:
         img1, img2 = img1.detach(), img2.detach()
+    channels = img1.shape[0] * img1.shape[1]
+    if channels <= MAX_CHANNELS:
+        return _Mean.apply(img1, img2, border)
     total = img1.new_zeros(())
-    pairs = zip(*(each.flatten(0, 1).split(MAX_CHANNELS) for each in (img1, img2)), strict=True)
-    for one, other in pairs:
-        found = ssim_map(one.movedim(0, -1).contiguous(), other.movedim(0, -1).contiguous())
-        inner = found[border : found.shape[0] - border, border : found.shape[1] - border]
-        total = total + inner.sum() / (inner.shape[0] * inner.shape[1])
-    return total / (img1.shape[0] * img1.shape[1])
+    for one, other in zip(*(each.flatten(0, 1).split(MAX_CHANNELS) for each in (img1, img2)), strict=True):
+        total = total + _Mean.apply(one, other, border) * (len(one) / channels)
+    return total
+
+
+class _Mean(Function):
+    """Mean similarity of at most 32 channels [..., H, W] without a border in pixels: one compiled call per direction."""
+
+    @staticmethod
+    def forward(ctx: Any, img1: Tensor, img2: Tensor, border: int) -> Tensor:
+        image, target = (each.flatten(0, -3).permute(1, 2, 0).contiguous() for each in (img1, img2))
+        ctx.save_for_backward(image, target)
+        ctx.border, ctx.shape = border, img1.shape
+        return torch.ops.gsplat_core.ssim_mean(image, target, border)
+
+    @staticmethod
+    @differentiable_once
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
+        image, target = ctx.saved_tensors
+        needs_image, needs_target, _ = ctx.needs_input_grad
+
+        def derivative(one: Tensor, other: Tensor) -> Tensor:
+            found: Tensor = torch.ops.gsplat_core.ssim_mean_backward(gradient, one, other, ctx.border)
+            return found.permute(2, 0, 1).view(ctx.shape)
+
+        # SSIM is symmetric, so the target's gradient is that of the image with both exchanged.
+        return (
+            derivative(image, target) if needs_image else None,
+            derivative(target, image) if needs_target else None,
+            None,
+        )
 
 
 @torch.library.register_fake("gsplat_core::ssim_map")
@@ -83,6 +119,16 @@ def _(image: Tensor, target: Tensor) -> Tensor:
 
 @torch.library.register_fake("gsplat_core::ssim_map_backward")
 def _(gradient: Tensor, image: Tensor, target: Tensor) -> Tensor:
+    return torch.empty_like(image, memory_format=torch.contiguous_format)
+
+
+@torch.library.register_fake("gsplat_core::ssim_mean")
+def _(image: Tensor, target: Tensor, border: int) -> Tensor:
+    return image.new_empty(())
+
+
+@torch.library.register_fake("gsplat_core::ssim_mean_backward")
+def _(gradient: Tensor, image: Tensor, target: Tensor, border: int) -> Tensor:
     return torch.empty_like(image, memory_format=torch.contiguous_format)
 
 

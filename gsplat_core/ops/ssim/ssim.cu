@@ -49,12 +49,18 @@ __device__ inline Pair masked_pair(const DeviceSsim& in, int row, int column, in
 
 __device__ inline bool is_tissue(const DeviceSsim& in, int64_t pixel) { return in.mask == nullptr || in.mask[pixel] != 0; }
 
-// Return dL/d(similarity) of a pixel's channel.
+__device__ inline bool is_counted(const DeviceSsim& in, int row, int column) {
+  const bool inner = row >= in.border && row < in.height - in.border && column >= in.border && column < in.width - in.border;
+  return inner && is_tissue(in, int64_t(row) * in.width + column);
+}
+
+// Return dL/d(similarity) of a counted pixel's channel.
 __device__ inline float weight_of(const DeviceSsim& in, int64_t pixel, int channel) {
   float weight = in.scale;
   if (in.tissue != nullptr) weight = *in.tissue > 0 ? float(double(in.scale) / (double(*in.tissue) * in.channels)) : 0;
+  if (in.factor != nullptr) weight *= *in.factor;
   if (in.upstream != nullptr) weight *= in.upstream[pixel * in.channels + channel];
-  return is_tissue(in, pixel) ? weight : 0;
+  return weight;
 }
 
 // Return the sum over the block, in a fixed order.
@@ -105,10 +111,11 @@ __global__ void __launch_bounds__(kThreads) similarity(DeviceSsim in, float* der
     const float a1 = 2 * ab + kC1, a2 = 2 * (product - ab) + kC2, b1 = means + kC1, b2 = squares - means + kC2;
     const float inverse = 1.0f / (b1 * b2), same = a1 * a2 * inverse;
     const int64_t pixel = int64_t(p.top + r) * in.width + column;
-    if (is_tissue(in, pixel)) dissimilar += double(1.0f - same);
+    const bool counted = is_counted(in, p.top + r, column);
+    if (counted) dissimilar += double(1.0f - same);
     if (in.map != nullptr) in.map[pixel * in.channels + p.channel] = same;
     if (derivatives == nullptr) continue;
-    const float weight = weight_of(in, pixel, p.channel), by_b1 = b2 * inverse, by_b2 = b1 * inverse;
+    const float weight = counted ? weight_of(in, pixel, p.channel) : 0, by_b1 = b2 * inverse, by_b2 = b1 * inverse;
     float* const to = derivatives + p.channel * plane + pixel;
     to[0] = weight * 2 * (b * (a2 - a1) * inverse - a * same * (by_b1 - by_b2));
     to[planes] = -weight * same * by_b2;
@@ -148,6 +155,13 @@ __global__ void __launch_bounds__(kThreads) gradient(DeviceSsim in, const float*
   }
 }
 
+__global__ void __launch_bounds__(kThreads) mean_of(const double* sums, int64_t blocks, double values, float* mean) {
+  double dissimilar = 0;
+  for (int64_t i = threadIdx.x; i < blocks; i += kThreads) dissimilar += sums[i];
+  dissimilar = block_total(dissimilar);
+  if (threadIdx.x == 0) *mean = float(1 - dissimilar / values);
+}
+
 dim3 grid_of(const DeviceSsim& in) {
   return dim3(blocks_for(in.width, kTile), blocks_for(in.height, kTile), unsigned(in.channels));
 }
@@ -165,6 +179,12 @@ void ssim_on_device(const DeviceSsim& in, CudaScratch& scratch, cudaStream_t str
   if (in.gradient != nullptr) derivatives = scratch.array<float>(int64_t(3) * in.channels * in.height * in.width);
   similarity<<<grid_of(in), kThreads, 0, stream>>>(in, derivatives);
   if (in.gradient != nullptr) gradient<<<grid_of(in), kThreads, 0, stream>>>(in, derivatives);
+}
+
+void ssim_mean_on_device(DeviceSsim in, double values, float* mean, CudaScratch& scratch, cudaStream_t stream) {
+  in.sums = scratch.array<double>(in.blocks());
+  ssim_on_device(in, scratch, stream);
+  mean_of<<<1, kThreads, 0, stream>>>(in.sums, in.blocks(), values, mean);
 }
 
 }  // namespace gsplat::ssim

@@ -27,6 +27,7 @@ struct SsimTask {
   float* gradient;              // [H, W, C] or null; dL/dimage is added to it
   double* sums;                 // [H, strips] or null: 1 - ssim summed over tissue
   int64_t height, width;
+  int64_t border;  // pixels this close to the edge count neither in `sums` nor, without `upstream`, in the gradient
   int channels;
   float taps[kSsimTaps];
 };
@@ -57,16 +58,20 @@ struct DeviceSsim {
   const uint8_t* mask;          // [H, W], non-zero = tissue; null: all pixels. Both images count as 0 elsewhere
   const float* upstream;        // dL/dmap [H, W, C]; null: 1
   const int64_t* tissue;        // number of tissue pixels; dL/dmap is divided by it times channels. null: no division
+  const float* factor;          // one more factor of upstream; null: 1
   float scale;                  // factor of upstream
   float* map;                   // [H, W, C] or null
   float* gradient;              // dL/dimage is added to it; null: not requested
   double* sums;                 // [blocks] or null: 1 - ssim summed over tissue
   int32_t height, width, channels, stride;
+  int32_t border;  // pixels this close to the edge count neither in `sums` nor in the gradient
 
   int64_t blocks() const;
 };
 constexpr int64_t kSsimMostRows = 65535 * 32;  // maximum grid size in the second dimension, times the tile height
 void ssim_on_device(const DeviceSsim& ssim, CudaScratch& scratch, cudaStream_t stream);
+// Compute the mean similarity of `values` pixels' channels: all without a mask that are not in the border.
+void ssim_mean_on_device(DeviceSsim ssim, double values, float* mean, CudaScratch& scratch, cudaStream_t stream);
 
 }  // namespace gsplat::ssim
 

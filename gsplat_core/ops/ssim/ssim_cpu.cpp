@@ -206,18 +206,32 @@ static void load_upstream(const Strip& s, int64_t row) {
   for (int64_t i = 0; i < (to - from) * c; ++i) out[i] = source[i];
 }
 
+// Set the weights of a row to 1 where its pixels count, and to 0 in the border.
+static void weigh_inner(const Strip& s, int64_t row) {
+  const SsimTask& task = s.task;
+  fill(s.upstream, S, 0);
+  if (row < task.border || row >= task.height - task.border) return;
+  const int64_t left = s.first_px - 2 * R, right = s.first_px + s.pixels + 2 * R;
+  const int64_t from = left < task.border ? task.border : left, inner = task.width - task.border;
+  const int64_t to = right > inner ? inner : right;
+  fill(s.upstream + (from - left) * task.channels, (to - from) * task.channels, 1);
+}
+
 // Write the sum and the similarities of a row, if the row belongs to the band that this task computes.
 static void emit_row(const Strip& s, int64_t strip, int64_t row) {
   const SsimTask& task = s.task;
   const int first = s.begin(0), last = s.end(0);
   if (task.sums) {
     const float* tissue = s.tissue + slot_of(row) * S;
+    const bool inside = row >= task.border && row < task.height - task.border;
+    const int64_t before = task.border - s.first_px, inner = task.width - task.border - s.first_px;
+    const int end = inside ? first + int(inner < s.pixels ? inner : s.pixels) * task.channels : 0;
     vfloat sums{};
-    int e = first;
-    for (; e + kLanes <= last; e += kLanes) sums += load(tissue + e) * (1.0f - load(s.similarity + e));
+    int e = first + int(before > 0 ? before : 0) * task.channels;
+    for (; e + kLanes <= end; e += kLanes) sums += load(tissue + e) * (1.0f - load(s.similarity + e));
     double total = 0;
     for (int lane = 0; lane < kLanes; ++lane) total += sums[lane];
-    for (; e < last; ++e) total += tissue[e] * (1.0f - s.similarity[e]);
+    for (; e < end; ++e) total += tissue[e] * (1.0f - s.similarity[e]);
     task.sums[row * ssim_strips(task.width, task.channels) + strip] = total;
   }
   if (task.map) {
@@ -240,7 +254,10 @@ static void band(const SsimTask& task, int64_t strip, int64_t row_begin, int64_t
   for (int64_t row = row_begin - halo; row < row_end + halo; ++row) {
     load_row(s, row + R);
     if (row >= 0 && row < task.height) {
-      if (task.upstream) load_upstream(s, row);
+      if (task.upstream)
+        load_upstream(s, row);
+      else if (task.border > 0)
+        weigh_inner(s, row);
       vertical_moments(s, row);
       similarity_row(s, row, int(halo));
       if (row >= row_begin && row < row_end) emit_row(s, strip, row);

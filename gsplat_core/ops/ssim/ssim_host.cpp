@@ -1,6 +1,7 @@
 #include "ssim.h"
 
 #include <cmath>
+#include <numeric>
 #include <vector>
 
 #include "host_call.h"
@@ -50,24 +51,38 @@ struct Images {
   }
 };
 
-// Compute SSIM: write its map, or add its gradient, scaled by `upstream`, to `gradient`; the other pointer is null.
-void run(Call& call, const Images& images, const float* upstream, float* map, float* gradient) {
+#if defined(GSPLAT_CUDA)
+using Task = DeviceSsim;
+#else
+using Task = SsimTask;
+#endif
+
+Task task_of(const Images& images) {
+  Task task = {};
 #if defined(GSPLAT_CUDA)
   check(images.height <= kSsimMostRows && images.width <= kSsimMostRows, "image must have at most ", kSsimMostRows,
         " pixels on a side, got ", images.width, " x ", images.height);
-  DeviceSsim task = {};
   task.stride = int32_t(images.channels);
-#else
-  (void)call;
-  SsimTask task = {};
 #endif
-  task.image = data(images.image), task.target = data(images.target), task.upstream = upstream, task.scale = 1;
-  task.map = map, task.gradient = gradient;
+  task.image = data(images.image), task.target = data(images.target), task.scale = 1;
   task.height = decltype(task.height)(images.height), task.width = decltype(task.width)(images.width);
   task.channels = int(images.channels);
+  return task;
+}
+
+// Set the border of a task; returns the number of values that are not in it.
+double set_border(Task& task, int64_t border) {
+  check(border >= 0 && 2 * border < task.height && 2 * border < task.width, "a border of ", border, " pixels leaves none of ",
+        task.width, " x ", task.height);
+  task.border = decltype(task.border)(border);
+  return double(task.height - 2 * border) * double(task.width - 2 * border) * task.channels;
+}
+
+void run(Call& call, Task& task) {
 #if defined(GSPLAT_CUDA)
   ssim_on_device(task, call, call.stream);
 #else
+  (void)call;
   run_ssim(task);
 #endif
 }
@@ -76,7 +91,9 @@ Tensor ssim_map(Tensor image, Tensor target) {
   Call call(image);
   const Images images(call, image, target);
   Tensor map = call.empty({images.height, images.width, images.channels});
-  run(call, images, nullptr, mutable_data(map), nullptr);
+  Task task = task_of(images);
+  task.map = mutable_data(map);
+  run(call, task);
   call.finish("ssim_map");
   return map;
 }
@@ -88,8 +105,47 @@ Tensor ssim_map_backward(Tensor gradient, Tensor image, Tensor target) {
   check(upstream.numel() == images.image.numel(), "the gradient must have the map's ", images.image.numel(), " values, got ",
         upstream.numel());
   Tensor result = call.zeros({images.height, images.width, images.channels});
-  run(call, images, data(upstream), nullptr, mutable_data(result));
+  Task task = task_of(images);
+  task.upstream = data(upstream), task.gradient = mutable_data(result);
+  run(call, task);
   call.finish("ssim_map_backward");
+  return result;
+}
+
+Tensor ssim_mean(Tensor image, Tensor target, int64_t border) {
+  Call call(image);
+  const Images images(call, image, target);
+  Task task = task_of(images);
+  const double values = set_border(task, border);
+  Tensor mean = call.empty({});
+#if defined(GSPLAT_CUDA)
+  ssim_mean_on_device(task, values, mutable_data(mean), call, call.stream);
+#else
+  std::vector<double> strips(size_t(task.height * ssim_strips(task.width, task.channels)));
+  task.sums = strips.data();
+  run_ssim(task);
+  *mutable_data(mean) = float(1 - std::accumulate(strips.begin(), strips.end(), 0.0) / values);
+#endif
+  call.finish("ssim_mean");
+  return mean;
+}
+
+Tensor ssim_mean_backward(Tensor gradient, Tensor image, Tensor target, int64_t border) {
+  Call call(image);
+  const Images images(call, image, target);
+  const Tensor upstream = call.floats(gradient, "gradient");
+  check(upstream.numel() == 1, "the gradient must be that of the mean, 1 value, got ", upstream.numel());
+  Task task = task_of(images);
+  const double values = set_border(task, border);
+  Tensor result = call.zeros({images.height, images.width, images.channels});
+  task.gradient = mutable_data(result);
+#if defined(GSPLAT_CUDA)
+  task.scale = float(1 / values), task.factor = data(upstream);
+#else
+  task.scale = float(double(*data(upstream)) / values);
+#endif
+  run(call, task);
+  call.finish("ssim_mean_backward");
   return result;
 }
 
@@ -98,6 +154,8 @@ Tensor ssim_map_backward(Tensor gradient, Tensor image, Tensor target) {
 STABLE_TORCH_LIBRARY_IMPL(gsplat_core, GSPLAT_DEVICE, m) {
   m.impl("ssim_map", GSPLAT_BOX(&ssim_map));
   m.impl("ssim_map_backward", GSPLAT_BOX(&ssim_map_backward));
+  m.impl("ssim_mean", GSPLAT_BOX(&ssim_mean));
+  m.impl("ssim_mean_backward", GSPLAT_BOX(&ssim_mean_backward));
 }
 
 }  // namespace gsplat::ssim

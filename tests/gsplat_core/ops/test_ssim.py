@@ -94,7 +94,9 @@ def test_the_number_of_threads_does_not_change_a_bit(two_threads):
         x = image.clone().requires_grad_()
         similarity = ssim_map(x, target)
         similarity.square().sum().backward()
-        return similarity.detach(), x.grad
+        y = image.movedim(-1, 0)[None].requires_grad_()
+        score = fused_ssim(y, target.movedim(-1, 0)[None], "valid")
+        return similarity.detach(), x.grad, score.detach(), *torch.autograd.grad(score, y)
 
     two = run()
     torch.set_num_threads(1)
@@ -109,6 +111,8 @@ def test_opcheck(differentiable):
     image, target = images((12, 9, 3))
     torch.library.opcheck(torch.ops.gsplat_core.ssim_map, (image.requires_grad_(differentiable), target))
     torch.library.opcheck(torch.ops.gsplat_core.ssim_map_backward, (target, image.detach(), target))
+    torch.library.opcheck(torch.ops.gsplat_core.ssim_mean, (image.detach(), target, 2))
+    torch.library.opcheck(torch.ops.gsplat_core.ssim_mean_backward, (torch.ones(()), image.detach(), target, 2))
 
 
 def test_what_it_cannot_take_is_refused():
@@ -121,19 +125,73 @@ def test_what_it_cannot_take_is_refused():
         ssim_map(torch.zeros(2, 2, 33), torch.zeros(2, 2, 33))
 
 
-def test_fused_ssim_is_the_mean_of_the_map_of_every_picture():
-    first = torch.rand(3, 11, 14, 17, generator=torch.Generator().manual_seed(0), requires_grad=True)
-    second = torch.rand(3, 11, 14, 17, generator=torch.Generator().manual_seed(1))
-    expected = torch.stack(
-        [reference_ssim_map(a.movedim(0, -1), b.movedim(0, -1)) for a, b in zip(first, second, strict=True)]
-    )
-    for padding, inner in (("same", expected), ("valid", expected[:, 5:-5, 5:-5])):
-        torch.testing.assert_close(fused_ssim(first, second, padding), inner.mean())
-    (gradient,) = torch.autograd.grad(fused_ssim(first, second, padding="valid"), first)
-    (wanted,) = torch.autograd.grad(expected[:, 5:-5, 5:-5].mean(), first)
-    torch.testing.assert_close(gradient, wanted)
-    assert not fused_ssim(first, second, train=False).requires_grad
+# 750 px with 3 channels are wider than one strip; 33 channels in all take two calls.
+PICTURES = [
+    (1, 3, 11, 11),
+    (1, 1, 11, 90),
+    (1, 3, 70, 13),
+    (2, 3, 16, 40),
+    (1, 3, 12, 750),
+    (2, 16, 14, 17),
+    (3, 11, 14, 17),
+]
+
+
+@pytest.mark.parametrize("padding", ["same", "valid"])
+@pytest.mark.parametrize("layout", ["planes", "pixels"])
+@pytest.mark.parametrize("shape", PICTURES)
+def test_fused_ssim_is_the_mean_of_the_map_of_every_picture(shape, layout, padding):
+    pair = [t.movedim(-1, 0).reshape(shape) for t in images((*shape[2:], shape[0] * shape[1]), seed=2)]
+    if layout == "pixels":
+        pair = [t.movedim(1, -1).contiguous().movedim(-1, 1) for t in pair]
+    ours = [t.clone().requires_grad_() for t in pair]
+    exact = [t.double().requires_grad_() for t in pair]
+    score = fused_ssim(*ours, padding)
+    maps = torch.stack([reference_ssim_map(a.movedim(0, -1), b.movedim(0, -1)) for a, b in zip(*exact, strict=True)])
+    wanted = (maps if padding == "same" else maps[:, 5:-5, 5:-5]).mean()
+    assert score.shape == () and score.item() == pytest.approx(wanted.item(), abs=1e-6)
+    (1.7 * score).backward()
+    (1.7 * wanted).backward()
+    for one, other in zip(ours, exact, strict=True):
+        scale = other.grad.abs().max()
+        torch.testing.assert_close(one.grad.double() / scale, other.grad / scale, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("border", [0, 1, 5, 8, 15])
+def test_the_border_counts_neither_in_the_mean_nor_in_the_gradient(border):
+    image, target = (t.requires_grad_() for t in images((31, 720, 3)))
+    inner = ssim_map(image, target)[border : 31 - border, border : 720 - border]
+    mean = torch.ops.gsplat_core.ssim_mean(image.detach(), target.detach(), border)
+    torch.testing.assert_close(mean, inner.mean(), rtol=1e-6, atol=1e-7)
+    upstream = torch.tensor(0.7)
+    for one, other in ((image, target), (target, image)):
+        (wanted,) = torch.autograd.grad(inner.mean(), one, upstream, retain_graph=True)
+        found = torch.ops.gsplat_core.ssim_mean_backward(upstream, one.detach(), other.detach(), border)
+        torch.testing.assert_close(found / wanted.abs().max(), wanted / wanted.abs().max(), rtol=0, atol=2e-6)
+
+
+def test_fused_ssim_takes_the_gradients_that_are_wanted():
+    first, second = (torch.rand(2, 3, 14, 17, generator=torch.Generator().manual_seed(seed)) for seed in (0, 1))
+    both = [t.clone().requires_grad_() for t in (first, second)]
+    gradients = torch.autograd.grad(fused_ssim(*both), both)
+    for index in (0, 1):
+        pair = [first, second]
+        pair[index] = both[index]
+        assert torch.equal(torch.autograd.grad(fused_ssim(*pair), both[index])[0], gradients[index])
+    assert not fused_ssim(*both, train=False).requires_grad
+    assert fused_ssim(*both, train=False) == fused_ssim(*both)
+    (differentiable,) = torch.autograd.grad(fused_ssim(*both), both[:1], create_graph=True)
+    with pytest.raises(NotImplementedError, match="first derivatives only"):
+        differentiable.sum().backward()
+
+
+def test_fused_ssim_refuses_what_it_cannot_take():
+    picture = torch.zeros(2, 3, 14, 17)
     with pytest.raises(InvalidInput, match="'same' or 'valid'"):
-        fused_ssim(first, second, "full")
+        fused_ssim(picture, picture, "full")
     with pytest.raises(InvalidInput, match="larger than 10 pixels"):
-        fused_ssim(first[..., :10], second[..., :10], "valid")
+        fused_ssim(picture[..., :10], picture[..., :10], "valid")
+    with pytest.raises(InvalidInput, match=r"must be float32, got torch\.float64"):
+        fused_ssim(picture, picture.double())
+    with pytest.raises(RuntimeError, match="border of 7 pixels leaves none of 17 x 14"):
+        torch.ops.gsplat_core.ssim_mean(picture[0].movedim(0, -1), picture[0].movedim(0, -1), 7)
