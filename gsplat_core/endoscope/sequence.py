@@ -66,6 +66,48 @@ black borders and recorder overlays.
 """
 
 
+def picture_fault(image: NDArray[np.uint8]) -> str | None:
+    """Return why a picture, RGB uint8 [H, W, 3], shows nothing: "black", "one colour" or "noise"; None otherwise."""
+    return _without_content(image, _reduced(image))
+
+
+def _reduced(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    height, width = (max(1, side // max(1, side // SAMPLES)) for side in image.shape[:2])
+    return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_NEAREST), np.uint8)
+
+
+def _without_content(image: NDArray[np.uint8], small: NDArray[np.uint8]) -> str | None:
+    levels = cv2.calcHist([luma(small)], [0], None, [256], [0, 256]).ravel()
+    pixels = small.shape[0] * small.shape[1]
+    if levels[BLACK_LEVEL:].sum() <= ODD_SHARE * pixels:
+        return "black"
+    if _one_grey(levels, pixels) and _one_colour(small):
+        return "one colour"
+    if min(image.shape[:2]) >= SMALLEST_FOR_NOISE_PX and _roughness(image) > NOISE_SHARE:
+        # If averages over small squares are smooth, the picture has content, as with fibre bundles or a noisy camera.
+        height, width = image.shape[:2]
+        size = width // AVERAGED_PX, height // AVERAGED_PX
+        averages = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+        if _roughness(averages) > NOISE_SHARE:
+            return "noise"
+    return None
+
+
+def _one_grey(levels: NDArray[Any], pixels: int) -> bool:
+    """Return True if all but `ODD_SHARE` of the pixels have nearly one grey level; faster than comparing colours."""
+    # Allow one more grey level on either side than for colours, since grey values are rounded.
+    wide = min(2 * ONE_COLOUR_LEVELS + 3, len(levels))
+    below = np.append(0, levels.cumsum())
+    return bool((below[wide:] - below[:-wide]).max() >= (1 - ODD_SHARE) * pixels)
+
+
+def _one_colour(small: NDArray[np.uint8]) -> bool:
+    levels = ONE_COLOUR_LEVELS
+    most = [int(np.bincount(small[:, :, channel].ravel(), minlength=1).argmax()) for channel in range(3)]
+    of_it = cv2.inRange(small, tuple(level - levels for level in most), tuple(level + levels for level in most))
+    return cv2.countNonZero(of_it) >= (1 - ODD_SHARE) * of_it.size
+
+
 class SequenceCheck:
     """Check of each picture against the previous one. Its state is one reduced picture and one number per row."""
 
@@ -85,19 +127,19 @@ class SequenceCheck:
         Returns:
             None, "black", "one colour", "noise", "duplicate", "frozen" or "torn".
         """
-        height, width = (max(1, side // max(1, side // SAMPLES)) for side in image.shape[:2])
-        small = np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_NEAREST), np.uint8)
+        small = _reduced(image)
+        height = len(small)
         previous, self._previous = self._previous, small
         if previous is None or self._shape != image.shape:
             self._shape, self._frames_seen, self._same_run = image.shape, 0, 0
             self._row_moves = np.zeros(height)
             self._new_since_ns = pts_ns
-            return self._unusable(image, small)
+            return _without_content(image, small)
         _, differs = cv2.threshold(cv2.absdiff(small, previous), SAME_LEVELS, 1, cv2.THRESH_BINARY)
         # Share of changed pixels in each row, over all channels.
         share = cv2.reduce(differs.reshape(height, -1), 1, cv2.REDUCE_AVG, dtype=cv2.CV_32F).ravel()
         if share.mean() <= 1 - SAME_SHARE:
-            return self._unusable(image, small) or self._repeated(pts_ns)
+            return _without_content(image, small) or self._repeated(pts_ns)
         self._new_since_ns, self._same_run = pts_ns, 0
         changed = share > CHANGED_SHARE
         torn = self._torn(small, share)
@@ -108,36 +150,7 @@ class SequenceCheck:
             # Update the frequency of row changes quickly at first, then as an average over about the last 50 frames.
             self._frames_seen += 1
             self._row_moves += (changed - self._row_moves) / min(self._frames_seen, 50)
-        return self._unusable(image, small) or ("torn" if torn else None)
-
-    def _unusable(self, image: NDArray[np.uint8], small: NDArray[np.uint8]) -> str | None:
-        levels = cv2.calcHist([luma(small)], [0], None, [256], [0, 256]).ravel()
-        pixels = small.shape[0] * small.shape[1]
-        if levels[BLACK_LEVEL:].sum() <= ODD_SHARE * pixels:
-            return "black"
-        if self._one_grey(levels, pixels) and self._one_colour(small):
-            return "one colour"
-        if min(image.shape[:2]) >= SMALLEST_FOR_NOISE_PX and _roughness(image) > NOISE_SHARE:
-            # If averages over small squares are smooth, the picture has content, as with fibre bundles or a noisy camera.
-            height, width = image.shape[:2]
-            size = width // AVERAGED_PX, height // AVERAGED_PX
-            averages = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-            if _roughness(averages) > NOISE_SHARE:
-                return "noise"
-        return None
-
-    def _one_grey(self, levels: NDArray[Any], pixels: int) -> bool:
-        """Return True if all but `ODD_SHARE` of the pixels have nearly one grey level; faster than comparing colours."""
-        # Allow one more grey level on either side than for colours, since grey values are rounded.
-        wide = min(2 * ONE_COLOUR_LEVELS + 3, len(levels))
-        below = np.append(0, levels.cumsum())
-        return bool((below[wide:] - below[:-wide]).max() >= (1 - ODD_SHARE) * pixels)
-
-    def _one_colour(self, small: NDArray[np.uint8]) -> bool:
-        levels = ONE_COLOUR_LEVELS
-        most = [int(np.bincount(small[:, :, channel].ravel(), minlength=1).argmax()) for channel in range(3)]
-        of_it = cv2.inRange(small, tuple(level - levels for level in most), tuple(level + levels for level in most))
-        return cv2.countNonZero(of_it) >= (1 - ODD_SHARE) * of_it.size
+        return _without_content(image, small) or ("torn" if torn else None)
 
     def _repeated(self, pts_ns: int) -> str:
         self._same_run += 1

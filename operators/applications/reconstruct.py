@@ -6,6 +6,7 @@ Held-out frames (1, 9, 17, ...) are excluded from training. The evaluation uses 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -55,7 +56,7 @@ from operators.applications.session import (
 )
 from operators.errors import NothingShown
 from operators.settings import OfflineSection, check_option
-from operators.sources.derived import PosedSource
+from operators.sources.derived import JudgedSource, PosedSource
 from operators.sources.source import FrameSource
 from operators.storage import storage_errors
 
@@ -130,7 +131,7 @@ def reconstruct(
     check_option("steps", steps)
 
     def run(inside: ReplaySettings, notes: list[str]) -> RunOutcome:
-        source = prepare(inside, notes, offline=True)
+        source: FrameSource = JudgedSource(prepare(inside, notes, offline=True))
         start = Start.now()
         fitted = _Fitting(source, inside, progress, stop_requested, notes, clock).done(steps)
         # Estimated poses come with the frames of the source.
@@ -212,12 +213,18 @@ class _Inputs:
         # `fit` estimates depth that needs all frames at once.
         choice = "none" if of_recording(settings.depth) == settings.depth else settings.depth
         finder = DepthFinder(choice, description.camera, device=settings.device)
-        frames = FirstFrames(self.source, description.frame_count)
-        chosen = [finder.with_depth(frame) for frame in frames if _trains(frame)]
+        chosen: list[Frame] = []
+        left_out: Counter[str] = Counter()
+        for frame in FirstFrames(self.source, description.frame_count):
+            if _trains(frame):
+                chosen.append(finder.with_depth(frame))
+            else:
+                left_out[frame.unusable or "held out"] += 1
         if not chosen:
+            why = ", ".join(f"{reason}: {count}" for reason, count in left_out.items())
             raise NothingShown(
-                f"nothing was shown: none of the {description.frame_count} frames of {description.name} can be trained on, since they are damaged,"
-                " withheld or held out; give a recording with other frames"
+                f"nothing was shown: none of the {description.frame_count} frames of {description.name} can be trained on"
+                f" ({why}); give other frames, and pictures of more than 8 bits with values up to 65535"
             )
         return chosen
 

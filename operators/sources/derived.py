@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from gsplat_core.endoscope.sequence import picture_fault
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings.calibration import default_camera
 from gsplat_core.scene.frames import Frame, resized_frame
@@ -106,6 +107,21 @@ class PosedSource(DerivedSource):
 
     def _derived(self, frame: Frame) -> Frame:
         return frame.with_fields(pose=self._pose_of(frame))
+
+
+class JudgedSource(DerivedSource):
+    """`FrameSource` that withholds the frames of another source whose picture shows nothing, such as a black one.
+
+    Unlike the checks of a stream, it judges each picture alone, so that a frame has the same verdict whenever it is read.
+    """
+
+    def __init__(self, source: FrameSource) -> None:
+        """Create a source with the frames of `source`, opened and closed together with this one."""
+        super().__init__(source, source.description)
+
+    def _derived(self, frame: Frame) -> Frame:
+        fault = None if frame.unusable else picture_fault(frame.image)
+        return frame if fault is None else replace(frame, withheld=fault)
 
 
 MOST_KEPT = 8

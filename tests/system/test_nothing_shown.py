@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 
 import cv2
 import numpy as np
@@ -86,3 +87,24 @@ def test_with_the_gate_off_the_same_run_shows_its_frames(drapes, tmp_path, capsy
         == OK
     )
     assert "nothing was shown" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("level", "bits"), [(0, 8), (4095, 16)])
+def test_black_pictures_are_not_reconstructed(level, bits, tmp_path, capsys):
+    folder = tmp_path / "black" / "images"
+    folder.mkdir(parents=True)
+    for k in range(5):
+        cv2.imwrite(str(folder / f"{k:03d}.png"), np.full((48, 64, 3), level, np.uint8 if bits == 8 else np.uint16))
+    assert run(["reconstruct", str(folder.parent), "--out", str(tmp_path / "out"), "--steps", "2"]) == NOTHING_SHOWN
+    said = capsys.readouterr().err
+    assert "(black: 5)" in said and "values up to 65535" in said
+
+
+def test_reconstruct_leaves_out_a_black_beginning(tiny, tmp_path, capsys):
+    recording, out = tmp_path / "recording", tmp_path / "out"
+    shutil.copytree(tiny, recording)
+    pictures = sorted((recording / "images").iterdir())
+    for path in pictures[:2]:
+        cv2.imwrite(str(path), np.zeros_like(cv2.imread(str(path))))
+    assert run(["reconstruct", str(recording), "--out", str(out), "--steps", "2", "--device", "cpu"]) == OK
+    assert "2 frames were withheld and not scored (black: 2)" in capsys.readouterr().err
