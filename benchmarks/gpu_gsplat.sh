@@ -52,7 +52,7 @@ untimed() {
 
 timed() {
   local module script
-  PYTHONPATH=$peers:$PYTHONPATH run suite "$python" benchmarks/suite.py --device cuda --only render rasterization training deformation --out "$out"
+  PYTHONPATH=$peers:$PYTHONPATH run suite "$python" benchmarks/suite.py --device cuda --only rasterization --out "$out"
   for script in "$@"; do
     for module in gsplat gsplat_core; do
       PYTHONPATH=$peers:$PYTHONPATH run "$(basename "$script" .py)-$module" "$python" "$script" --module "$module"
