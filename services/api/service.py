@@ -81,6 +81,7 @@ async def _result(check: Callable[[], Awaitable[CheckResult]]) -> CheckResult:
 router = new_router("health", prefix="")
 
 
+@router.head("/livez", include_in_schema=False)
 @router.get("/livez")
 @requires("public")
 async def live() -> Alive:
@@ -88,6 +89,7 @@ async def live() -> Alive:
     return Alive()
 
 
+@router.head("/readyz", include_in_schema=False)
 @router.get("/readyz", response_model_exclude_none=True, responses={503: {"model": Readiness}})
 @requires("public")
 async def ready(

@@ -69,9 +69,15 @@ def test_a_route_without_a_role_cannot_be_made():
 
 
 def test_a_wrong_method_says_which_are_right(plane):
-    for path, methods in (("/v1/streams", "GET, POST"), ("/v1/models/a/versions", "GET, PUT"), ("/livez", "GET")):
+    for path, methods in (("/v1/streams", "GET, POST"), ("/v1/models/a/versions", "GET, PUT"), ("/livez", "GET, HEAD")):
         answer = plane.ask("TRACE", path)
         assert (answer.status_code, answer.headers["allow"], answer.json()["status"]) == (405, methods, 405)
+
+
+def test_probes_answer_head(plane):
+    for path in ("/livez", "/readyz", "/readyz?verbose=1"):
+        seen, asked = (plane.client.request(method, path) for method in ("HEAD", "GET"))
+        assert (seen.status_code, seen.content) == (200, b"") and asked.status_code == 200
 
 
 def test_absent_parts_answer_503(new_plane):
