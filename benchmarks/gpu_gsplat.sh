@@ -6,8 +6,8 @@
 #   GSPLAT_SOURCES   unpacked source archive of gsplat 1.5.3, whose tests are run with this package
 #   EXAMPLES         folder with gsplat's simple_trainer.py, or "" to leave the trainer out
 #   SCRIPT           further scripts of timings, run with --module gsplat and with --module gsplat_core
-# With one GPU, timed benchmarks run first and alone. With two, they have the first GPU alone, the others run on the second
-# at the same time, and processes.py runs on both. PYTHON is the interpreter (default python3). Each benchmark prints to OUT/NAME.txt; one that fails does not stop the others.
+# Timed benchmarks run alone on their GPU. With two GPUs, the others run on the second at the same time, and processes.py on
+# both. PYTHON is the interpreter (default python3). Each benchmark prints to OUT/NAME.txt; one that fails does not stop the others.
 set -uo pipefail
 cd "$(dirname "$0")/.."
 out=$(realpath -m "$1") wheel=$(realpath "$2") sources=$(realpath "$3") examples=${4:-}
@@ -36,8 +36,23 @@ compare() {
 gpus=$(nvidia-smi --list-gpus | wc -l)
 peers=$PWD/build/peers
 
-# What compares pictures, gradients and memory, and may share a GPU.
+# Comparisons of pictures, gradients, memory and scores, which may share a GPU.
 untimed() {
+  compare static static --full --steps 3000 &
+  local beside=$!
+  compare calls calls
+  compare cameras cameras
+  compare thresholds thresholds
+  compare memory memory --full
+  compare strategies strategies --full --steps 3000
+  wait "$beside"
+}
+
+peer_tests() {
+  compare own_tests own_tests --tests "$sources/tests" --oracle "$peers/gsplat" --peer "$peers" --together 10 --timeout 400
+}
+
+timed() {
   export CUDA_VISIBLE_DEVICES=$((gpus > 1 ? 1 : 0))
   compare own_tests own_tests --tests "$sources/tests" --oracle "$peers/gsplat" --peer "$peers" --together 10 --timeout 400 &
   local beside=$!
@@ -71,14 +86,17 @@ building=$!
 if [ "$gpus" -gt 1 ]; then
   compare processes processes
 fi
+CUDA_VISIBLE_DEVICES=$((gpus > 1 ? 1 : 0)) untimed &
+beside=$!
 run tests benchmarks/gpu_tests.sh
 wait "$building"
 
 if [ "$gpus" -gt 1 ]; then
-  untimed &
+  CUDA_VISIBLE_DEVICES=1 peer_tests &
   CUDA_VISIBLE_DEVICES=0 timed "$@"
   wait
 else
+  wait "$beside"
   timed "$@"
-  untimed
+  peer_tests
 fi
