@@ -46,7 +46,7 @@ def scene(count: int, width: int, height: int, device: str) -> dict[str, Any]:
         "quats": torch.tensor([1.0, 0, 0, 0]) + 0.25 * torch.randn(count, 4, generator=generator),
         "scales": size * torch.exp(uniform(count, 3) - 0.5) * torch.tensor([1, 1, 0.1]),
         "opacities": 0.3 + 0.6 * uniform(count),
-        "colors": uniform(count, 3),
+        "colors": uniform(1, count, 3),  # for each camera; gsplat's 2DGS with depth takes no others
         "viewmats": torch.eye(4)[None],
         "Ks": torch.tensor([[[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]]),
     }
