@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,63 @@ def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
     """Return a Markdown table."""
     lines = [head, ["---"] * len(head), *rows]
     return "\n".join("| " + " | ".join(str(cell) for cell in line) + " |" for line in lines)
+
+
+def speed(folder: Path) -> str:
+    """Return times of eager calls of both packages: `gpu_eager.py` in one process, and a script of timings in turn."""
+    path = folder / "rasterization.jsonl"
+    lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.exists() else []
+    rows: list[Sequence[object]] = []
+    host: list[Sequence[object]] = []
+    for each in (line["result"] for line in lines):
+        if "ratio" in each:
+            asked = each.get("asked_ms")
+            kernels = f"{each['ours_kernel_ms']:.3f} / {each['gsplat_kernel_ms']:.3f} ms"
+            verdict = "" if asked is None else f"≤ {asked} ms: {'met' if each['met'] else 'missed'}"
+            rows.append([each["work"], f"{each['ours_ms']:.3f} ms", f"{each['gsplat_ms']:.3f} ms", f"{each['ratio']:.1f}", kernels, verdict])  # fmt: skip
+        elif each["work"].endswith("host time"):
+            host.append([each["work"].removesuffix(" host time"), *(f"{each[f'{part}_us']:.0f} ({each[f'{part}_native_us']:.0f}) µs" for part in ("forward", "forward_with_gradients", "backward")), f"{each['loss_us']:.0f} µs"])  # fmt: skip
+    if not rows:
+        return "Not measured yet."
+    about = lines[0]
+    text = [
+        "Colour and expected depth, one call after another; the backward pass is that of a mean absolute difference, whose operations in torch"
+        " are part of both times. Kernels are the time in which anything runs on the GPU. Other comparisons ran at the same time on a second GPU"
+        " and on the same processor (`gpu_gsplat.sh`), which lengthens the host times of both packages, here and in the trainings below. [RESULTS.md](../RESULTS.md) has a run"
+        " with nothing else on the machine.",
+        table(("`gpu_eager.py`", "ours", "gsplat 1.5.3", "times faster", "kernels, ours / gsplat", "required"), rows),
+        "Host time of one call (of it in native code), and of the loss in torch:",
+        table(("scene", "forward", "forward with gradients", "backward", "loss"), host),
+    ]
+    runs = {}
+    for module in ("gsplat", "gsplat_core"):
+        found = folder / f"splat_bench-{module}.jsonl"
+        if found.exists():
+            runs[module] = [json.loads(line) for line in found.read_text(encoding="utf-8").splitlines()]
+    if len(runs) == 2:
+        text += [
+            "Independent script of timings, one process for each package on the same machine:",
+            table(
+                (
+                    "scene",
+                    "forward: ours / gsplat",
+                    "times faster",
+                    "forward and backward: ours / gsplat",
+                    "times faster",
+                ),
+                [
+                    [
+                        one["scene"],
+                        f"{one['fwd_ms']:.3f} / {other['fwd_ms']:.3f} ms",
+                        f"{other['fwd_ms'] / one['fwd_ms']:.1f}",
+                        f"{one['fwd_bwd_ms']:.3f} / {other['fwd_bwd_ms']:.3f} ms",
+                        f"{other['fwd_bwd_ms'] / one['fwd_bwd_ms']:.1f}",
+                    ]
+                    for one, other in zip(runs["gsplat_core"], runs["gsplat"], strict=True)
+                ],
+            ),
+        ]
+    return "\n\n".join([*text, provenance({"cuda": [about]})])
 
 
 def own_tests(logs: Logs) -> str:
@@ -302,6 +360,12 @@ def trainings(logs: Logs) -> str:
             for name in sorted(names - set(variants))
             if name != "ours-selective"
         ]
+        counts = Counter((run["strategy"], run["variant"]) for run in log["runs"])
+        fewer = [
+            f"`{strategy}` with {TRAINER_VARIANTS[name]} ({count})"
+            for (strategy, name), count in sorted(counts.items())
+            if count < max(counts.values())
+        ]
         texts.append(
             f"{device}: {scene['views']} views of {scene['width_px']}x{scene['height_px']} px, {scene['points']:,} points,"
             f" {log['steps']:,} steps with all intervals scaled by {log['steps'] / 30_000:g}, cap of `mcmc` {log['cap']:,},"
@@ -309,6 +373,7 @@ def trainings(logs: Logs) -> str:
             f" {'the package fused-ssim' if installed else 'ours, because fused-ssim was not installed'}."
             f" Replaced packages: {', '.join(sorted({each for run in log['runs'] for each in run['replaced']}))}."
             + (f" Not run for want of time: {', '.join(absent)}." if absent else "")
+            + (f" With fewer seeds, for want of time: {', '.join(fewer)}." if fewer else "")
         )
     head = ("strategy", "package", "device", "PSNR", "SSIM", "splats", "peak memory", "training time", "waiting", "ratio", "ratio without waiting")  # fmt: skip
     return "\n\n".join([*texts, table(head, rows)])
@@ -373,6 +438,7 @@ def gsplat_text(folder: Path = FOLDER) -> str:
         "# The gsplat surface\n\nGenerated by `python benchmarks/publish.py` from the logs of the scripts in [benchmarks/gsplat](../gsplat); do not edit."
         " [docs/gsplat.md](../../docs/gsplat.md) says how to run gsplat programs."
     ]
+    parts.append(f"## Speed of eager calls\n\n{speed(folder)}")
     for title, topic, section in SECTIONS:
         logs = logs_of(topic, folder)
         text = section(logs) if logs else ""
