@@ -392,7 +392,30 @@ def trainer(logs: Logs) -> str:
         " the first step, which takes seconds and moves the ratios towards 1. Required: at most 0.65"
         " of gsplat's time, and 0.5 with our optimiser and SSIM. gsplat needs CUDA."
     )
-    return f"{said}\n\n{trainings(logs)}"
+    return "\n\n".join([said, trainings(logs), *_own_trainer(logs)])
+
+
+def _own_trainer(logs: Logs) -> list[str]:
+    """Return the times of `intrasplat train`, relative to gsplat's trainer, where both trained the same scene with as many steps."""
+    lines = []
+    for device, own in logs_of("static").items():
+        theirs = logs.get(device)
+        if theirs is None or any(own[name] != theirs[name] for name in ("scene", "steps")):
+            continue
+        for name, strategy in (("adc", "default"), ("mcmc", "mcmc")):
+            ours, peer = own["strategies"][name], theirs["summary"][strategy].get("gsplat")
+            if peer is not None:
+                median, worst = (seconds / peer["training_s"][0] for seconds in ours["training_s"])
+                lines.append(
+                    f"- {device}: `intrasplat train --strategy {name}` takes {median:.2f} ({worst:.2f}) of the median time of gsplat's trainer with"
+                    f" `{strategy}`: {ours['psnr_db'][0]:.2f} and {peer['psnr_db'][0]:.2f} dB, {ours['gaussians'][0]:,.0f} and {peer['gaussians'][0]:,.0f} Gaussians."
+                )
+    if not lines:
+        return []
+    return [
+        "The same scene with as many steps by [`intrasplat train`](#static-scenes-intrasplat-train), which has its own schedule of"
+        " strategies and whose times vary, because other benchmarks shared its GPU:\n\n" + "\n".join(lines)
+    ]
 
 
 def _trained(each: Mapping[str, Any]) -> list[str]:
