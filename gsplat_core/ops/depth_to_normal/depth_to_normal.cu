@@ -21,9 +21,8 @@ __global__ void __launch_bounds__(kThreads) normals(Maps maps, float* out) {
 }
 
 __global__ void __launch_bounds__(kThreads) gradients(Maps maps, const float* v_normals, float* v_depths) {
-  for_own_pixel(maps, [&](const View& view, int64_t image, int x, int y) {
-    write_gradient(maps, view, image, x, y, v_normals, v_depths);
-  });
+  for_own_pixel(
+      maps, [&](const View& view, int64_t image, int x, int y) { write_gradient(maps, view, image, x, y, v_normals, v_depths); });
 }
 
 int64_t pixels_of(const Maps& maps) { return maps.images * maps.height * maps.width; }

@@ -23,9 +23,8 @@ void run(const Maps& maps, float* normals, const CpuCall&) {
                               [&](int64_t begin, int64_t end) { kernels().normals(maps, normals, begin, end); });
 }
 void run(const Maps& maps, const float* v_normals, float* v_depths, const CpuCall&) {
-  torch::stable::parallel_for(0, maps.images * maps.height, kRows, [&](int64_t begin, int64_t end) {
-    kernels().gradients(maps, v_normals, v_depths, begin, end);
-  });
+  torch::stable::parallel_for(0, maps.images * maps.height, kRows,
+                              [&](int64_t begin, int64_t end) { kernels().gradients(maps, v_normals, v_depths, begin, end); });
 }
 
 #endif
@@ -37,8 +36,9 @@ struct Given {
     check(this->depths.dim() == 3 && this->depths.numel() <= kMostPixels,
           "depth_to_normal: depths must be [I, H, W] with fewer than 2^31 pixels");
     const int64_t images = this->depths.size(0);
-    check(to_world.numel() == 16 * images && K.numel() == 9 * images, "depth_to_normal: camtoworlds and Ks must have 16 and 9 values for each of ",
-          images, " images, got ", to_world.numel(), " and ", K.numel());
+    check(to_world.numel() == 16 * images && K.numel() == 9 * images,
+          "depth_to_normal: camtoworlds and Ks must have 16 and 9 values for each of ", images, " images, got ", to_world.numel(),
+          " and ", K.numel());
     maps = {data(this->depths), data(to_world), data(K), images, int32_t(this->depths.size(1)), int32_t(this->depths.size(2))};
   }
   Tensor depths, to_world, K;

@@ -40,15 +40,20 @@ struct Slopes {
   float p, q, a, b;  // of the formula above
 };
 
-GSPLAT_INLINE bool is_inner(const Maps& maps, int x, int y) { return x > 0 && x + 1 < maps.width && y > 0 && y + 1 < maps.height; }
+GSPLAT_INLINE bool is_inner(const Maps& maps, int x, int y) {
+  return x > 0 && x + 1 < maps.width && y > 0 && y + 1 < maps.height;
+}
 
 // The slopes at an inner pixel of the image that starts at `depths`.
 GSPLAT_INLINE Slopes slopes_at(const Maps& maps, const View& view, const float* depths, int x, int y) {
   const float* const at = depths + int64_t(y) * maps.width + x;
   const float right = at[1], left = at[-1], below = at[maps.width], above = at[-int64_t(maps.width)];
-  return {(float(x) + 0.5f - view.center_x) * view.per_fx, (float(y) + 0.5f - view.center_y) * view.per_fy,
-          right - left,                                     below - above,
-          (below + above) * view.per_fy,                    (right + left) * view.per_fx};
+  return {(float(x) + 0.5f - view.center_x) * view.per_fx,
+          (float(y) + 0.5f - view.center_y) * view.per_fy,
+          right - left,
+          below - above,
+          (below + above) * view.per_fy,
+          (right + left) * view.per_fx};
 }
 
 // The cross product of the differences in world axes.
@@ -100,8 +105,10 @@ GSPLAT_INLINE Change change_at(const Maps& maps, const View& view, int64_t first
 GSPLAT_INLINE void write_gradient(const Maps& maps, const View& view, int64_t image, int x, int y, const float* v_normals,
                                   float* v_depths) {
   const int64_t first = image * maps.height * maps.width;
-  const Change left = change_at(maps, view, first, x - 1, y, v_normals), right = change_at(maps, view, first, x + 1, y, v_normals);
-  const Change above = change_at(maps, view, first, x, y - 1, v_normals), below = change_at(maps, view, first, x, y + 1, v_normals);
+  const Change left = change_at(maps, view, first, x - 1, y, v_normals),
+               right = change_at(maps, view, first, x + 1, y, v_normals);
+  const Change above = change_at(maps, view, first, x, y - 1, v_normals),
+               below = change_at(maps, view, first, x, y + 1, v_normals);
   v_depths[first + int64_t(y) * maps.width + x] =
       view.per_fx * (left.b + right.b) + left.p - right.p + view.per_fy * (above.a + below.a) + above.q - below.q;
 }
