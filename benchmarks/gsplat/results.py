@@ -156,6 +156,19 @@ def thresholds(logs: Logs) -> str:
     return "\n\n".join([said, table(head, rows)])
 
 
+def names(logs: Logs) -> str:
+    """Return how many of gsplat's public names exist, and the parameters that differ."""
+    lines = []
+    for log in logs.values():
+        present = log["names"] - len(log["absent"])
+        lines.append(
+            f"{present} of {log['names']} public names of gsplat {log['gsplat']}{'; absent: ' + ', '.join(log['absent']) if log['absent'] else ''}."
+            f" Parameters have gsplat's names, order and defaults in all but {len(log['different'])} of them:"
+        )
+        lines.append("\n".join(f"- `{name}`: {'; '.join(found)}" for name, found in log["different"].items()))
+    return "\n\n".join(lines)
+
+
 def calls(logs: Logs) -> str:
     """Return the number of typical calls that work, and those that do not."""
     rows, missing = [], []
@@ -436,6 +449,7 @@ def _trained(each: Mapping[str, Any]) -> list[str]:
 SECTIONS: tuple[tuple[str, str, Callable[[Logs], str]], ...] = (
     ("gsplat's own tests", "own_tests", own_tests),
     ("Rounding near the thresholds of blending", "thresholds", thresholds),
+    ("Public names", "names", names),
     ("Typical calls", "calls", calls),
     ("Memory of packed and sparse gradients", "memory", memory),
     ("Surfels (2D Gaussian Splatting)", "surfels", surfels),
