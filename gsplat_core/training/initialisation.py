@@ -32,6 +32,11 @@ THICKNESS = 0.3
 """Thickness of a new Gaussian relative to its width, since tissue is a surface."""
 
 FIRST_OPACITY = 0.9
+HIDDEN = -10.0
+"""Logit of the opacity of Gaussians at excluded pixels, which is too small to be drawn."""
+MARGIN_IN_SPACINGS = 2
+"""Distance to the nearest pixel that is not excluded up to which Gaussians are visible, so that the rim has neighbours on
+both sides."""
 TOOL_MARGIN_PX = 2
 """Width in pixels of the margin around tools that is in-painted together with them, since masks end slightly early."""
 
@@ -45,7 +50,8 @@ def gaussians_from_frame(
     """Create Gaussians that cover the whole frame including tools.
 
     Pixels under tools get in-painted colours (Telea 2004) and extrapolated depth, so that tissue
-    uncovered later has Gaussians.
+    uncovered later has Gaussians. Gaussians that the frame's `loss_mask` excludes, such as outside of a round view, are
+    transparent: nothing is known of that place.
 
     Args:
         frame: first frame of a scene.
@@ -57,9 +63,25 @@ def gaussians_from_frame(
     """
     height, width = frame.image.shape[:2]
     pixels, spacing_px = jittered_grid(width, height, count, seed)
-    return gaussians_at_pixels(
+    created = gaussians_at_pixels(
         pixels, spacing_px, tissue_colours(frame), tissue_depth(frame, default_depth_mm), camera, sh_degree=sh_degree
     )
+    hidden = excluded(frame, spacing_px)
+    if hidden is not None:
+        column, row = pixels.astype(np.int64).T
+        created.logit_opacities[torch.from_numpy(hidden[row.clip(0, height - 1), column.clip(0, width - 1)])] = HIDDEN
+    return created
+
+
+def excluded(frame: Frame, spacing_px: float) -> NDArray[np.bool_] | None:
+    """Return the pixels [H, W] that `loss_mask` excludes and that are no neighbours of others at this spacing; None if
+    there are none.
+    """
+    if frame.loss_mask is None or frame.loss_mask.all() or not frame.loss_mask.any():
+        return None
+    margin_px = math.ceil(MARGIN_IN_SPACINGS * spacing_px)
+    near = cv2.dilate(frame.loss_mask, np.ones((2 * margin_px + 1,) * 2, np.uint8))
+    return np.asarray(near == 0)
 
 
 def jittered_grid(width: int, height: int, count: int, seed: int) -> tuple[NDArray[np.float64], float]:
@@ -284,8 +306,17 @@ class StartOnDevice:
             means=(local[:, None, :] * pose[:, :3]).sum(dim=2) + pose[:, 3],
             quats=beside(z, facing(np.asarray(camera_to_world[:3, :3], np.float64))).repeat(count, 1),
             log_scales=sigma.log()[:, None] + flattened,
-            logit_opacities=torch.full_like(z, math.log(FIRST_OPACITY / (1 - FIRST_OPACITY))),
+            logit_opacities=self._opacities(frame, z),
             sh=sh,
+        )
+
+    def _opacities(self, frame: Frame, like: Tensor) -> Tensor:
+        visible = torch.full_like(like, math.log(FIRST_OPACITY / (1 - FIRST_OPACITY)))
+        hidden = excluded(frame, self._spacing_px)
+        if hidden is None:
+            return visible
+        return visible.masked_fill_(
+            tensor_of(hidden.astype(np.uint8), self._device).flatten()[self._cells].bool(), HIDDEN
         )
 
     def _float32(self, values: np.ndarray) -> Tensor:

@@ -2,10 +2,12 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
 
+from gsplat_core.rendering.rasterization import render
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import SH_C0
@@ -88,3 +90,19 @@ def test_filling_keeps_what_is_known_of_a_constant_picture_and_lies_between_its_
     whole = filled(picture, known)
     assert float(whole.min()) >= float(picture.min())
     assert float(whole.max()) <= float(picture.max())
+
+
+def test_nothing_is_shown_far_outside_of_the_loss_mask(make_frame):
+    frame = make_frame()
+    inside = np.zeros(frame.image.shape[:2], np.uint8)
+    inside[8:32, 12:36] = 1
+    camera = Camera.from_focal(50.0, 48, 40)
+    for excluding in (inside, 1 - inside):
+        for gaussians in both(frame.with_fields(loss_mask=excluding), camera, count=480):
+            alpha = render(gaussians, camera).alpha
+            assert float(alpha[excluding > 0].min()) > 0.7
+            assert float(alpha[cv2.dilate(excluding, np.ones((17, 17), np.uint8)) == 0].max()) < 0.05
+    for said_nothing in (np.zeros_like(inside), np.ones_like(inside), None):
+        host, device = both(frame.with_fields(loss_mask=said_nothing), camera)
+        assert torch.equal(host.logit_opacities, both(frame, camera)[0].logit_opacities)
+        torch.testing.assert_close(device.logit_opacities, host.logit_opacities)
