@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.ops.arguments import require_shape
+from gsplat_core.ops.arguments import require_same_kind, require_shape
 from gsplat_core.scene.cameras import Camera
 
 LARGEST_JUMP = 0.02
@@ -25,6 +25,7 @@ def check_depth_maps(depths: Tensor, camtoworlds: Tensor, Ks: Tensor) -> tuple[i
     leading = tuple(depths.shape[:-3])
     require_shape("camtoworlds", camtoworlds, (*leading, 4, 4), "[..., 4, 4]")
     require_shape("Ks", Ks, (*leading, 3, 3), "[..., 3, 3]")
+    require_same_kind(depths=depths, camtoworlds=camtoworlds, Ks=Ks)
     return leading
 
 

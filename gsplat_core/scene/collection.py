@@ -80,6 +80,8 @@ def rotated_harmonics(sh: Tensor, rotation: Tensor) -> Tensor:
 
 LABELS = "semantics"
 """Name of the extra tensor [N, classes] whose largest logit is the label."""
+LEAST_SCALE = 1e-37
+"""Smallest factor of `GaussianCollection.transform`, and the inverse of the largest."""
 MOST_ROTATION_ERROR = 1e-4
 """Largest element of `rotation @ rotation.T` minus the identity for a matrix that is accepted as a rotation."""
 
@@ -172,13 +174,13 @@ class GaussianCollection:
             selection: bool [N]; None for all.
             rotation: rotation matrix [3, 3].
             translation: shift in world units, [3].
-            scale: factor of positions and sizes, greater than 0.
+            scale: factor of positions and sizes, 1e-37 to 1e37, the range of float32.
 
         Raises:
-            InvalidInput: for a matrix that is no rotation, or a scale of 0 or less.
+            InvalidInput: for a matrix that is no rotation, or a scale out of range.
         """
-        if not 0 < scale < math.inf:
-            raise InvalidInput(f"scale must be greater than 0 and finite, got {scale}")
+        if not LEAST_SCALE <= scale <= 1 / LEAST_SCALE:
+            raise InvalidInput(f"scale must be from {LEAST_SCALE:g} to {1 / LEAST_SCALE:g}, got {scale}")
         rows = self._rows(selection)
         turned = self._gaussians.select(rows)
         means = turned.means

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import numbers
 from dataclasses import dataclass
 from typing import get_args
 
@@ -136,8 +137,9 @@ class ReconstructorConfig:
                 f"rates.field is {type(self.rates.field).__name__}; a {kind.name} field has {type(kind.rates).__name__}"
             )
         for name in ("gaussians", "max_gaussians", "steps_per_frame", "first_frame_steps", "window_frames"):
-            if getattr(self, name) < 1:
-                raise InvalidSetting(f"{name} is {getattr(self, name)}; it must be at least 1")
+            value = getattr(self, name)
+            if not isinstance(value, numbers.Integral) or value < 1:
+                raise InvalidSetting(f"{name} is {value!r}; it must be a whole number of at least 1")
         MOTION_PRIORS.check(self.motion_prior)
         RENDERERS.check(self.renderer)
         STRATEGIES.check(self.strategy)

@@ -122,8 +122,10 @@ def loss_weights(chosen: Sequence[str]) -> dict[str, float]:
 
     Raises:
         InvalidSetting: for an unknown loss, a repeated loss, a weight that is not a positive number, or a weight for a
-            loss of the fused path.
+            loss of the fused path, or a string in place of a list.
     """
+    if isinstance(chosen, str):
+        raise InvalidSetting(f"losses is {chosen!r}; give a list of names, such as [{chosen!r}]")
     weights: dict[str, float] = {}
     for each in chosen:
         name, colon, given = each.partition(":")

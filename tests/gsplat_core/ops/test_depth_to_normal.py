@@ -77,3 +77,9 @@ def test_wrong_shapes_are_named(name, value, message):
     given[name] = value
     with pytest.raises(InvalidInput, match=message):
         depth_to_normal(*given)
+
+
+def test_mixed_dtypes_are_named():
+    depths, poses, K = maps((), 4, 5)
+    with pytest.raises(InvalidInput, match=r"one floating-point dtype .* camtoworlds: torch.float64"):
+        depth_to_normal(depths, poses.double(), K)

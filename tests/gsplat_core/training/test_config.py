@@ -152,3 +152,17 @@ def test_defaults_are_those_of_the_published_figures():
     assert (offline.gaussians, offline.max_gaussians, offline.motion_spacing_s) == (60_000, 80_000, 0.05)
     assert ReconstructorConfig.offline("hexplane").motion_spacing_s == pytest.approx(1 / 15)
     assert offline.depth_of_recording == "parallax"
+
+
+@pytest.mark.parametrize(
+    "name", ["gaussians", "max_gaussians", "steps_per_frame", "first_frame_steps", "window_frames"]
+)
+@pytest.mark.parametrize("value", [0, -3, 1.5, float("nan"), "7"])
+def test_counts_are_whole_numbers(name, value):
+    with pytest.raises(InvalidSetting, match=f"{name} is {value!r}; it must be a whole number of at least 1"):
+        ReconstructorConfig(**{name: value})
+
+
+def test_losses_are_a_list():
+    with pytest.raises(InvalidSetting, match=r"losses is 'flow'; give a list of names, such as \['flow'\]"):
+        ReconstructorConfig(losses="flow")
