@@ -8,8 +8,9 @@ from __future__ import annotations
 import hashlib
 import math
 import time
+from array import array
 from collections import OrderedDict, deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -114,6 +115,12 @@ class QualityResult:
     """Number of frames compared with a displayed picture, their own or an older one. Includes withheld and damaged frames,
     which have no score.
     """
+    scored: Sequence[int] = ()
+    """Sequence numbers of the frames that are neither withheld nor damaged, in order; empty for a live stream."""
+    previous_frame_db: float | None = None
+    """Mean tissue PSNR in dB of the previous raw frame over the scored frames (trivial baseline); None if there is none."""
+    heldout_previous_frame_db: float | None = None
+    """The same baseline over the scored frames that were never trained on."""
 
 
 LOOK_NS = 500_000_000
@@ -143,8 +150,6 @@ class OnScreenResult:
     """Sequence number of the frame with the lowest PSNR, `worst_db`."""
     previous_frame_db: float | None
     """Mean tissue PSNR in dB of the previous raw frame after the first second (trivial baseline)."""
-    previous_frame_throughout_db: float | None
-    """Mean tissue PSNR in dB of the previous raw frame over all scored frames (trivial baseline)."""
     frames: int
     """Number of frames scored against a displayed picture."""
     not_on_screen: int
@@ -321,7 +326,11 @@ class MetricsOp(Operator):
         self.frames = 0
         """Number of frames compared with a displayed picture so far, scored or not."""
         self.next_frame = NextFrameScores()
-        self.settled, self.before, self.before_throughout = ScoredMean(), ScoredMean(), ScoredMean()
+        self.settled, self.before = ScoredMean(), ScoredMean()
+        self.before_all, self.before_held_out = ScoredMean(), ScoredMean()
+        self.scored = array("q")
+        """Sequence numbers of the frames that are neither withheld nor damaged. Not recorded for a live stream, which may
+        run for days."""
         self.worst: tuple[float, int] | None = None
         self.not_on_screen = 0
         self._digest.close()
@@ -386,6 +395,8 @@ class MetricsOp(Operator):
         """Score a frame against its own picture."""
         tracker = self.trained if rendered.trained else self.held_out
         scored = self._score(rendered.frame, rendered, tracker, similarity=True)
+        if rendered.frame.unusable is None:
+            self.scored.append(rendered.frame.seq)
         self._log(scored.as_json())
         return scored
 
@@ -399,7 +410,6 @@ class MetricsOp(Operator):
         similarity = self.report and self.frames % SIMILARITY_EVERY == 0
         scored = self._score(frame, shown.rendered, self.trained, similarity=similarity)
         self.not_on_screen += shown.rendered.frame.seq != frame.seq
-        self.before_throughout.add(scored.previous_frame_db)
         value = scored.quality.psnr_tissue_db
         if self._is_settled(frame):
             self.settled.add(value)
@@ -420,6 +430,9 @@ class MetricsOp(Operator):
             quality = tracker.observe(frame.seq, rendered.image, frame.image, frame.tissue, similarity=similarity)
             if previous is not None and previous.image.shape == frame.image.shape:
                 before_db = psnr_tissue_db(previous.image, frame.image, frame.tissue)
+        self.before_all.add(before_db)
+        if tracker is self.held_out:
+            self.before_held_out.add(before_db)
         return ScoredFrame(rendered, quality, before_db, self._next_frame_db(frame, before_db))
 
     def _log(self, entry: Mapping[str, Value]) -> None:
@@ -453,7 +466,19 @@ class MetricsOp(Operator):
             entries, per_entry = self.log.series(self.frames) if self.log is not None else ((), 1)
             if self.log is not None and self.frames:
                 outcome.output("frames", self.log.path)
-            outcome.add(QualityResult(self.trained, self.held_out, entries, per_entry, self.frames_sha256, self.frames))
+            outcome.add(
+                QualityResult(
+                    self.trained,
+                    self.held_out,
+                    entries,
+                    per_entry,
+                    self.frames_sha256,
+                    self.frames,
+                    scored=tuple(self.scored),
+                    previous_frame_db=self.before_all.mean,
+                    heldout_previous_frame_db=self.before_held_out.mean,
+                )
+            )
         outcome.add(self.next_frame.result)
         if self.on_screen:
             worst_db, worst_seq = self.worst or (None, None)
@@ -463,7 +488,6 @@ class MetricsOp(Operator):
                     worst_db=worst_db,
                     worst_seq=worst_seq,
                     previous_frame_db=self.before.mean,
-                    previous_frame_throughout_db=self.before_throughout.mean,
                     frames=self.frames,
                     not_on_screen=self.not_on_screen,
                     unscored=self._screen.unscored,

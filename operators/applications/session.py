@@ -300,8 +300,8 @@ def saves_model(out: Path, fitted: Model | None = None) -> Callable[[Session], N
 
 
 def measures_baselines(source: FrameSource) -> Callable[[Session], None]:
-    """Return a function that measures trivial baselines on the frames of a finished session, for `Session.finish`. It reads the
-    source twice more."""
+    """Return a function that measures trivial baselines on the scored frames of a finished session, for `Session.finish`. It
+    reads the source twice more."""
 
     def measure(session: Session) -> None:
         if session.stop_requested() or session.failure is not None:
@@ -314,7 +314,7 @@ def measures_baselines(source: FrameSource) -> Callable[[Session], None]:
             )
         else:
             quality = session.reached.find(QualityResult)
-            session.reached.add(measure_baselines(FirstFrames(source, 0 if quality is None else quality.frames)))
+            session.reached.add(measure_baselines(ScoredFrames(source, () if quality is None else quality.scored)))
 
     return measure
 
@@ -339,6 +339,32 @@ class FirstFrames:
                     return
         finally:
             self.source.close()
+
+
+NOT_SCORED = "not scored"
+"""Value of `Frame.withheld` for frames that a run did not score."""
+
+
+@dataclass(frozen=True)
+class ScoredFrames:
+    """The frames of a closed source up to the last one that a run scored; each iteration reads from the beginning.
+
+    Frames that the run did not score, for example because a check withheld them, are withheld.
+    """
+
+    source: FrameSource
+    scored: Sequence[int]
+    """Sequence numbers of the scored frames, in order."""
+
+    def __iter__(self) -> Iterator[Frame]:
+        if not self.scored:
+            return
+        scored = frozenset(self.scored)
+        for frame in FirstFrames(self.source, sys.maxsize):
+            is_scored = frame.seq in scored or frame.unusable is not None
+            yield frame if is_scored else replace(frame, withheld=NOT_SCORED)
+            if frame.seq >= self.scored[-1]:
+                return
 
 
 Report = Callable[[RunOutcome, Path], None]

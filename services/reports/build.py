@@ -195,8 +195,7 @@ def _training_steps(chosen: ChosenSteps) -> TrainingSteps:
 
 def _qualities(outcome: RunOutcome, quality: QualityResult) -> QualityReport:
     offline = outcome.command == "reconstruct"
-    baselines, screen = outcome.find(Baselines), outcome.find(OnScreenResult)
-    previous_db = screen.previous_frame_throughout_db if screen else None
+    baselines = outcome.find(Baselines)
     return QualityReport(
         live=None if offline else _quality(quality.trained),
         next_frame=_next_frame(outcome.find(NextFrameResult)),
@@ -204,9 +203,9 @@ def _qualities(outcome: RunOutcome, quality: QualityResult) -> QualityReport:
         training=_quality(quality.trained) if offline else None,
         heldout=_quality(quality.held_out) if outcome.settings.heldout else None,
         baselines=BaselineQuality(
-            previous_frame_db=baselines.previous_frame_db if baselines else previous_db,
+            previous_frame_db=quality.previous_frame_db,
             train_mean_db=baselines.heldout_train_mean_db if baselines else None,
-            heldout_previous_frame_db=baselines.heldout_previous_frame_db if baselines else None,
+            heldout_previous_frame_db=quality.heldout_previous_frame_db,
             heldout_neighbour_mean_db=baselines.heldout_neighbour_mean_db if baselines else None,
         ),
     )

@@ -159,7 +159,7 @@ class BaselineQuality(Part):
     """Tissue PSNR in dB of trivial baselines on the same recording; null if not measured."""
 
     previous_frame_db: float | None
-    """Previous raw frame, from the second frame on."""
+    """Previous raw frame, over the scored frames and their tissue."""
     train_mean_db: float | None
     """Mean of all training frames, for every held-out frame."""
     heldout_previous_frame_db: float | None = None

@@ -73,6 +73,22 @@ def test_a_damaged_frame_is_shown_and_not_scored(rendered, frame, compute, tmp_p
     assert quality.frames_sha256 == whole.frames_sha256, "what was displayed is the same"
 
 
+def test_the_baselines_are_of_the_frames_and_the_pixels_that_are_scored(rendered, frame, compute):
+    """A run's own tool masks and withheld frames count for its baseline as for its pictures."""
+    mask = np.ones((16, 24), np.uint8)
+    mask[:, 12:] = 0
+    frames = [frame(0), frame(1, mask=mask), frame(2, withheld="black"), frame(3, withheld="black"), frame(4), frame(5)]
+    operator = MetricsOp(None)
+    scored = score(operator, compute, [rendered(frame=one, trained=one.seq != 5) for one in frames])
+    quality, _ = result(operator)
+    assert list(quality.scored) == [0, 1, 4, 5]
+    left = [one.image[:, :12].astype(float) for one in frames[:2]]
+    of_tissue = -10 * math.log10((((left[1] - left[0]) / 255) ** 2).mean())
+    assert scored[1].previous_frame_db == pytest.approx(of_tissue, abs=1e-3)
+    assert quality.previous_frame_db == pytest.approx(np.mean([scored[k].previous_frame_db for k in (1, 4, 5)]))
+    assert quality.heldout_previous_frame_db == pytest.approx(scored[5].previous_frame_db)
+
+
 def test_without_a_frame_there_is_a_result_and_no_file_to_show(tmp_path, compute):
     operator = MetricsOp(None, log=FrameLog(tmp_path / "frames.jsonl"))
     quality, outputs = result(operator)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 
@@ -11,6 +12,8 @@ import pytest
 
 from services.cli.app import run
 from services.cli.terminal import NOTHING_SHOWN, OK
+from services.reports.evaluation import EvaluationReport
+from services.reports.schema import RunReport
 
 
 @pytest.fixture
@@ -100,11 +103,33 @@ def test_black_pictures_are_not_reconstructed(level, bits, tmp_path, capsys):
     assert "(black: 5)" in said and "values up to 65535" in said
 
 
-def test_reconstruct_leaves_out_a_black_beginning(tiny, tmp_path, capsys):
-    recording, out = tmp_path / "recording", tmp_path / "out"
+@pytest.fixture
+def black_beginning(tiny, tmp_path):
+    """`tiny`, of which the first two pictures are black."""
+    recording = tmp_path / "recording"
     shutil.copytree(tiny, recording)
-    pictures = sorted((recording / "images").iterdir())
-    for path in pictures[:2]:
+    for path in sorted((recording / "images").iterdir())[:2]:
         cv2.imwrite(str(path), np.zeros_like(cv2.imread(str(path))))
-    assert run(["reconstruct", str(recording), "--out", str(out), "--steps", "2", "--device", "cpu"]) == OK
+    return recording
+
+
+def test_a_black_beginning_is_left_out_offline_and_by_evaluate(black_beginning, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert run(["reconstruct", str(black_beginning), "--out", str(out), "--steps", "2", "--device", "cpu"]) == OK
     assert "2 frames were withheld and not scored (black: 2)" in capsys.readouterr().err
+    assert run(["evaluate", str(out), str(black_beginning), "--protocol", "retention", "--json"]) == OK
+    report = EvaluationReport.model_validate_json(capsys.readouterr().out)
+    assert report.left_out == {"withheld": 2}
+    (copy,) = (each for each in report.baselines if each.age_frames == 1)
+    assert copy.frames == 4 and copy.psnr_tissue_db < 50
+
+
+def test_the_previous_frame_of_a_replay_is_compared_where_its_pictures_are(black_beginning, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert run(["replay", str(black_beginning), "--out", str(out), "--steps-per-frame", "2", "--device", "cpu"]) == OK
+    quality = RunReport.read(out / "report.json").quality
+    # The copy of a black picture for a black one would have an infinite PSNR, which counts as 100 dB.
+    assert quality.live.frames == 4 and quality.baselines.previous_frame_db < 50
+    lines = [json.loads(line) for line in (out / "frames.jsonl").read_text().splitlines()]
+    scored = [line["previous_frame_db"] for line in lines if line["previous_frame_db"] is not None]
+    assert quality.baselines.previous_frame_db == pytest.approx(np.mean(scored))

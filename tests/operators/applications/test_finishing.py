@@ -91,11 +91,22 @@ def test_baselines_are_left_out_with_a_note(fields, digest, said):
     assert note.startswith(said) and not run.reached.parts
 
 
-@pytest.mark.parametrize("shown", [None, 2])
-def test_baselines_are_of_the_frames_that_were_shown(monkeypatch, shown):
+@pytest.mark.parametrize("scored", [None, (), (2, 3, 6)])
+def test_baselines_are_of_the_frames_that_were_scored(monkeypatch, frame, scored):
     monkeypatch.setattr(session_module, "measure_baselines", lambda frames: SimpleNamespace(frames=list(frames)))
     run = session()
-    if shown is not None:
-        run.reached.add(QualityResult(None, None, (), 1, "", shown))
-    measures_baselines(Scripted([1, 2, 3]))(run)
-    assert run.reached.find(SimpleNamespace).frames == [1, 2, 3][: shown or 0] and not run.notes
+    if scored is not None:
+        run.reached.add(QualityResult(None, None, (), 1, "", 5, scored))
+    given = [frame(k, withheld="blur" if k == 4 else None) for k in range(9)]
+    measures_baselines(Scripted(given))(run)
+    read = run.reached.find(SimpleNamespace).frames
+    assert [(each.seq, each.withheld) for each in read] == [
+        (0, "not scored"),
+        (1, "not scored"),
+        (2, None),
+        (3, None),
+        (4, "blur"),
+        (5, "not scored"),
+        (6, None),
+    ][: 7 if scored else 0]
+    assert not run.notes
