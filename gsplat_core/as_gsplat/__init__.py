@@ -72,6 +72,7 @@ _ROW_OPERATIONS = {
     "duplicate": _OPERATIONS,
     "inject_noise_to_position": _OPERATIONS,
     "normalized_quat_to_rotmat": _FUNCTIONS,
+    "quat_scale_to_covar_preci": "gsplat_core.ops.covariance",
     "relocate": _OPERATIONS,
     "remove": _OPERATIONS,
     "reset_opa": _OPERATIONS,
@@ -153,6 +154,7 @@ MODULES: Mapping[str, Mapping[str, str]] = {
         "CameraModel": "gsplat_core.scene.cameras",
         "_make_lazy_cuda_func": _FUNCTIONS,
         "_make_lazy_cuda_obj": _FUNCTIONS,
+        "persp_proj": f"{_PLAIN}:_persp_proj",
     },
     "gsplat.distributed": {**_COLLECTIVES, "cli": _DISTRIBUTED},
     "gsplat.exporter": {

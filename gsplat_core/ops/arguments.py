@@ -49,7 +49,9 @@ def require_same_kind(**tensors: Tensor | None) -> None:
     kinds = {(tensor.dtype, tensor.device) for tensor in given.values()}
     if len(kinds) > 1 or any(not tensor.is_floating_point() for tensor in given.values()):
         found = ", ".join(f"{name}: {tensor.dtype} on {tensor.device}" for name, tensor in given.items())
-        raise InvalidInput(f"all inputs must have one floating-point dtype and one device, got {found}")
+        raise InvalidInput(
+            f"all inputs must have one floating-point dtype and one device, got {found}; convert them with Tensor.to"
+        )
 
 
 def require_float32(op: str, **tensors: Tensor | None) -> None:

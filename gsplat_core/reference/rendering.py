@@ -365,7 +365,6 @@ def point_moments(
 _quat_to_rotmat = quat_to_rotmat
 _quat_scale_to_covar_preci = quat_scale_to_covar_preci
 _world_to_cam = world_to_cam
-_isect_offset_encode = isect_offset_encode
 _spherical_harmonics = spherical_harmonics
 
 
@@ -402,6 +401,10 @@ def _isect_tiles(
     means2d: Tensor, radii: Tensor, depths: Tensor, tile_size: int, tile_width: int, tile_height: int, sort: bool = True
 ) -> tuple[Tensor, Tensor, Tensor]:
     return isect_tiles(means2d, radii, depths, tile_size, tile_width, tile_height, sort)
+
+
+def _isect_offset_encode(isect_ids: Tensor, I: int, tile_width: int, tile_height: int) -> Tensor:
+    return isect_offset_encode(isect_ids, I, tile_width, tile_height)
 
 
 def _rasterize_to_pixels(

@@ -463,11 +463,13 @@ class Operations(StepOperations):
         Shapes, where `...` are any batch dimensions, common to all arguments:
             means [..., N, 3]; quats [..., N, 4] wxyz, of any length but zero; scales [..., N, 3]; opacities [..., N];
             colors [..., N, D] or [..., C, N, D] when `sh_degree` is None, else coefficients [..., N, K, 3] or
-            [..., C, N, K, 3] with K >= (sh_degree + 1)², displayed as max(0, 0.5 + sum). None if `render_mode` has no RGB;
+            [..., C, N, K, 3] with K >= (sh_degree + 1)², displayed as max(0, 0.5 + sum). None if `render_mode` has no RGB; D may
+            be 0 if it has depth;
             viewmats [..., C, 4, 4] world to camera, OpenCV axes; Ks [..., C, 3, 3] in pixels.
 
         Args:
-            width, height: image size in pixels; the first pixel's centre is at (0.5, 0.5).
+            width, height: image size in pixels; the first pixel's centre is at (0.5, 0.5). Floating-point tensors are
+                truncated.
             near_plane, far_plane: range of z in the scene's unit; Gaussians with a centre outside it are culled.
             radius_clip: Gaussians with both radii at or below this many pixels are culled.
             eps2d: blur in pixels² added to the diagonal of the 2D covariance.
@@ -628,8 +630,10 @@ def _step_by_step(ops: StepOperations, arguments: Arguments, settings: RenderSet
         covars = torch.stack([covars[..., i, j] for i in range(3) for j in range(i, 3)], -1)
         quats = scales = None
     signals = []
-    if settings.has_colors and colors is not None:
+    colored_channels = 0
+    if colors is not None and settings.shows(colors):
         signals.append(Signal(colors, settings.sh_degree))
+        colored_channels = colors.shape[-1]
     if extra_signals is not None:
         signals.append(Signal(extra_signals, settings.extra_degree, clamped=False))
 
@@ -648,7 +652,7 @@ def _step_by_step(ops: StepOperations, arguments: Arguments, settings: RenderSet
     if settings.distributed:  # `meta` describes the Gaussians of this process
         splats = splats._replace(rows=mine.rows, opacities=mine.opacities)
     widths = [signal.values.shape[-1] for signal in signals]
-    colored = splats.image[..., : widths[0]] if settings.has_colors else splats.image[..., :0]
+    colored = splats.image[..., :colored_channels]
     extra = None if extra_signals is None else splats.image[..., sum(widths) - widths[-1] : sum(widths)]
     depth = splats.image[..., -1:] if settings.has_depth else None
     normals = None
@@ -800,7 +804,7 @@ def check_shapes(arguments: Arguments, settings: RenderSettings) -> tuple[tuple[
         leading = tuple(values.shape[: values.dim() - (1 if degree is None else 2)])
         if leading not in ((*batch_dims, n), (*batch_dims, c, n)):
             raise InvalidInput(f"{name} must be {form} with N = {n}, C = {c}, got {list(values.shape)}")
-        if degree is None and (settings.has_colors or name != "colors") and values.shape[-1] < 1:
+        if degree is None and values.shape[-1] < (settings.least_colors if name == "colors" else 1):
             raise InvalidInput(f"{name} must be {form} with at least one channel, got {list(values.shape)}")
     require_same_kind(means=means, colors=colors, backgrounds=backgrounds, extra_signals=extra)
     if backgrounds is not None and colors is not None:

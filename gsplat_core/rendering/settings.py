@@ -139,6 +139,15 @@ class RenderSettings:
         """True if colours are among the output channels."""
         return self.render_mode.startswith("RGB")
 
+    def shows(self, colors: Tensor | None) -> bool:
+        """Return True if the output has channels of `colors`, which may have none if the output has depth."""
+        return self.has_colors and colors is not None and (self.sh_degree is not None or colors.shape[-1] > 0)
+
+    @property
+    def least_colors(self) -> int:
+        """Smallest number of channels of plain colours: 0 if the output has a channel of depth or distance besides."""
+        return 0 if self.has_depth or self.has_distance else 1
+
     @property
     def tile_grid(self) -> tuple[int, int]:
         """Number of tiles per row and per column."""
@@ -219,11 +228,16 @@ def is_transformed() -> bool:
 
 
 def _whole(name: str, value: Any, expected: str) -> int:
-    """Return a whole number as an int; `expected` completes the error about other values."""
+    """Return a whole number as an int; `expected` completes the error about other values.
+
+    A floating-point tensor of one element is truncated, as gsplat does: programs give `width=K[0, 2] * 2`.
+    """
     try:
+        if isinstance(value, Tensor) and value.is_floating_point():
+            return int(value)
         if not isinstance(value, bool):
             return operator.index(value)
-    except TypeError:
+    except (TypeError, ValueError, RuntimeError, OverflowError):
         pass
     raise InvalidInput(f"{name} must be {expected}, got {_shown(value)}")
 

@@ -77,11 +77,11 @@ def rasterization_2dgs(
         means [..., N, 3]; quats [..., N, 4] wxyz, of any length but zero, whose rotated z axis is the normal; scales
         [..., N, 3], of which the third has no effect; opacities [..., N]; colors [..., N, D] or [..., C, N, D] when
         `sh_degree` is None, else coefficients [..., N, K, 3] or [..., C, N, K, 3] with K >= (sh_degree + 1)², displayed as
-        max(0, 0.5 + sum); viewmats [..., C, 4, 4] world to camera, OpenCV axes; Ks [..., C, 3, 3] in pixels, of pinhole
-        cameras.
+        max(0, 0.5 + sum); D may be 0 if `render_mode` has depth; viewmats [..., C, 4, 4] world to camera, OpenCV axes; Ks
+        [..., C, 3, 3] in pixels, of pinhole cameras.
 
     Args:
-        width, height: image size in pixels; the first pixel's centre is at (0.5, 0.5).
+        width, height: image size in pixels; the first pixel's centre is at (0.5, 0.5). Floating-point tensors are truncated.
         near_plane, far_plane: range of z in the scene's unit; surfels with a centre outside it are culled.
         radius_clip: surfels with both radii at or below this many pixels are culled.
         eps2d: without effect, as in gsplat.
@@ -142,7 +142,7 @@ def rasterization_2dgs(
     )
     assert isinstance(projected, DenseSurfels)
     channels, dense = None, projected
-    if settings.has_colors:
+    if settings.shows(colors):
         signals = [Signal(colors, sh_degree)]
         channels, dense = view_colors(step_by_step, geometry[0], signals, viewmats, dense)
     visible.append(dense.radii)

@@ -46,6 +46,22 @@ def test_render_modes(scene, mode, channels, packed):
         torch.testing.assert_close(image[..., -1:], depth)
 
 
+@pytest.mark.parametrize("mode", ["RGB+D", "RGB+ED", "RGB-d", "RGB-Ed"])
+@pytest.mark.parametrize("changes", [{}, {"packed": True}, {"with_ut": True, "with_eval3d": True}], ids=str)
+def test_colors_without_channels_leave_the_depth(scene, mode, changes):
+    """Programs concatenate the features that a caller asks for, which may be none."""
+    options = {"sh_degree": None, "packed": False, **changes}
+    means = scene.means.clone().requires_grad_()
+    empty = dict(means=means, colors=torch.zeros(50, 0), backgrounds=torch.zeros(2, 0))
+    image, alphas, _ = rasterize(scene, **options, **empty, render_mode=mode)
+    expected, expected_alphas, _ = rasterize(scene, **options, colors=None, render_mode=mode[4:])
+    assert image.shape == (2, 37, 52, 1)
+    torch.testing.assert_close(image, expected)
+    torch.testing.assert_close(alphas, expected_alphas)
+    image.sum().backward()
+    assert means.grad.isfinite().all() and means.grad.any()
+
+
 @pytest.mark.parametrize("count", [1, 3, 7, 40])
 @pytest.mark.parametrize("per_camera", [False, True])
 def test_plain_colors_with_any_number_of_channels(scene, count, per_camera):
@@ -271,6 +287,7 @@ def test_wrong_arguments_are_refused(scene):
         ({"colors": scene.sh, "sh_degree": 4}, r"K >= 25 for degree 4, got"),
         ({"sh_degree": 5}, "sh_degree .*got 5"),
         ({"sh_degree": None, "colors": scene.sh[:, :0, 0]}, "at least one channel"),
+        ({"colors": scene.sh[..., :0], "render_mode": "RGB+D"}, r"coeffs .*16, 0\]"),
         ({"viewmats": scene.viewmats[0, 0]}, r"viewmats must be \[..., C, 4, 4\]"),
         ({"Ks": scene.Ks[:1]}, r"Ks .*\[2, 3, 3\], got \[1, 3, 3\]"),
         ({"covars": torch.zeros(50, 6)}, r"covars .*3, 3\], got \[50, 6\]"),

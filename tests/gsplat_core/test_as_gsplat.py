@@ -158,6 +158,21 @@ def test_names_are_those_of_the_package_itself(installed):
             assert getattr(module, name) is getattr(gsplat_core, name)
 
 
+def test_the_older_projection_is_that_of_a_pinhole_camera(installed):
+    wrapper = importlib.import_module("gsplat.cuda._wrapper")
+    splats = torch.tensor([[[0.1, 0.2, 2.0], [0.3, -0.1, 3.0]]]), torch.eye(3).expand(1, 2, 3, 3)
+    K = torch.tensor([[[20.0, 0, 8], [0, 20, 8], [0, 0, 1]]])
+    expected = wrapper.proj(*splats, K, 16, 16, camera_model="pinhole")
+    torch.testing.assert_close(wrapper.persp_proj(*splats, K, 16, 16), expected)
+
+
+def test_starts_of_tile_lists_are_found_by_the_argument_names_of_the_plain_function(installed):
+    plain = importlib.import_module("gsplat.cuda._torch_impl")
+    means2d, radii = torch.tensor([[[4.0, 4.0], [20.0, 4.0]]]), torch.full((1, 2, 2), 3, dtype=torch.int32)
+    _, ids, _ = plain._isect_tiles(means2d, radii, torch.ones(1, 2), 16, 2, 1)
+    assert plain._isect_offset_encode(isect_ids=ids, I=1, tile_width=2, tile_height=1).tolist() == [[[0, 1]]]
+
+
 @pytest.mark.parametrize(("installed", "most"), [("1.6", 0.99), ("1.5.3", 0.999)], indirect=["installed"])
 def test_the_constants_are_those_of_the_chosen_version(installed, most):
     gsplat = importlib.import_module("gsplat")
@@ -230,6 +245,8 @@ def test_names_that_gsplats_own_modules_import_are_found_in_them(installed):
     assert default.remove is importlib.import_module("gsplat.strategy.ops").remove
     assert importlib.import_module("gsplat.rendering").depth_to_normal is depth_to_normal
     assert importlib.import_module("gsplat.compression.png_compression").log_transform is utils.log_transform
+    operations = importlib.import_module("gsplat.strategy.ops")
+    assert operations.quat_scale_to_covar_preci is importlib.import_module("gsplat").quat_scale_to_covar_preci
     plain = importlib.import_module("gsplat.cuda._torch_impl")
     assert importlib.import_module("gsplat.cuda._torch_impl_2dgs")._quat_scale_to_matrix is plain._quat_scale_to_matrix
 

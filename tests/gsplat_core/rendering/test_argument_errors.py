@@ -65,6 +65,19 @@ NUMBERS = {
 
 
 @pytest.mark.parametrize("render", [gsplat_core.rasterization, gsplat_core.rasterization_2dgs])
+def test_a_size_computed_from_the_intrinsics_is_truncated(render):
+    """Programs give `width=K[0, 2] * 2`, a floating-point tensor, which gsplat truncates."""
+    given = arguments()
+    expected = render(**given)[0]
+    for more in (0.0, 0.75):
+        sizes = {"width": given["Ks"][0, 0, 2] * 2 + more, "height": given["Ks"][0, 1, 2] * 2 + more}
+        assert torch.equal(render(**{**given, **sizes})[0], expected)
+    for value in (0.5, -3.0, float("nan"), float("inf"), [16.0, 16.0]):
+        with pytest.raises(InvalidInput, match="width"):
+            render(**{**given, "width": torch.tensor(value)})
+
+
+@pytest.mark.parametrize("render", [gsplat_core.rasterization, gsplat_core.rasterization_2dgs])
 @pytest.mark.parametrize(
     "kind", [np.array, lambda v: np.float32(v) if isinstance(v, float) else np.int64(v), torch.tensor]
 )

@@ -105,6 +105,19 @@ def test_modes_have_the_same_values(mode: str) -> None:
     assert {"means2d", "ray_transforms", "gradient_2dgs", "isect_ids", "render_distort", "tile_width"} <= meta.keys()
 
 
+@pytest.mark.parametrize("packed", [False, True])
+def test_colors_without_channels_leave_the_depth(packed: bool) -> None:
+    s = scene(cameras=2)
+    options: dict[str, Any] = {"render_mode": "RGB+ED", "packed": packed}
+    expected = rasterization_2dgs(**s, **options)
+    empty = {"colors": s["colors"][..., :0], "backgrounds": torch.zeros(2, 0)}
+    found = rasterization_2dgs(**{**s, **empty}, **options)
+    torch.testing.assert_close(found[0], expected[0][..., 3:])
+    torch.testing.assert_close(found[3], expected[3])
+    with pytest.raises(InvalidInput, match="at least one channel"):
+        rasterization_2dgs(**{**s, **empty}, packed=packed)
+
+
 def test_packed_rows_and_sparse_gradients_are_those_of_the_dense_call() -> None:
     s = scene(cameras=2)
     s["means"][:20, 2] -= 4
