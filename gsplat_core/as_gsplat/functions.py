@@ -53,8 +53,10 @@ def get_projection_matrix(
         zfar: z of the far plane.
         fovX: horizontal field of view in radians.
         fovY: vertical field of view in radians.
-        device: device of the matrix; None for the default device of torch.
+        device: device of the matrix; None for CUDA if there is a GPU, as in gsplat, and else for the default device of torch.
     """
+    if device is None and torch.cuda.is_available():
+        device = "cuda"
     matrix = torch.zeros(4, 4, device=device)
     matrix[0, 0] = 1 / math.tan(0.5 * fovX)
     matrix[1, 1] = 1 / math.tan(0.5 * fovY)

@@ -323,6 +323,8 @@ def test_the_projection_matrix_sends_near_and_far_planes_to_0_and_1():
     torch.testing.assert_close(near[:3] / near[3], torch.tensor([1.0, 1.0, 0.0]))
     far = matrix @ torch.tensor([0.0, 0, 10, 1])
     torch.testing.assert_close(far[2] / far[3], torch.tensor(1.0))
+    expected = "cuda" if torch.cuda.is_available() else "cpu"
+    assert utils.get_projection_matrix(0.5, 10.0, 1.2, 0.8).device.type == expected
 
 
 def test_the_logarithmic_transform_has_an_inverse():
