@@ -126,21 +126,31 @@ class NetworkToolFinder:
         Raises:
             InvalidInput: for any other array.
         """
-        height, width = size_of(image)
-        tissue = np.ones((height, width), np.uint8)
-        if min(height, width) < SMALLEST_PX:
+        tissue = np.ones(size_of(image), np.uint8)
+        if min(tissue.shape) < SMALLEST_PX:
             return tissue
-        chosen = self._network
+        small = averaged(image, self._network.input_px)
+        if self._round is self._network or not round_view(small):
+            return self._found(image, self._network)
+        rows, columns = between_bars(small)
+        if round_view(small[rows, columns]):
+            return self._found(image, self._round)
+        # Black bars make the corners dark, too. The network for full pictures was not trained with them.
+        rows, columns = between_bars(image)
+        if min(tissue[rows, columns].shape) >= SMALLEST_PX:
+            tissue[rows, columns] = self._found(np.ascontiguousarray(image[rows, columns]), self._network)
+        return tissue
+
+    def _found(self, image: NDArray[np.uint8], chosen: _Network) -> NDArray[np.uint8]:
         small = averaged(image, chosen.input_px)
-        if self._round is not chosen and round_view(small):
-            chosen = self._round
-            small = averaged(image, chosen.input_px)
         planes = features(small, chosen.inputs)
         smoothed = along_edges(chosen.logits(planes), planes[0])
         levels = (smoothed * np.float32(127 / CERTAIN) + 128).clip(0, 255).astype(np.uint8)
         view = field_of_view(lowest_and_highest(small)[1])
         levels *= view
         remove_inner_regions(levels, view)
+        height, width = image.shape[:2]
+        tissue = np.ones((height, width), np.uint8)
         cv2.resize(levels, (width, height), dst=tissue, interpolation=cv2.INTER_LINEAR)
         cv2.threshold(tissue, 128, 1, cv2.THRESH_BINARY_INV, dst=tissue)
         return tissue
@@ -154,6 +164,19 @@ def round_view(small: NDArray[np.uint8]) -> bool:
             if (small[rows, columns].max(axis=2) < SURROUND).mean() < DARK_CORNER:
                 return False
     return True
+
+
+def between_bars(image: NDArray[np.uint8]) -> tuple[slice, slice]:
+    """Return the rows and the columns of a picture, RGB uint8 [H, W, 3], that black bars at its borders leave. Text printed over
+    less than a quarter of a bar's length does not count as content.
+    """
+    lit = lowest_and_highest(image)[1] >= SURROUND
+    sides = []
+    for axis in (1, 0):
+        count = lit.sum(axis=axis)
+        content = np.flatnonzero(count >= (1 - DARK_CORNER) * max(1, count.max()))
+        sides.append(slice(int(content[0]), int(content[-1]) + 1) if content.size else slice(None))
+    return sides[0], sides[1]
 
 
 def along_edges(logits: NDArray[np.float32], planes: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
@@ -11,6 +12,7 @@ from gsplat_core.endoscope.tools import (
     ROUND_INPUTS,
     ROUND_NETWORK,
     NetworkToolFinder,
+    between_bars,
     remove_inner_regions,
     round_view,
 )
@@ -106,3 +108,50 @@ def test_round_views_and_full_pictures_each_have_their_own_network(finder):
     np.testing.assert_array_equal(finder.find(full), only_full.find(full))
     np.testing.assert_array_equal(finder.find(around), only_round.find(around))
     assert (only_full.find(around) != only_round.find(around)).any()
+
+
+BARS = {
+    "above and below": (40, 40, 0, 0),
+    "beside": (0, 0, 60, 60),
+    "around": (30, 31, 40, 41),
+    "portrait": (0, 0, 400, 400),
+}
+"""Heights of black bars above and below a picture and widths of those beside it, in pixels."""
+
+
+def barred(image, bars):
+    above, below, left, right = bars
+    return cv2.copyMakeBorder(image, above, below, left, right, cv2.BORDER_CONSTANT)
+
+
+@pytest.mark.parametrize("bars", BARS.values(), ids=BARS)
+def test_black_bars_do_not_change_what_is_found_between_them(finder, bars):
+    image, _ = with_rod(256, 320)
+    found = finder.find(barred(image, bars))
+    np.testing.assert_array_equal(found, 1 - barred(1 - finder.find(image), bars))
+    assert not found.all()
+
+
+@pytest.mark.parametrize("bars", BARS.values(), ids=BARS)
+def test_black_bars_around_a_round_view_do_not_change_its_network(finder, bars):
+    image = barred(in_round_view(with_rod(256, 320)[0])[0], bars)
+    only_round = NetworkToolFinder(ROUND_NETWORK, ROUND_INPUT_PX, ROUND_INPUTS)
+    np.testing.assert_array_equal(finder.find(image), only_round.find(image))
+
+
+def test_text_in_a_black_bar_is_no_content():
+    image = barred(tissue(120, 160), (30, 20, 40, 10))
+    image[5:12, 60:90] = 255
+    assert between_bars(image) == (slice(30, 150), slice(40, 200))
+
+
+def test_a_black_picture_has_no_bars():
+    assert between_bars(np.zeros((96, 128, 3), np.uint8)) == (slice(None), slice(None))
+
+
+def test_a_black_picture_is_all_tissue(finder):
+    assert finder.find(np.zeros((96, 128, 3), np.uint8)).all()
+
+
+def test_a_narrow_strip_between_black_bars_is_all_tissue(finder):
+    assert finder.find(barred(with_rod(20, 320)[0], (100, 100, 0, 0))).all()
