@@ -35,8 +35,8 @@ class ScoredFrame:
     quality: FrameQuality
     """Scores of the picture. For a frame trained on before display they measure the training error."""
     previous_frame_db: float
-    """Tissue PSNR in dB of the previous raw frame as a prediction (trivial baseline). NaN for the first frame and after
-    a change of size.
+    """Tissue PSNR in dB of the previous raw frame as a prediction (trivial baseline), see `Frame.can_be_shown`. NaN for the
+    first frame and after a change of size.
     """
     next_frame_db: float = math.nan
     """Tissue PSNR in dB of the prediction made before training on this frame; NaN without a prediction."""
@@ -277,7 +277,7 @@ class MetricsOp(Operator):
     """
 
     _previous: Frame | None
-    """Newest raw frame, the trivial baseline for the prediction of the next frame; None at the start of a stream."""
+    """Newest raw frame that the display follows, the trivial baseline for the next frame; None at the start of a stream."""
 
     def __init__(
         self,
@@ -403,7 +403,7 @@ class MetricsOp(Operator):
     def _score_shown(self, frame: Frame, shown: ShownPicture | None, until_ns: float) -> ScoredFrame | None:
         """Score a frame against the picture on display until `until_ns`; None without a picture."""
         if shown is None:
-            self._previous = frame
+            self._follow(frame)
             return None
         if self._first_s is None:
             self._first_s = frame.time_s
@@ -423,7 +423,8 @@ class MetricsOp(Operator):
         self, frame: Frame, rendered: RenderedFrame, tracker: QualityTracker, *, similarity: bool
     ) -> ScoredFrame:
         """Score a frame against a picture; `similarity` also computes SSIM."""
-        previous, self._previous = self._previous, frame
+        previous = self._previous
+        self._follow(frame)
         self.frames += 1
         quality, before_db = FrameQuality(frame.seq, math.nan, math.nan, math.nan), math.nan
         if frame.unusable is None:
@@ -434,6 +435,10 @@ class MetricsOp(Operator):
         if tracker is self.held_out:
             self.before_held_out.add(before_db)
         return ScoredFrame(rendered, quality, before_db, self._next_frame_db(frame, before_db))
+
+    def _follow(self, frame: Frame) -> None:
+        if frame.can_be_shown:
+            self._previous = frame
 
     def _log(self, entry: Mapping[str, Value]) -> None:
         if self.log is not None and self._log_works:

@@ -3,7 +3,8 @@
 A copy of the previous frame is a strong baseline in slow endoscopy. A reconstruction that scores
 lower adds nothing to a frozen video. The recording is read twice, with at most ten frames and one
 sum in memory. Frames are held out by `Frame.seq`. Damaged and withheld frames are neither scored nor part of the mean
-of the training frames. Where numbers are missing, the previous frame is the last one that arrived.
+of the training frames. Where numbers are missing or pictures cannot be shown (`Frame.can_be_shown`), the previous frame is the last
+one that arrived and could be shown.
 """
 
 from __future__ import annotations
@@ -237,13 +238,19 @@ def _tissue_in_both(frame: Frame, other: Frame) -> NDArray[np.uint8] | None:
 
 
 def _neighbourhoods(recording: Iterable[Frame], most: int) -> Iterator[tuple[Frame, list[Frame], Frame | None]]:
-    """Yield each frame with up to `most` preceding frames, newest first, and the next frame, None for the last one."""
+    """Yield each frame with up to `most` preceding frames, newest first, and the next frame, None for the last one.
+
+    Frames that cannot be shown are yielded without others, and are not among those of other frames.
+    """
     window: deque[Frame] = deque(maxlen=most + 2)
     for frame in recording:
         if window and window[-1].image.shape != frame.image.shape:
             raise InvalidInput(
                 f"frame {frame.seq} is {list(frame.image.shape)}, the one before it {list(window[-1].image.shape)}; they must be equal"
             )
+        if not frame.can_be_shown:
+            yield frame, [], None
+            continue
         window.append(frame)
         if len(window) > 1:
             yield window[-2], list(window)[-3::-1], frame

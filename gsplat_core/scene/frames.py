@@ -179,6 +179,13 @@ class Frame:
         return self.withheld in (BLUR, CUT_IN_DOUBT) and self.status is not FrameStatus.DAMAGED
 
     @property
+    def can_be_shown(self) -> bool:
+        """True if a display without a model could show the frame's picture, as the trivial baselines do. False for a picture that
+        is withheld and not followed, such as a black one.
+        """
+        return self.withheld is None or self.withheld in (BLUR, CUT_IN_DOUBT)
+
+    @property
     def tissue(self) -> NDArray[np.uint8] | None:
         """Intersection of `mask` and `loss_mask`, uint8 [H, W], 0 = excluded; None if the frame has neither."""
         if self.mask is None or self.loss_mask is None:

@@ -86,6 +86,8 @@ def test_the_baselines_are_of_the_frames_and_the_pixels_that_are_scored(rendered
     of_tissue = -10 * math.log10((((left[1] - left[0]) / 255) ** 2).mean())
     assert scored[1].previous_frame_db == pytest.approx(of_tissue, abs=1e-3)
     assert quality.previous_frame_db == pytest.approx(np.mean([scored[k].previous_frame_db for k in (1, 4, 5)]))
+    before = -10 * math.log10((((frames[4].image.astype(float) - frames[1].image) / 255) ** 2).mean())
+    assert scored[4].previous_frame_db == pytest.approx(before, abs=1e-3), "black pictures are not shown"
     assert quality.heldout_previous_frame_db == pytest.approx(scored[5].previous_frame_db)
 
 

@@ -121,7 +121,7 @@ def test_a_black_beginning_is_left_out_offline_and_by_evaluate(black_beginning, 
     report = EvaluationReport.model_validate_json(capsys.readouterr().out)
     assert report.left_out == {"withheld": 2}
     (copy,) = (each for each in report.baselines if each.age_frames == 1)
-    assert copy.frames == 4 and copy.psnr_tissue_db < 50
+    assert copy.frames == 3 and copy.psnr_tissue_db < 50
 
 
 def test_the_previous_frame_of_a_replay_is_compared_where_its_pictures_are(black_beginning, tmp_path, capsys):

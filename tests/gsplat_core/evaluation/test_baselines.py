@@ -130,6 +130,16 @@ def test_withheld_frames_are_counted_and_kept_out_of_the_mean():
     assert measured.heldout_train_mean_db == pytest.approx(decibels(20), abs=1e-4)
 
 
+@pytest.mark.parametrize(("withheld", "previous", "after"), [("black", 100, 130), ("blur", 40, 130)])
+def test_a_picture_that_cannot_be_shown_is_no_neighbour(withheld, previous, after):
+    """The display keeps the picture before it, and so does the baseline."""
+    odd = Frame(seq=8, pts_ns=8, image=np.full((2, 3, 3), 40, np.uint8), withheld=withheld)
+    measured = measure_baselines([frame(7, 100), odd, frame(9, 120), frame(10, 130)])
+    assert measured.left_out == {"withheld": 1} and measured.copies[1].frames == 2
+    assert measured.heldout_previous_frame_db == pytest.approx(decibels(120 - previous), abs=1e-4)
+    assert measured.heldout_neighbour_mean_db == pytest.approx(decibels(120 - (previous + after) / 2), abs=1e-4)
+
+
 def test_what_fails_in_a_thread_reaches_the_caller():
     wrong = Frame(seq=1, pts_ns=1, image=np.zeros((2, 3, 3), np.uint8), mask=np.ones((2, 3), np.uint8))
     object.__setattr__(wrong, "mask", np.ones((5, 5), np.uint8))
