@@ -304,7 +304,7 @@ class InterlacingStage(Stage):
         right = frame.right_image
         if right is not None:
             right = without_combs(right)
-        return frame.with_fields(image=image, right_image=right)
+        return frame.with_fields(image=image, right_image=right, deinterlaced=True)
 
 
 @dataclass(frozen=True)
@@ -365,19 +365,23 @@ class SharpnessCounts(StageCounts):
 class SharpnessStage(Stage):
     """Withholds frames with blur or smoke, relative to the usual sharpness of the scene.
 
-    Damaged frames, and frames withheld by an earlier stage, are not examined. The stage must run after `CutStage`.
+    Damaged frames, and frames withheld by an earlier stage, are not examined. The stage must run after `CutStage` and
+    `InterlacingStage`.
     """
 
     counts_type = SharpnessCounts
 
     def reset(self) -> None:
         self._gate = SharpnessGate()
+        self._deinterlaced = False
 
     def annotate(self, frame: Frame) -> Frame:
         if frame.unusable is not None:
             return frame
-        if frame.new_scene is not None:
+        if frame.new_scene is not None or frame.deinterlaced != self._deinterlaced:
+            # Pictures with combs are sharper than the same ones without.
             self._gate.start_scene()
+        self._deinterlaced = frame.deinterlaced
         fault = self._gate.fault(frame.image, frame.pts_ns, frame.tissue)
         return frame if fault is None else self.withhold(frame, fault)
 

@@ -160,6 +160,8 @@ class Frame:
     """Reason for a scene change at this frame ("cut", "resized"); None if the scene continues."""
     scene: int = 0
     """Scene id; lets a consumer that missed the first frame of a scene detect the change."""
+    deinterlaced: bool = False
+    """True if combs of interlaced video were removed from the picture, which also removes detail."""
 
     @property
     def unusable(self) -> str | None:

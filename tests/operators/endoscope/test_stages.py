@@ -238,3 +238,17 @@ def test_both_eyes_of_interlaced_video_are_repaired():
     passed = run(stage, [frame.with_fields(right_image=frame.image) for frame in frames(images)])
     assert np.array_equal(passed[15].image, passed[15].right_image) and not np.array_equal(passed[15].image, images[15])
     assert stage.counts().found["de-interlaced"] > 10
+
+
+def test_removing_combs_is_no_blur():
+    """The pictures without combs are compared with each other, not with the sharper ones from before combs were found."""
+    images = [np.roll(image, 6 * k, axis=1) for k, image in enumerate(texture(1, 30, 320, 256))]
+    for image, later in itertools.pairwise(images):
+        image[1::2] = later[1::2]
+    # The first frames are at rest, as combs are found late in a stream that begins so.
+    given = frames([images[0]] * 8 + images[:-1])
+    repaired = run(InterlacingStage(), given)
+    assert [frame.deinterlaced for frame in repaired].count(True) > 10
+    assert {frame.withheld for frame in run(SharpnessStage(), repaired)} == {None}
+    unmarked = [frame.with_fields(deinterlaced=False) for frame in repaired]
+    assert "blur" in {frame.withheld for frame in run(SharpnessStage(), unmarked)}
