@@ -96,24 +96,31 @@ def print_report(report: RunReport, out: Path, *, as_json: bool) -> None:
     lines = [
         f"{frames.displayed} of {frames.ingested} frames displayed, {frames.dropped} dropped, in {run.wall_s:.1f} s"
     ]
-    for name, part, baseline in (
-        ("displayed frame (training error)", quality.live, quality.baselines.previous_frame_db),
-        ("held-out frames", quality.heldout, quality.baselines.heldout_previous_frame_db),
-        ("training frames (training error)", quality.training, quality.baselines.previous_frame_db),
+    baselines = quality.baselines
+    for name, part, previous_db, mean_db in (
+        ("displayed frame (training error)", quality.live, baselines.previous_frame_db, None),
+        ("held-out frames", quality.heldout, baselines.heldout_previous_frame_db, baselines.heldout_neighbour_mean_db),
+        ("training frames (training error)", quality.training, baselines.previous_frame_db, None),
     ):
         if part is not None:
-            lines += quality_line(name, part.psnr_tissue_db, baseline)
+            lines += quality_line(name, part.psnr_tissue_db, previous_db, mean_db)
     lines += next_frame_line(report)
     typer.echo("\n".join(lines))
     typer.echo(str(out / "report.html"))
 
 
-def quality_line(name: str, psnr_db: float | None, previous_db: float | None) -> list[str]:
-    """Return a line with a mean tissue PSNR and the trivial baseline on the same frames; empty without the PSNR."""
+def quality_line(
+    name: str, psnr_db: float | None, previous_db: float | None, mean_db: float | None = None
+) -> list[str]:
+    """Return a line with a mean tissue PSNR and trivial baselines on the same frames; empty without the PSNR.
+
+    `mean_db` is the PSNR of the mean of the two neighbouring frames.
+    """
     if psnr_db is None:
         return []
-    beside = "" if previous_db is None else f" (previous frame shown instead: {previous_db:.2f} dB)"
-    return [f"tissue PSNR, {name}: {psnr_db:.2f} dB{beside}"]
+    baselines = {"previous frame shown instead": previous_db, "mean of both neighbours": mean_db}
+    beside = "; ".join(f"{what}: {value:.2f} dB" for what, value in baselines.items() if value is not None)
+    return [f"tissue PSNR, {name}: {psnr_db:.2f} dB{f' ({beside})' if beside else ''}"]
 
 
 def next_frame_line(report: RunReport) -> list[str]:

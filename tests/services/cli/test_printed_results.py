@@ -31,7 +31,7 @@ class Report(SimpleNamespace):
 
 def report(**changed: Any) -> Any:
     next_frame = SimpleNamespace(psnr_tissue_db=31.0, previous_frame_db=30.0)
-    baselines = SimpleNamespace(previous_frame_db=35.5, heldout_previous_frame_db=None)
+    baselines = SimpleNamespace(previous_frame_db=35.5, heldout_previous_frame_db=None, heldout_neighbour_mean_db=34.5)
     scores = [SimpleNamespace(psnr_tissue_db=each) for each in (36.25, 33.0)]
     given = {
         "notes": ["a note"], "live": SimpleNamespace(**FACTS),
@@ -87,7 +87,7 @@ def test_a_report_is_printed_with_its_baselines(capsys: pytest.CaptureFixture[st
     assert err == "note: a note\n" and out.splitlines() == [
         "30 of 33 frames displayed, 3 dropped, in 12.3 s",
         "tissue PSNR, displayed frame (training error): 36.25 dB (previous frame shown instead: 35.50 dB)",
-        "tissue PSNR, held-out frames: 33.00 dB",
+        "tissue PSNR, held-out frames: 33.00 dB (mean of both neighbours: 34.50 dB)",
         "tissue PSNR, next frame, predicted before training on it: 31.00 dB (previous frame shown instead: 30.00 dB)",
         "out/report.html",
     ]
