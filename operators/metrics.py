@@ -120,7 +120,7 @@ class QualityResult:
     previous_frame_db: float | None = None
     """Mean tissue PSNR in dB of the previous raw frame over the scored frames (trivial baseline); None if there is none."""
     heldout_previous_frame_db: float | None = None
-    """The same baseline over the scored frames that were never trained on."""
+    """That mean over held-out frames only."""
 
 
 LOOK_NS = 500_000_000
