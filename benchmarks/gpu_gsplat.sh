@@ -48,21 +48,8 @@ untimed() {
   wait "$beside"
 }
 
-peer_tests() {
-  compare own_tests own_tests --tests "$sources/tests" --oracle "$peers/gsplat" --peer "$peers" --together 10 --timeout 400
-}
-
-timed() {
-  export CUDA_VISIBLE_DEVICES=$((gpus > 1 ? 1 : 0))
-  compare own_tests own_tests --tests "$sources/tests" --oracle "$peers/gsplat" --peer "$peers" --together 10 --timeout 400 &
-  local beside=$!
-  compare calls calls
-  compare cameras cameras
-  compare thresholds thresholds
-  compare memory memory --full
-  compare strategies strategies --full --steps 3000
-  compare static static --full --steps 3000
-  wait "$beside"
+own_tests() {
+  compare own_tests own_tests --tests "$sources/tests" --oracle "$peers/gsplat" --together 5 --timeout 400
 }
 
 timed() {
@@ -92,11 +79,11 @@ run tests benchmarks/gpu_tests.sh
 wait "$building"
 
 if [ "$gpus" -gt 1 ]; then
-  CUDA_VISIBLE_DEVICES=1 peer_tests &
+  CUDA_VISIBLE_DEVICES=1 own_tests &
   CUDA_VISIBLE_DEVICES=0 timed "$@"
   wait
 else
   wait "$beside"
   timed "$@"
-  peer_tests
+  own_tests
 fi

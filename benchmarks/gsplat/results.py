@@ -401,8 +401,8 @@ def trainer(logs: Logs) -> str:
         " gsplat 1.5.3 never resets opacities. Every 8th image is held out and scored. Median of the seeds, with the worst in"
         " brackets. Training time excludes start and evaluation, and includes waiting for the trainer's own reader of pictures,"
         " which is the same for all. Ratios are to gsplat with the same seed; the last one is without the waiting. Peak memory is"
-        " that of PyTorch's allocator on CUDA, and that of the process on the CPU. LPIPS is not measured. Up to commit ceec9ff4 the time also includes the import of a package of torch in"
-        " the first step, which takes seconds and moves the ratios towards 1. Required: at most 0.65"
+        " that of PyTorch's allocator on CUDA, and that of the process on the CPU. LPIPS is not measured."
+        " Required: at most 0.65"
         " of gsplat's time, and 0.5 with our optimiser and SSIM. gsplat needs CUDA."
     )
     return "\n\n".join([said, trainings(logs), *_own_trainer(logs)])
