@@ -138,17 +138,6 @@ class StageOp(Operator):
             outcome.add(stage.counts())
 
 
-def left_out(frame: Frame, kept: NDArray[np.uint8]) -> Frame:
-    """Return the frame with further pixels excluded from the loss.
-
-    Args:
-        frame: the frame; its own `loss_mask` stays in effect.
-        kept: uint8 [H, W], 0 = excluded.
-    """
-    together = kept if frame.loss_mask is None else np.minimum(frame.loss_mask, kept)
-    return frame.with_fields(loss_mask=together)
-
-
 @dataclass(frozen=True)
 class OrdinaryFrames:
     """Number of unusual frames, checked by every stage (`looked`), and of ordinary frames, checked by some stages."""
@@ -328,8 +317,7 @@ class FieldOfViewStage(Stage):
         return masked
 
     def carried(self, frame: Frame) -> Frame:
-        mask = self._view.mask
-        return frame if mask is None or mask.shape != frame.image.shape[:2] else left_out(frame, mask)
+        return frame.excluding(self._view.mask)
 
 
 @dataclass(frozen=True)
@@ -353,8 +341,7 @@ class StripStage(Stage):
         return masked
 
     def carried(self, frame: Frame) -> Frame:
-        mask = self._detector.mask
-        return frame if mask is None or mask.shape != frame.image.shape[:2] else left_out(frame, mask)
+        return frame.excluding(self._detector.mask)
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,8 @@ from __future__ import annotations
 import hashlib
 import math
 import time
-from array import array
 from collections import OrderedDict, deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -115,12 +114,13 @@ class QualityResult:
     """Number of frames compared with a displayed picture, their own or an older one. Includes withheld and damaged frames,
     which have no score.
     """
-    scored: Sequence[int] = ()
-    """Sequence numbers of the frames that are neither withheld nor damaged, in order; empty for a live stream."""
     previous_frame_db: float | None = None
     """Mean tissue PSNR in dB of the previous raw frame over the scored frames (trivial baseline); None if there is none."""
     heldout_previous_frame_db: float | None = None
     """That mean over held-out frames only."""
+    heldout_neighbour_mean_db: float | None = None
+    """Mean tissue PSNR in dB of the mean of the previous and the next raw frame over held-out frames that have both (trivial
+    baseline, which sees the future); None if there is none."""
 
 
 LOOK_NS = 500_000_000
@@ -278,6 +278,8 @@ class MetricsOp(Operator):
 
     _previous: Frame | None
     """Newest raw frame that the display follows, the trivial baseline for the next frame; None at the start of a stream."""
+    _without_next: tuple[Frame, Frame] | None
+    """Newest held-out frame, after its previous frame, until the next frame arrives; None otherwise."""
 
     def __init__(
         self,
@@ -316,7 +318,7 @@ class MetricsOp(Operator):
         for frame, shown, until_ns in self._screen.pairs(waiting=0):
             self._score_shown(frame, shown, until_ns)
         self._digest.close()
-        self._previous = None
+        self._previous = self._without_next = None
         if self.log is not None:
             self.log.close()
 
@@ -328,9 +330,7 @@ class MetricsOp(Operator):
         self.next_frame = NextFrameScores()
         self.settled, self.before = ScoredMean(), ScoredMean()
         self.before_all, self.before_held_out = ScoredMean(), ScoredMean()
-        self.scored = array("q")
-        """Sequence numbers of the frames that are neither withheld nor damaged. Not recorded for a live stream, which may
-        run for days."""
+        self.neighbour_mean = ScoredMean()
         self.worst: tuple[float, int] | None = None
         self.not_on_screen = 0
         self._digest.close()
@@ -341,6 +341,7 @@ class MetricsOp(Operator):
         self._waiting_db: OrderedDict[int, float] = OrderedDict()
         """Tissue PSNR in dB of the previous raw frame, for frames whose prediction has not arrived."""
         self._previous = None
+        self._without_next = None
         self._first_s: float | None = None
         self._trimmed_s = time.monotonic()
         self._log_works = True
@@ -395,8 +396,6 @@ class MetricsOp(Operator):
         """Score a frame against its own picture."""
         tracker = self.trained if rendered.trained else self.held_out
         scored = self._score(rendered.frame, rendered, tracker, similarity=True)
-        if rendered.frame.unusable is None:
-            self.scored.append(rendered.frame.seq)
         self._log(scored.as_json())
         return scored
 
@@ -434,11 +433,20 @@ class MetricsOp(Operator):
         self.before_all.add(before_db)
         if tracker is self.held_out:
             self.before_held_out.add(before_db)
+            if previous is not None and math.isfinite(before_db):
+                self._without_next = previous, frame
         return ScoredFrame(rendered, quality, before_db, self._next_frame_db(frame, before_db))
 
     def _follow(self, frame: Frame) -> None:
-        if frame.can_be_shown:
-            self._previous = frame
+        if not frame.can_be_shown:
+            return
+        if self._without_next is not None:
+            before, held_out = self._without_next
+            self._without_next = None
+            if frame.image.shape == held_out.image.shape:
+                mean = (before.image.astype(np.float32) + frame.image) / np.float32(2 * 255)
+                self.neighbour_mean.add(psnr_tissue_db(mean, held_out.image, held_out.tissue))
+        self._previous = frame
 
     def _log(self, entry: Mapping[str, Value]) -> None:
         if self.log is not None and self._log_works:
@@ -479,9 +487,9 @@ class MetricsOp(Operator):
                     per_entry,
                     self.frames_sha256,
                     self.frames,
-                    scored=tuple(self.scored),
                     previous_frame_db=self.before_all.mean,
                     heldout_previous_frame_db=self.before_held_out.mean,
+                    heldout_neighbour_mean_db=self.neighbour_mean.mean,
                 )
             )
         outcome.add(self.next_frame.result)

@@ -17,6 +17,7 @@ even lines are kept, and outliers of odd lines are replaced by the mean of their
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable
 
 import cv2
 import numpy as np
@@ -154,6 +155,33 @@ class FieldOfView:
             kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * margin + 1, 2 * margin + 1))
             inside = np.asarray(cv2.erode(inside, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=1))
         self.mask = inside
+
+
+def seen_in_recording(pictures: Iterable[NDArray[np.uint8]]) -> NDArray[np.uint8] | None:
+    """Find the pixels that the scope saw at some time of a recording, without drawn strips and text.
+
+    The field of view counts from the first complete window on; in shorter recordings the last one counts. Strips and text
+    are those of the last pictures.
+
+    Args:
+        pictures: usable pictures in order, RGB uint8 [H, W, 3], all of one size.
+
+    Returns:
+        Mask uint8 [H, W], 1 = seen; None if the whole picture is.
+    """
+    view, strips = FieldOfView(), StripDetector()
+    held: list[NDArray[np.uint8] | None] = []
+    for count, picture in enumerate(pictures, 1):
+        mask = view.observe(picture)
+        strips.observe(picture)
+        if count == WINDOW_FRAMES or not held or mask is not held[-1]:
+            # The outline of the first frame alone is no longer needed once a whole window was examined.
+            held = [*(held if count > WINDOW_FRAMES else []), mask]
+    masks = [mask for mask in held if mask is not None]
+    seen = np.maximum.reduce(masks) if masks and len(masks) == len(held) else None
+    if strips.mask is None:
+        return seen
+    return strips.mask if seen is None else np.minimum(seen, strips.mask)
 
 
 def find_outline(brightest: NDArray[np.uint8], darkest: NDArray[np.uint8]) -> Outline | None:

@@ -175,7 +175,7 @@ def measure_baselines(
     mean_image = train_mean.image()
     for frame in recording if mean_image is not None else ():
         if is_heldout(frame.seq) and why_left_out(frame) is None:
-            sums.take(("heldout", TRAIN_MEAN), *psnrs_db(mean_image, frame.image, frame.mask))  # type: ignore[arg-type]
+            sums.take(("heldout", TRAIN_MEAN), *psnrs_db(mean_image, frame.image, frame.tissue))  # type: ignore[arg-type]
     return sums.baselines(ages, left_out)
 
 
@@ -213,7 +213,7 @@ def _compare(frame: Frame, before: Sequence[Frame], after: Frame | None, ages: S
 
     def score(group: str, name: object, picture: ImageLike | None) -> None:
         if picture is not None:
-            found[group, name] = psnrs_db(picture, frame.image, frame.mask)
+            found[group, name] = psnrs_db(picture, frame.image, frame.tissue)
 
     for age in ages:
         if age <= len(before):
@@ -232,9 +232,9 @@ def _compare(frame: Frame, before: Sequence[Frame], after: Frame | None, ages: S
 
 
 def _tissue_in_both(frame: Frame, other: Frame) -> NDArray[np.uint8] | None:
-    if frame.mask is None or other.mask is None:
-        return other.mask if frame.mask is None else frame.mask
-    return ((frame.mask != 0) & (other.mask != 0)).astype(np.uint8)
+    if frame.tissue is None or other.tissue is None:
+        return other.tissue if frame.tissue is None else frame.tissue
+    return ((frame.tissue != 0) & (other.tissue != 0)).astype(np.uint8)
 
 
 def _neighbourhoods(recording: Iterable[Frame], most: int) -> Iterator[tuple[Frame, list[Frame], Frame | None]]:

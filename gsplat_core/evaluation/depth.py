@@ -151,8 +151,8 @@ class DepthSums:
         known = np.isfinite(frame.depth) & (frame.depth > 0)
         if frame.depth_confidence is not None:
             known &= frame.depth_confidence >= BELIEVED
-        if frame.mask is not None:
-            known &= frame.mask != 0
+        if frame.tissue is not None:
+            known &= frame.tissue != 0
         count = int(known.sum())
         if not count:
             return math.nan

@@ -180,7 +180,7 @@ class PartSums:
             picture_of: callback that renders Gaussians from the frame's pose, [H, W, 3] in 0..1.
         """
         moved, frozen = self._at(frame.time_s).tensors(), self._at(self._reference_s).tensors()
-        tissue = np.ones(frame.image.shape[:2], bool) if frame.mask is None else frame.mask != 0
+        tissue = np.ones(frame.image.shape[:2], bool) if frame.tissue is None else frame.tissue != 0
         wanted = frame.image[tissue].astype(np.float64) / 255
         for thawed in self._errors:
             names = {name for part in thawed for name in PARTS[part]}
@@ -359,7 +359,7 @@ def _is_chosen(frame: Frame, frame_count: int, most: int) -> bool:
 
 
 def _tissue(frame: Frame) -> NDArray[np.bool_]:
-    return np.ones(frame.image.shape[:2], bool) if frame.mask is None else frame.mask != 0
+    return np.ones(frame.image.shape[:2], bool) if frame.tissue is None else frame.tissue != 0
 
 
 def _posed(camera: Camera, pose: Pose | None) -> Camera:

@@ -148,7 +148,7 @@ def evaluate_heldout(
             continue
         picture = picture_of(frame)
         quality = sums.add(frame, picture.image)
-        unrounded_db = psnr_tissue_db(picture.unrounded, frame.image, frame.mask)
+        unrounded_db = psnr_tissue_db(picture.unrounded, frame.image, frame.tissue)
         unrounded.add(unrounded_db)
         depth_mae_mm = depth.add(frame, picture.depth)
         if record is not None:
@@ -475,7 +475,7 @@ def _frozen(frames: Iterable[Frame], shown: Frame | None, tail: Range) -> Baseli
     for frame in frames if shown is not None else ():
         assert shown is not None
         if _within(frame, tail) and frame.seq != shown.seq and why_left_out(frame) is None:
-            tissue_db, frame_db = psnrs_db(shown.image, frame.image, frame.mask)
+            tissue_db, frame_db = psnrs_db(shown.image, frame.image, frame.tissue)
             tissue.add(tissue_db)
             whole.add(frame_db)
     return BaselineScore(tissue.mean, whole.mean, tissue.count)

@@ -73,7 +73,7 @@ def why_left_out(frame: Frame) -> str | None:
         return "damaged"
     if frame.withheld is not None:
         return "withheld"
-    if frame.mask is not None and not frame.mask.any():
+    if frame.tissue is not None and not frame.tissue.any():
         return "no tissue"
     return None
 
@@ -97,7 +97,7 @@ class ScoreSums:
         Raises:
             InvalidInput: if the sizes differ.
         """
-        quality = frame_quality(frame.seq, picture, frame.image, frame.mask)
+        quality = frame_quality(frame.seq, picture, frame.image, frame.tissue)
         self.take(quality)
         return quality
 

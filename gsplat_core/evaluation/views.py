@@ -106,8 +106,8 @@ def seen_by_both(
         camera: camera of the view; its pose maps left-camera coordinates to its own.
         view: frame of the view.
     """
-    tissue = np.ones(view.image.shape[:2], bool) if view.mask is None else view.mask != 0
-    trained = np.ones(left.image.shape[:2], bool) if left.mask is None else left.mask != 0
+    tissue = np.ones(view.image.shape[:2], bool) if view.tissue is None else view.tissue != 0
+    trained = np.ones(left.image.shape[:2], bool) if left.tissue is None else left.tissue != 0
     if left_depth is None:
         return tissue
     pose = camera.world_to_camera
@@ -178,7 +178,9 @@ class ViewSums:
         self, frame: Frame, own: Camera, true: NDArray[Any] | None, depth: NDArray[Any] | None
     ) -> float | None:
         """Return the median tissue depth in the recording's unit: true if known, otherwise the model's; None without both."""
-        known = np.zeros(0) if true is None else true[(true > 0) & (True if frame.mask is None else frame.mask != 0)]
+        known = (
+            np.zeros(0) if true is None else true[(true > 0) & (True if frame.tissue is None else frame.tissue != 0)]
+        )
         if not known.size:
             shows = self._shown(own, frame).depth if depth is None else depth
             known = self._scale * shows[shows > 0]

@@ -194,6 +194,17 @@ class Frame:
             return self.mask if self.loss_mask is None else self.loss_mask
         return np.minimum(self.mask, self.loss_mask)
 
+    def excluding(self, kept: NDArray[np.uint8] | None) -> Frame:
+        """Return the frame with further pixels excluded from the loss.
+
+        Args:
+            kept: uint8 [H, W], 0 = excluded; `loss_mask` stays in effect. With None, or a mask for another picture size, the
+                frame itself is returned.
+        """
+        if kept is None or kept.shape != self.image.shape[:2]:
+            return self
+        return self.with_fields(loss_mask=kept if self.loss_mask is None else np.minimum(self.loss_mask, kept))
+
     def __post_init__(self) -> None:
         if self.depth is not None and self.depth_origin is None:
             object.__setattr__(self, "depth_origin", MEASURED)

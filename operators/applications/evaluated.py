@@ -18,8 +18,8 @@ from gsplat_core.io.sessions import SessionReader, is_session
 from gsplat_core.models import Model
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
-from operators.applications.session import FirstFrames
-from operators.sources.derived import JudgedSource, PosedSource
+from operators.applications.session import FirstFrames, judged
+from operators.sources.derived import PosedSource
 from operators.sources.registry import SourceOptions, open_source
 from operators.sources.source import FrameSource, SourceDescription
 
@@ -122,7 +122,7 @@ def fitting_source(
         run: settings of the run that made the model; None if unknown.
 
     Returns:
-        The source, which withholds pictures that show nothing, its scale, the mapping of its timestamps, and notes for the report.
+        The source as `judged` returns it, its scale, the mapping of its timestamps, and notes for the report.
 
     Raises:
         InvalidSetting: the model cannot come from such a recording, because camera, aspect ratio or
@@ -157,7 +157,7 @@ def fitting_source(
         playback, more = _session_playback(model, Path(address), description)
     else:
         playback, more = _playback(model, description, None if run is None else run.fps, max_frames is not None)
-    return JudgedSource(source), scale, playback, [*notes, *more]
+    return judged(source), scale, playback, [*notes, *more]
 
 
 def poses_of_run(source: FrameSource, run: EvaluatedRun | None) -> Path | None:

@@ -50,13 +50,13 @@ from operators.applications.session import (
     Session,
     Start,
     delivered,
-    measures_baselines,
+    judged,
     saves_model,
     seeded,
 )
 from operators.errors import NothingShown
 from operators.settings import OfflineSection, check_option
-from operators.sources.derived import JudgedSource, PosedSource
+from operators.sources.derived import PosedSource
 from operators.sources.source import FrameSource
 from operators.storage import storage_errors
 
@@ -131,7 +131,7 @@ def reconstruct(
     check_option("steps", steps)
 
     def run(inside: ReplaySettings, notes: list[str]) -> RunOutcome:
-        source: FrameSource = JudgedSource(prepare(inside, notes, offline=True))
+        source = prepare(inside, notes, offline=True)
         start = Start.now()
         fitted = _Fitting(source, inside, progress, stop_requested, notes, clock).done(steps)
         # Estimated poses come with the frames of the source.
@@ -154,7 +154,6 @@ def reconstruct(
                 lambda session: session.reached.add(fitted.steps),
                 saves_model(inside.out, model),
                 *([_saves_poses(source, inside.out)] if fitted.path is not None else []),
-                measures_baselines(source),
             ],
             notes=notes,
             stop_requested=stop_requested,
@@ -258,7 +257,7 @@ class _Fitting:
         """
         settings = self._settings
         with seeded(settings.seed, settings.device):
-            inputs = _Inputs(self._source, settings)
+            inputs = _Inputs(judged(self._source), settings)
             if settings.poses == "estimated":
                 try:
                     inputs = _posed(inputs)

@@ -36,7 +36,6 @@ from operators.applications.session import (
     Session,
     check_device,
     delivered,
-    measures_baselines,
     saves_model,
     seeded,
 )
@@ -213,8 +212,7 @@ def replay(
             inside.stated(online=True),
             command="replay",
             engine=inside.engine,
-            # A session may drop frames, so the baselines would read other frames than those displayed.
-            finish=[saves_model(inside.out), *([] if followed else [measures_baselines(source)])],
+            finish=[saves_model(inside.out)],
             notes=notes,
             stop_requested=stop_requested,
         ).execute()

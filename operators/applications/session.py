@@ -12,19 +12,20 @@ from pathlib import Path
 from time import perf_counter
 from typing import Protocol, TypeVar, cast
 
+from gsplat_core.endoscope.artefacts import seen_in_recording
 from gsplat_core.errors import CoreError
-from gsplat_core.evaluation.baselines import measure_baselines
 from gsplat_core.io.bundle import save_bundle
+from gsplat_core.io.recordings import is_heldout
 from gsplat_core.models import Model
 from gsplat_core.scene.frames import Frame
 from operators.errors import DeviceMissing, OperatorsError, RunFailed
 from operators.graph import Application, DurationSummary, GreedyScheduler, ManualClock, MultiThreadScheduler, run
 from operators.graph.application import Engine
 from operators.ingest import LOOK_S, SourceResult
-from operators.metrics import QualityResult
 from operators.outcome import Contributor, OutcomeBuilder
 from operators.output_folder import OutputFolder
 from operators.reconstruct import ModelResult
+from operators.sources.derived import JudgedSource
 from operators.sources.source import FrameSource, SourceState
 from operators.storage import storage_errors
 
@@ -105,7 +106,7 @@ class RunOutcome:
     settings: RunSettings
     started_at: datetime
     wall_s: float
-    """Duration from the start of the run to the end of its graph, in seconds, without saving and baselines."""
+    """Duration from the start of the run to the end of its graph, in seconds, without saving."""
     stop_reason: str
     """`end of recording`, `end of stream`, `end of the time asked for`, `interrupted`, or the error message."""
     interrupted: bool
@@ -155,7 +156,7 @@ class Session:
 
     The graph defines source, sinks, clock and training budget. Every operator, and the graph
     itself, may contribute to the outcome (`Contributor`). The `finish` steps add results computed
-    after the graph has ended, such as a saved model or baselines. Each step is attempted even if an
+    after the graph has ended, such as a saved model. Each step is attempted even if an
     earlier one failed, so that a run that ends early keeps its results.
     """
 
@@ -299,26 +300,6 @@ def saves_model(out: Path, fitted: Model | None = None) -> Callable[[Session], N
     return save
 
 
-def measures_baselines(source: FrameSource) -> Callable[[Session], None]:
-    """Return a function that measures trivial baselines on the scored frames of a finished session, for `Session.finish`. It
-    reads the source twice more."""
-
-    def measure(session: Session) -> None:
-        if session.stop_requested() or session.failure is not None:
-            session.notes.append(
-                "the run ended early: baselines that need a second reading of the recording were left out"
-            )
-        elif source.description.digest is None:
-            session.notes.append(
-                f"{source.description.name} can be read only once: baselines that need a second reading were left out"
-            )
-        else:
-            quality = session.reached.find(QualityResult)
-            session.reached.add(measure_baselines(ScoredFrames(source, () if quality is None else quality.scored)))
-
-    return measure
-
-
 @dataclass(frozen=True)
 class FirstFrames:
     """The first `count` frames of a closed source; each iteration reads from the beginning."""
@@ -341,30 +322,24 @@ class FirstFrames:
             self.source.close()
 
 
-NOT_SCORED = "not scored"
-"""Value of `Frame.withheld` for frames that a run did not score."""
+def judged(source: FrameSource) -> JudgedSource:
+    """Return a closed source whose pictures that show nothing are withheld, and whose pixels that the scope does not see, such as
+    those outside of a round view, are excluded from the loss.
 
-
-@dataclass(frozen=True)
-class ScoredFrames:
-    """The frames of a closed source up to the last one that a run scored; each iteration reads from the beginning.
-
-    Frames that the run did not score, for example because a check withheld them, are withheld.
+    The source is read once. Held-out frames are not examined. A source that can be read only once has no pixels excluded.
     """
-
-    source: FrameSource
-    scored: Sequence[int]
-    """Sequence numbers of the scored frames, in order."""
-
-    def __iter__(self) -> Iterator[Frame]:
-        if not self.scored:
-            return
-        scored = frozenset(self.scored)
-        for frame in FirstFrames(self.source, sys.maxsize):
-            is_scored = frame.seq in scored or frame.unusable is not None
-            yield frame if is_scored else replace(frame, withheld=NOT_SCORED)
-            if frame.seq >= self.scored[-1]:
-                return
+    about, bare = source.description, JudgedSource(source)
+    if about.digest is None or about.frame_count is None:
+        return bare
+    size = about.height_px, about.width_px
+    return JudgedSource(
+        source,
+        seen_in_recording(
+            frame.image
+            for frame in FirstFrames(bare, about.frame_count)
+            if frame.unusable is None and not is_heldout(frame.seq) and frame.image.shape[:2] == size
+        ),
+    )
 
 
 Report = Callable[[RunOutcome, Path], None]

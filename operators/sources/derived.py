@@ -110,18 +110,25 @@ class PosedSource(DerivedSource):
 
 
 class JudgedSource(DerivedSource):
-    """`FrameSource` that withholds the frames of another source whose picture shows nothing, such as a black one.
+    """`FrameSource` that withholds the frames of another source whose picture shows nothing, such as a black one, and excludes
+    pixels that the scope does not see.
 
     Unlike the checks of a stream, it judges each picture alone, so that a frame has the same verdict whenever it is read.
     """
 
-    def __init__(self, source: FrameSource) -> None:
-        """Create a source with the frames of `source`, opened and closed together with this one."""
+    def __init__(self, source: FrameSource, seen: NDArray[np.uint8] | None = None) -> None:
+        """Create a source with the frames of `source`.
+
+        Args:
+            source: opened and closed together with this one.
+            seen: pixels of all pictures that the scope sees, uint8 [H, W], 0 = excluded from the loss; None for all.
+        """
         super().__init__(source, source.description)
+        self._seen = seen
 
     def _derived(self, frame: Frame) -> Frame:
         fault = None if frame.unusable else picture_fault(frame.image)
-        return frame if fault is None else replace(frame, withheld=fault)
+        return frame.excluding(self._seen) if fault is None else replace(frame, withheld=fault)
 
 
 MOST_KEPT = 8

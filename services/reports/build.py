@@ -8,7 +8,6 @@ from pathlib import Path
 import torch
 
 from gsplat_core.errors import InvalidInput
-from gsplat_core.evaluation.baselines import Baselines
 from gsplat_core.evaluation.depth import DepthShare
 from gsplat_core.evaluation.scores import finite
 from gsplat_core.training.metrics import QualityTracker
@@ -195,7 +194,6 @@ def _training_steps(chosen: ChosenSteps) -> TrainingSteps:
 
 def _qualities(outcome: RunOutcome, quality: QualityResult) -> QualityReport:
     offline = outcome.command == "reconstruct"
-    baselines = outcome.find(Baselines)
     return QualityReport(
         live=None if offline else _quality(quality.trained),
         next_frame=_next_frame(outcome.find(NextFrameResult)),
@@ -204,9 +202,8 @@ def _qualities(outcome: RunOutcome, quality: QualityResult) -> QualityReport:
         heldout=_quality(quality.held_out) if outcome.settings.heldout else None,
         baselines=BaselineQuality(
             previous_frame_db=quality.previous_frame_db,
-            train_mean_db=baselines.heldout_train_mean_db if baselines else None,
             heldout_previous_frame_db=quality.heldout_previous_frame_db,
-            heldout_neighbour_mean_db=baselines.heldout_neighbour_mean_db if baselines else None,
+            heldout_neighbour_mean_db=quality.heldout_neighbour_mean_db,
         ),
     )
 

@@ -239,7 +239,6 @@ def baselines_section(report: RunReport) -> str:
     rows += [
         ("Held-out frames: previous frame", baselines.heldout_previous_frame_db, False),
         ("Held-out frames: mean of both neighbours (sees the future)", baselines.heldout_neighbour_mean_db, False),
-        ("Held-out frames: mean of all training frames", baselines.train_mean_db, False),
     ]
     known = [value for _, value, _ in rows if value is not None]
     low, high = (min(known) - 1, max(known) + 1) if known else (0.0, 1.0)

@@ -160,8 +160,8 @@ class BaselineQuality(Part):
 
     previous_frame_db: float | None
     """Previous raw frame, over the scored frames and their tissue."""
-    train_mean_db: float | None
-    """Mean of all training frames, for every held-out frame."""
+    train_mean_db: float | None = None
+    """Mean of all training frames, for every held-out frame; null except in older reports (`evaluate` measures it)."""
     heldout_previous_frame_db: float | None = None
     heldout_neighbour_mean_db: float | None = None
     """Tissue PSNR in dB of the mean of the previous and the next frame. Uses a future frame."""

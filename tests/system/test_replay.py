@@ -60,7 +60,7 @@ def test_quality_is_told_apart_and_stands_beside_its_baselines(finished):
     assert [entry.trained for entry in report.series] == [True, False, True, True, True, True]
     assert live.psnr_tissue_db is not None and live.psnr_tissue_db > 25
     assert report.quality.baselines.previous_frame_db is not None
-    assert report.quality.baselines.train_mean_db is not None
+    assert report.quality.baselines.heldout_neighbour_mean_db is not None
 
 
 @pytest.mark.parametrize("engine", ["embedded", pytest.param("holoscan", marks=pytest.mark.holoscan)])

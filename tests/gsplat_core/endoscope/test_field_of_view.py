@@ -11,8 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsplat_core.endoscope import artefacts
-from gsplat_core.endoscope.artefacts import FieldOfView
+from gsplat_core.endoscope.artefacts import FieldOfView, seen_in_recording
 from tests.gsplat_core.endoscope.clips import clip, texture
+from tests.gsplat_core.endoscope.test_strip import FRAMES, drawn_into, strip_below
 
 HEIGHT, WIDTH = 256, 320
 
@@ -347,3 +348,24 @@ def test_a_hundredth_of_the_longer_side_is_left_out_except_at_the_pictures_edge(
     expected[:, round(0.25 * size[1]) + margin :] = 1
     assert np.abs(mask.astype(int) - expected).sum() <= size[0] and mask[:, -1].all() and mask[[0, -1], -5:].all()
     assert not mask[:, : round(0.25 * size[1]) + margin - 1].any()
+
+
+def test_a_recording_s_field_is_all_that_the_scope_saw():
+    """A field found in the first picture alone does not count once there is a whole window."""
+    small, large = disc(radius=80), disc(radius=120)
+    pictures = seen_through(small, count=1) + seen_through(large, count=40)
+    assert overlap(seen_in_recording(iter(pictures)), large) > 0.92
+    later = seen_through(small, seed=2, count=150)
+    assert overlap(seen_in_recording(pictures + later), large) > 0.92
+    assert overlap(seen_in_recording(later[:5]), small) > 0.9
+    whole = seen_through(np.ones((HEIGHT, WIDTH), bool), count=40)
+    assert seen_in_recording(whole) is None and seen_in_recording([]) is None
+    assert seen_in_recording(later[:35] + whole) is None
+
+
+def test_strips_of_a_recording_are_not_seen():
+    pictures = drawn_into(seen_through(FIELDS["disc"], count=FRAMES, level=30), strip_below)
+    seen = seen_in_recording(pictures).astype(bool)
+    assert not (seen & ~FIELDS["disc"]).any() and seen[-14:].mean() < 0.2 * FIELDS["disc"][-14:].mean()
+    assert (seen & FIELDS["disc"]).sum() > 0.9 * FIELDS["disc"][:-14].sum()
+    assert seen_in_recording(drawn_into(texture(3, FRAMES, WIDTH, HEIGHT), strip_below))[:-20].all()

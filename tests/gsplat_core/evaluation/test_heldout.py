@@ -29,10 +29,11 @@ def test_an_exact_model_scores_the_cap_on_the_held_out_frames_alone(frame, pictu
     assert [(entry["seq"], entry["psnr_tissue_db"]) for entry in log] == [(1, 100.0), (9, 100.0), (17, 100.0)]
 
 
-def test_both_definitions_and_the_picture_before_it_was_rounded(frame, picture, decibels):
+@pytest.mark.parametrize("excluded", ["mask", "loss_mask"])
+def test_both_definitions_and_the_picture_before_it_was_rounded(frame, picture, decibels, excluded):
     mask = np.ones((16, 20), np.uint8)
     mask[:, :15] = 0
-    shown = evaluate_heldout([frame(1, 100, mask=mask)], lambda _: picture(110.4), window_s=ALWAYS)
+    shown = evaluate_heldout([frame(1, 100, **{excluded: mask})], lambda _: picture(110.4), window_s=ALWAYS)
     assert shown.score.psnr_tissue_db == pytest.approx(decibels(10), abs=1e-6), "as a PNG file holds it"
     assert shown.score.psnr_frame_db == pytest.approx(decibels(10) + 10 * np.log10(4), abs=1e-6), "a quarter is tissue"
     assert shown.unrounded_db == pytest.approx(decibels(10.4), abs=1e-4)

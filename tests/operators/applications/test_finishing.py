@@ -1,4 +1,4 @@
-"""After the graph: the model is saved, and baselines are measured where the source can be read again."""
+"""After the graph the model is saved, and a source is read again."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from operators.applications import session as session_module
-from operators.applications.session import FirstFrames, measures_baselines, saves_model
-from operators.metrics import QualityResult
+from operators.applications.session import FirstFrames, saves_model
 from operators.outcome import OutcomeBuilder
 from operators.reconstruct import ModelResult
 from operators.sources.source import SourceState
@@ -73,40 +72,3 @@ def test_the_newest_model_is_saved(tmp_path, monkeypatch, reached_its_own, has_f
     assert run.reached.outputs == ({"model": tmp_path / "model"} if model else {})
     result = run.reached.find(ModelResult)
     assert (None if result is None else result.model) == model
-
-
-@pytest.mark.parametrize(
-    ("fields", "digest", "said"),
-    [
-        ({"stop_requested": lambda: True}, "d", "the run ended early"),
-        ({"failure": ValueError("full")}, "d", "the run ended early"),
-        ({"stop_requested": lambda: True}, None, "the run ended early"),
-        ({}, None, "pipe - can be read only once"),
-    ],
-)
-def test_baselines_are_left_out_with_a_note(fields, digest, said):
-    run = session(**fields)
-    measures_baselines(Scripted([1], digest))(run)
-    (note,) = run.notes
-    assert note.startswith(said) and not run.reached.parts
-
-
-@pytest.mark.parametrize("scored", [None, (), (2, 3, 6)])
-def test_baselines_are_of_the_frames_that_were_scored(monkeypatch, frame, scored):
-    monkeypatch.setattr(session_module, "measure_baselines", lambda frames: SimpleNamespace(frames=list(frames)))
-    run = session()
-    if scored is not None:
-        run.reached.add(QualityResult(None, None, (), 1, "", 5, scored))
-    given = [frame(k, withheld="blur" if k == 4 else None) for k in range(9)]
-    measures_baselines(Scripted(given))(run)
-    read = run.reached.find(SimpleNamespace).frames
-    assert [(each.seq, each.withheld) for each in read] == [
-        (0, "not scored"),
-        (1, "not scored"),
-        (2, None),
-        (3, None),
-        (4, "blur"),
-        (5, "not scored"),
-        (6, None),
-    ][: 7 if scored else 0]
-    assert not run.notes

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from gsplat_core.errors import RecordingInvalid
 from gsplat_core.io.bundle import load_bundle
-from gsplat_core.io.recordings import synthesize
+from gsplat_core.io.recordings import open_recording, synthesize
 from gsplat_core.training import offline
+from gsplat_core.training.metrics import psnr_tissue_db
 from operators.applications import reconstruct as module
 from operators.applications.evaluate import EvaluationSettings, evaluate
 from operators.applications.evaluated import EvaluatedRun
+from operators.applications.session import judged
 from operators.metrics import QualityResult
 from operators.pose import EstimatedPoses
+from operators.sources.registry import SourceOptions, open_source
 from services.reports.build import write_reports
 from tests.gsplat_core.geometry.moving_scope import SIDEWAYS, video
 
@@ -90,3 +95,30 @@ def test_poses_that_are_asked_for_are_those_of_all_frames(moving, tmp_path):
     outcome.outputs["poses"].write_bytes(b"no poses")
     with pytest.raises(RecordingInvalid, match="has no poses"):
         heldout_db()
+
+
+def test_the_surround_of_a_round_view_is_neither_learned_nor_scored(tmp_path):
+    size = height, width = 64, 80
+    y, x = np.mgrid[:height, :width]
+    inside = (x - 40) ** 2 + (y - 32) ** 2 <= 28**2
+    folder = tmp_path / "take"
+    folder.mkdir()
+    rng = np.random.default_rng(0)
+    texture = cv2.resize(rng.integers(90, 220, (16, 20, 3), np.uint8), (width, height), interpolation=cv2.INTER_CUBIC)
+    for number in range(10):
+        shown = np.where(inside[..., None], np.roll(texture, number % 3, 1), 8)
+        cv2.imwrite(str(folder / f"{number:03}.png"), shown.astype(np.uint8))
+    settings = module.ReconstructSettings(recording=folder, out=tmp_path / "out", sinks=())
+    outcome = module.reconstruct(settings, steps=30)
+    source = open_source(folder, SourceOptions())
+    kept = judged(source)._seen
+    assert kept.shape == size and not (kept.astype(bool) & ~inside).any() and kept.mean() > 0.8 * inside.mean()
+    model = load_bundle(outcome.outputs["model"])
+    where = model.camera.K @ model.gaussians.means.double().numpy().T
+    column, row = np.rint(where[:2] / where[2]).astype(int)
+    opaque = torch.sigmoid(model.gaussians.logit_opacities).numpy() > 0.5
+    outside = np.hypot(column - 40, row - 32) > 36
+    assert len(opaque) > 500 and not opaque[outside].any() and opaque[~outside].mean() > 0.8
+    pictures = [frame.image for frame in open_recording(folder)]
+    copies = [psnr_tissue_db(a, b, kept) for a, b in itertools.pairwise(pictures)]
+    assert outcome.find(QualityResult).previous_frame_db == pytest.approx(np.mean(copies), abs=0.01)

@@ -111,7 +111,7 @@ def test_an_empty_run_still_has_a_page(report):
         "operators": {},
         "series": [],
         "model": None,
-        "quality": {"live": None, "heldout": None, "baselines": {"previous_frame_db": None, "train_mean_db": None}},
+        "quality": {"live": None, "heldout": None, "baselines": {"previous_frame_db": None}},
     }
     Page(render_html(type(report).model_validate(content), []))
 
