@@ -8,7 +8,7 @@ With --margins, one line per alteration, also the hard ones, with the number of 
 their middle quarters; one line per sample from outside, with crops and reduced copies; and one line per threshold of the out-of-body gate: the most extreme value of frames from inside whose other measure exceeds its own threshold, by
 recording; and the number of frames of each recording withheld by a threshold chosen on the others alone, half-way to the pictures from outside.
 
-Usage: python benchmarks/gates.py FOLDER_OF_RECORDINGS [--frames 60] [--only NAME] [--change NAME] [--margins]
+Usage: python benchmarks/gates.py FOLDER_OF_RECORDINGS [--frames 60] [--only NAME] [--change NAME [--outside]] [--margins]
 """
 
 from __future__ import annotations
@@ -98,6 +98,7 @@ def main() -> int:
     parser.add_argument("--frames", type=int, default=60)
     parser.add_argument("--only", choices=sorted(INSIDE))
     parser.add_argument("--change", choices=sorted(UNUSUAL), help="only this alteration, and no pictures from outside")
+    parser.add_argument("--outside", action="store_true", help="pictures from outside also with --change")
     parser.add_argument("--margins", action="store_true")
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
@@ -110,7 +111,7 @@ def main() -> int:
             count = None if change == "unchanged" else arguments.frames
             pictures = islice(frames(arguments.recordings / INSIDE[name]), count)
             say({"recording": name, "change": change, **withheld(changed(pictures, UNUSUAL[change]))})
-    if arguments.only is None and arguments.change is None:
+    if arguments.outside or (arguments.only is None and arguments.change is None):
         for number in FROM_OUTSIDE:
             (picture,) = frames(arguments.recordings / f"out_of_body/{number}.png")
             say({"outside": number, "evidence": evidence_words(picture[0])})

@@ -1,17 +1,20 @@
-"""Run live and offline reconstruction with default settings on every recording of a folder.
+"""Run live and offline reconstruction with default settings on every recording of a folder, and the checks of masks, gates and
+geometry.
 
     python benchmarks/generality.py ../shared/recordings --device cuda
     python benchmarks/generality.py MY_RECORDINGS --parts live --runs 1 --out /tmp/mine.jsonl
+    python benchmarks/generality.py ../shared/recordings --parts tools cutting_masks gates stereo poses blind fixed
 
-Recordings are found by their files, so the script also runs on unknown recordings.
-Each run is a line of the log. `publish.py` generates results/generality.md from
-the logs in `logs/generality`.
+Recordings are found by their files, so the script also runs on unknown recordings. The checks need the recordings of this
+project, or none. Each run of a recording or result of a check is a line of the log. Lines of other parts stay in it.
+`publish.py` generates results/generality.md from the logs in `logs/generality`.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import shlex
 import statistics
 import sys
@@ -29,6 +32,15 @@ from host_pauses import pauses_text
 FOLDER = suite.LOGS / "generality"
 VIDEOS = ("left.mp4", "video.mp4")
 PARTS = ("live", "live_own_rate", "offline")
+CHECKS = {
+    "tools": "benchmarks/tool_mask.py {recordings} --annotations",
+    "cutting_masks": "benchmarks/tool_mask.py {recordings}/cutting",
+    "gates": "benchmarks/gates.py {recordings} --change unchanged --outside",
+    **{name: f"benchmarks/geometry_random.py {name}" for name in ("stereo", "poses", "blind", "fixed")},
+}
+"""Commands of the checks of tool masks, gates, and geometry on random recordings, by part. Nothing in them is random, so they are run
+once.
+"""
 LEAST_FRAMES = 31
 """Frames of a recording for a live run: a second and one more frame, since scores start after a second."""
 OFFLINE_CPU_SCALE = "0.25"
@@ -82,19 +94,36 @@ def commands(root: Path, parts: Iterable[str], device: str) -> Iterator[tuple[st
             yield part, name, suite.Benchmark(f"generality_{part}", shlex.join(words), device)
 
 
+def checks(root: Path, parts: Iterable[str], device: str) -> Iterator[tuple[str, str, suite.Benchmark]]:
+    """Yield part, the name `all`, and the command of each check."""
+    for part in parts:
+        command = CHECKS[part].replace("{recordings}", shlex.quote(str(root)))
+        yield part, "all", suite.Benchmark(f"generality_{part}", command, device, runs=1)
+
+
 def run(root: Path, parts: Iterable[str], device: str, runs: int, out: Path) -> None:
-    """Append a line to the log for each run of each command. The log is started anew."""
+    """Write a line to the log for each run of each command, in place of earlier lines of the same parts."""
     date = datetime.now(UTC).strftime("%Y-%m-%d")
     about = {"commit": suite.commit(), "date": date, "machine": suite.machine(device)}
-    chosen = list(commands(root, parts, device))
+    wanted = tuple(parts)
+    chosen = [
+        *commands(root, [part for part in wanted if part in PARTS], device),
+        *checks(root, [part for part in wanted if part in CHECKS], device),
+    ]
     if not chosen:
         sys.exit(
             f"no recording is in {root}; a recording is a folder with images/, video.mp4, left.mp4 or poses_bounds.npy"
         )
     out.parent.mkdir(parents=True, exist_ok=True)
+    earlier = out.read_text(encoding="utf-8").splitlines() if out.exists() else []
+    kept = [line for line in earlier if line and json.loads(line)["part"] not in wanted]
     with out.open("w", encoding="utf-8") as log:
+        log.write("".join(f"{line}\n" for line in kept))
         for number in range(1, runs + 1):
             for part, name, benchmark in chosen:
+                if number > 1 and part in CHECKS:
+                    continue
+                ended = "done"
                 for line in suite.measured(benchmark, number, about):
                     stated = {
                         "part": part,
@@ -103,9 +132,8 @@ def run(root: Path, parts: Iterable[str], device: str, runs: int, out: Path) -> 
                     }
                     log.write(json.dumps(line | stated) + "\n")
                     log.flush()
-                    print(
-                        f"{part} {name} run {number}: {line.get('error', 'done').strip().splitlines()[-1]}", flush=True
-                    )
+                    ended = line.get("error", ended).strip().splitlines()[-1]
+                print(f"{part} {name} run {number}: {ended}", flush=True)
 
 
 def lines_of(folder: Path = FOLDER) -> dict[str, list[dict[str, Any]]]:
@@ -219,6 +247,113 @@ def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
+def number(result: Mapping[str, Any], path: str, factor: float = 1.0, digits: int = 2) -> str:
+    """Return a number of a result as text."""
+    found = value(result, path)
+    return "–" if found is None else f"{factor * found:.{digits}f}"
+
+
+def tools_text(results: Mapping[str, list[dict[str, Any]]]) -> str:
+    """Return the table of tool masks of the frames with outlines drawn by hand, and of the recorded masks of `cutting`."""
+    head = ("recording", "frames", "mean IoU", "worst frame", "tools of more than 2 % of the picture", "of them missed", "tissue called tool, %", "required")  # fmt: skip
+    rows = []
+    for each in (*results["tools"], *results["cutting_masks"]):
+        name, iou = each["recording"], value(each, "iou")
+        least = {"mean of recordings": 0.70, "cutting": 0.80}.get(name, 0.55)
+        required = "–" if iou is None else f"{least:.2f}: {'met' if iou >= least else 'missed'}"
+        if name == "mean of recordings":
+            rows.append((name, "", number(each, "iou"), "", "", "", "", required))
+            continue
+        counts = [number(each, path, digits=0) for path in ("large", "missed")]
+        rows.append(
+            (
+                f"`{name}`" + (" (recorded masks)" if name == "cutting" else ""),
+                number(each, "frames", digits=0),
+                number(each, "iou"),
+                number(each, "iou_min"),
+                *counts,
+                number(each, "false_share", 100.0, 1),
+                required,
+            )
+        )
+    return (
+        "Frames with outlines drawn by hand; none was trained on. Some were looked at in development, `laparoscopy` and `pelvis_stills` decided between checkpoints "
+        "([checks.md](checks.md#tool-masks-tool_maskpy)). A tool is missed if less than 30 % of it is found.\n\n"
+        + table(head, rows)
+    )
+
+
+def gates_text(results: Mapping[str, list[dict[str, Any]]]) -> str:
+    """Return the table of withheld frames of recordings from inside, and of pictures from outside."""
+    inside = [each for each in results["gates"] if "recording" in each]
+    outside = [each for each in results["gates"] if "outside" in each]
+    rows = []
+    for each in inside:
+        out = sum(count for reason, count in each["withheld"].items() if reason.startswith("out of body"))
+        rest = ", ".join(f"{reason} {n}" for reason, n in each["withheld"].items() if not reason.startswith("out of"))
+        rows.append((f"`{each['recording']}`", str(each["frames"]), str(out), rest or "0", "0: met" if not out else "0: missed"))  # fmt: skip
+    passed, pictures = 0, 0
+    for each in outside:
+        evidence = each["evidence"]
+        counts = evidence if isinstance(evidence, Mapping) else {evidence: 1}
+        passed, pictures = passed + counts.get("none", 0), pictures + sum(counts.values())
+    head = ("recording", "frames", "withheld as out of body", "otherwise", "required")
+    return (
+        table(head, rows)
+        + f"\n\nOf {pictures} pictures from outside of a body (3 recorded ones, the others drawn), {passed} show no evidence of it; required: 0."
+    )
+
+
+GEOMETRY = {
+    "stereo": ("Both eyes at rest: depth by matching", "depth", (1.0, 2.0)),
+    "poses": ("Moving eye with its poses, 10 s: depth by parallax, the default", "parallax.depth", (2.0, 4.0)),
+    "poses, breathing": ("… depth by breathing (experimental)", "breathing.depth", (2.0, 4.0)),
+    "blind": ("Moving eye without poses, 10 s: error of the path", "ate", (2.0, 5.0)),
+    "fixed": ("One eye at rest: relief from light (experimental, no default)", "depth", None),
+}
+"""Title, figure, and required median and worst value in per cent, by part of the log."""
+
+
+def geometry_text(results: Mapping[str, list[dict[str, Any]]]) -> str:
+    """Return the table of errors on random recordings. A recording without an estimate counts as the worst."""
+    head = ("estimate", "recordings", "with an estimate", "error, %: median; worst", "best-fit plane, %: median; worst", "smaller error than that plane", "required median; worst")  # fmt: skip
+    rows = []
+    for part, (title, path, most) in GEOMETRY.items():
+        each = [result for result in results.get(part.split(",")[0], []) if "seed" in result]
+        if not each:
+            continue
+        found = [value(result, path) for result in each]
+        planes = [value(result, path.replace("depth", "plane")) for result in each] if "depth" in path else []
+        errors = [math.inf if one is None else 100 * one for one in found]
+        middle, worst = statistics.median(errors), max(errors)
+        known = [100 * one for one in planes if one is not None]
+        below = sum(a is not None and b is not None and a < b for a, b in zip(found, planes, strict=False))
+        met = most is None or (middle <= most[0] and worst <= most[1])
+        rows.append(
+            (
+                title,
+                str(len(each)),
+                str(sum(one is not None for one in found)),
+                f"{_error(middle)}; {_error(worst)}",
+                f"{statistics.median(known):.2f}; {max(known):.2f}" if known else "–",
+                str(below) if planes else "–",
+                f"below the plane on 8 of {len(each)}, or no default: met"
+                if most is None
+                else f"{most[0]:g}; {most[1]:g}: {'met' if met else 'missed'}",
+            )
+        )
+    return (
+        "`synthesize --random`, seeds 1000 to 1009, which development did not use. RMS error over believed tissue, relative to the median depth; of a path, RMS distance after "
+        "the best similarity, relative to its length. Planes are each frame's best-fit plane, fitted to the truth, of recordings with an estimate. A recording without an estimate "
+        "counts as an infinite error. [geometry.md](geometry.md#random-recordings-geometry_randompy) has single recordings and causes.\n\n"
+        + table(head, rows)
+    )
+
+
+def _error(per_cent: float) -> str:
+    return f"{per_cent:.2f}" if math.isfinite(per_cent) else "none"
+
+
 TITLES = {
     "live": "Live at 30 frames/s",
     "live_own_rate": "Live at the recording's own rate",
@@ -254,22 +389,41 @@ def generality_text(folder: Path = FOLDER) -> str:
             parts += [f"## {title}, {name}", live_table(groups) if part.startswith("live") else offline_table(groups)]
             if failed:
                 parts.append("Ended with an error:\n\n" + "\n".join(failed))
-            about = own[0]["machine"]
-            gpu = f"{about['gpu']}, " if "gpu" in about else ""
             parts.append(
-                f"Measured at commit {own[0]['commit']}, {own[0]['date']}, {gpu}{about['cores']} cores of {about['cpu']}, torch {about['torch']}{pauses_text(about)}; "
-                f"{_runs(own)} runs of `{own[0]['command']}` and the same for the other recordings."
+                f"{_origin(own[0])}; {_runs(own)} runs of `{own[0]['command']}` and the same for the other recordings."
             )
+        for title, needed, text_of in (
+            ("Tool masks", ("tools", "cutting_masks"), tools_text),
+            ("Gates", ("gates",), gates_text),
+            ("Geometry of random recordings", tuple(GEOMETRY), geometry_text),
+        ):
+            found = {part: [line for line in lines if line["part"] == part] for part in needed}
+            if not any(found.values()):
+                continue
+            results = {part: [line["result"] for line in own if "result" in line] for part, own in found.items()}
+            firsts = [own[0] for own in found.values() if own]
+            parts += [f"## {title}, {name}", text_of(results)]
+            parts.append(f"{_origin(firsts[0])}; " + ", ".join(f"`{each['command']}`" for each in firsts) + ".")
     if len(parts) == 2:
         parts.append("Not measured yet.")
     return "\n\n".join(parts) + "\n"
+
+
+def _origin(line: Mapping[str, Any]) -> str:
+    """Return commit, date and machine of a log line as text."""
+    about = line["machine"]
+    gpu = f"{about['gpu']}, " if "gpu" in about else ""
+    return (
+        f"Measured at commit {line['commit']}, {line['date']}, {gpu}{about['cores']} cores of {about['cpu']}, torch {about['torch']}"
+        f"{pauses_text(about)}"
+    )
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("recordings", type=Path, nargs="?", default=suite.RECORDINGS, help="folder of recordings")
     parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu")
-    parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
+    parser.add_argument("--parts", nargs="+", choices=[*PARTS, *CHECKS], default=list(PARTS))
     parser.add_argument("--runs", type=int, default=3)
     parser.add_argument("--out", type=Path, help="log (default: benchmarks/logs/generality/DEVICE.jsonl)")
     options = parser.parse_args()

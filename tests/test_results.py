@@ -201,3 +201,59 @@ def test_a_live_row_is_met_only_if_every_run_is_above_the_previous_frame(tmp_pat
     ):
         (tmp_path / "cpu.jsonl").write_text(lines(*runs), encoding="utf-8")
         assert row in generality.generality_text(tmp_path)
+
+
+def test_running_one_part_keeps_the_lines_of_others(tmp_path, monkeypatch):
+    out = tmp_path / "cpu.jsonl"
+    out.write_text("".join(json.dumps(LINE | {"part": part}) + "\n" for part in ("live", "gates", "tools")))
+    ran = []
+
+    def measured(benchmark, number, about):
+        ran.append((benchmark.command, number))
+        yield LINE | about | {"result": {"outside": "x", "evidence": "straight"}}
+
+    monkeypatch.setattr(generality.suite, "measured", measured)
+    monkeypatch.setattr(generality.suite, "machine", lambda device: LINE["machine"])
+    monkeypatch.setattr(generality.suite, "commit", lambda: "def")
+    generality.run(tmp_path / "of", ["gates", "blind"], "cpu", 3, out)
+    lines = [json.loads(line) for line in out.read_text().splitlines()]
+    assert [(line["part"], line["commit"]) for line in lines] == [
+        ("live", "abc"),
+        ("tools", "abc"),
+        ("gates", "def"),
+        ("blind", "def"),
+    ]
+    assert ran == [
+        (f"benchmarks/gates.py {tmp_path}/of --change unchanged --outside", 1),
+        ("benchmarks/geometry_random.py blind", 1),
+    ], "nothing in a check is random, so it is run once"
+
+
+def check_text(tmp_path: Path, part: str, *results: dict[str, object]) -> str:
+    """Return results/generality.md of a log with these results of one check."""
+    lines = [json.dumps(LINE | {"part": part, "recording": "all", "result": result}) + "\n" for result in results]
+    (tmp_path / "cpu.jsonl").write_text("".join(lines), encoding="utf-8")
+    return str(generality.generality_text(tmp_path))
+
+
+def test_a_recording_without_an_estimate_counts_as_the_worst(tmp_path):
+    found = [{"seed": 1, "ate": 0.01}, {"seed": 2, "ate": None}, {"seed": 3, "ate": 0.02}, {"summary": {"ate": 0}}]
+    row = check_text(tmp_path, "blind", *found)
+    assert "error of the path | 3 | 2 | 2.00; none | – | – | 2; 5: missed |" in row
+    row = check_text(tmp_path, "blind", found[0], found[2])
+    assert "error of the path | 2 | 2 | 1.50; 2.00 | – | – | 2; 5: met |" in row
+    stereo = [{"seed": k, "depth": depth, "plane": 0.01} for k, depth in enumerate((0.004, 0.008, 0.021))]
+    assert "| 3 | 3 | 0.80; 2.10 | 1.00; 1.00 | 2 | 1; 2: missed |" in check_text(tmp_path, "stereo", *stereo)
+
+
+def test_tool_masks_and_gates_are_met_by_their_figures(tmp_path):
+    masks = [
+        {"recording": "a", "frames": 2, "iou": 0.54, "iou_min": 0.1, "large": 3, "missed": 1, "false_share": 0.012}
+    ]
+    text = check_text(tmp_path, "tools", *masks, {"recording": "mean of recordings", "iou": 0.71, "iou_min": 0.54})
+    assert "| `a` | 2 | 0.54 | 0.10 | 3 | 1 | 1.2 | 0.55: missed |" in text and "0.70: met" in text
+    held = {"recording": "a", "frames": 9, "withheld": {"out of body: cold light": 2, "blur": 3}}
+    drawn = {"outside": "drawn: wall", "pictures": 3, "evidence": {"straight": 1, "none": 2}}
+    text = check_text(tmp_path, "gates", held, {"outside": "0008", "evidence": "straight"}, drawn)
+    assert "| `a` | 9 | 2 | blur 3 | 0: missed |" in text
+    assert "Of 4 pictures from outside of a body" in text and "2 show no evidence" in text

@@ -69,7 +69,11 @@ def report() -> RunReport:
             "quality": {
                 "live": {"psnr_tissue_db": 38.5, "psnr_frame_db": 39.25, "ssim": 0.97, "frames": 3},
                 "heldout": {"psnr_tissue_db": 33.0, "psnr_frame_db": 34.0, "ssim": 0.9, "frames": 1},
-                "baselines": {"previous_frame_db": 37.25, "heldout_previous_frame_db": 36.0, "heldout_neighbour_mean_db": 24.5},
+                "baselines": {
+                    "previous_frame_db": 37.25,
+                    "heldout_previous_frame_db": 36.0,
+                    "heldout_neighbour_mean_db": 24.5,
+                },
             },
             "model": {"gaussians": 1200, "parameters": 99000, "sha256": "cd" * 32, "version": 4},
             "frames_sha256": "ef" * 32,

@@ -72,7 +72,10 @@ def test_the_command_prints_every_figure_with_its_kind_and_baseline(predicted, t
     print_report(predicted, tmp_path, as_json=False)
     lines = capsys.readouterr().out.splitlines()
     assert "tissue PSNR, displayed frame (training error): 38.50 dB (previous frame shown instead: 37.25 dB)" in lines
-    assert "tissue PSNR, held-out frames: 33.00 dB (previous frame shown instead: 36.00 dB; mean of both neighbours: 24.50 dB)" in lines
+    assert (
+        "tissue PSNR, held-out frames: 33.00 dB (previous frame shown instead: 36.00 dB; mean of both neighbours: 24.50 dB)"
+        in lines
+    )
     assert (
         "tissue PSNR, next frame, predicted before training on it: 36.12 dB (previous frame shown instead: 35.90 dB)"
         in lines
