@@ -19,7 +19,7 @@ import shlex
 import statistics
 import sys
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -77,10 +77,14 @@ def frames_and_rate(recording: Path) -> tuple[int, float]:
         video.release()
 
 
-def commands(root: Path, parts: Iterable[str], device: str) -> Iterator[tuple[str, str, suite.Benchmark]]:
-    """Yield part, name of the recording, and the command that measures it."""
+def commands(
+    root: Path, parts: Iterable[str], device: str, only: Collection[str] = ()
+) -> Iterator[tuple[str, str, suite.Benchmark]]:
+    """Yield part, name of the recording, and the command that measures it; of all recordings, or of those named in `only`."""
     scale = () if device == "cuda" else ("--scale", OFFLINE_CPU_SCALE)
     for name, recording in recordings(root).items():
+        if only and name not in only:
+            continue
         frames, rate = frames_and_rate(recording)
         for part in parts:
             own_rate = part == "live_own_rate"
@@ -101,13 +105,13 @@ def checks(root: Path, parts: Iterable[str], device: str) -> Iterator[tuple[str,
         yield part, "all", suite.Benchmark(f"generality_{part}", command, device, runs=1)
 
 
-def run(root: Path, parts: Iterable[str], device: str, runs: int, out: Path) -> None:
+def run(root: Path, parts: Iterable[str], device: str, runs: int, out: Path, only: Collection[str] = ()) -> None:
     """Write a line to the log for each run of each command, in place of earlier lines of the same parts."""
     date = datetime.now(UTC).strftime("%Y-%m-%d")
     about = {"commit": suite.commit(), "date": date, "machine": suite.machine(device)}
     wanted = tuple(parts)
     chosen = [
-        *commands(root, [part for part in wanted if part in PARTS], device),
+        *commands(root, [part for part in wanted if part in PARTS], device, only),
         *checks(root, [part for part in wanted if part in CHECKS], device),
     ]
     if not chosen:
@@ -424,11 +428,12 @@ def main() -> None:
     parser.add_argument("recordings", type=Path, nargs="?", default=suite.RECORDINGS, help="folder of recordings")
     parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu")
     parser.add_argument("--parts", nargs="+", choices=[*PARTS, *CHECKS], default=list(PARTS))
+    parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="recordings, by their path in the folder")
     parser.add_argument("--runs", type=int, default=3)
     parser.add_argument("--out", type=Path, help="log (default: benchmarks/logs/generality/DEVICE.jsonl)")
     options = parser.parse_args()
     out = options.out or FOLDER / f"{options.device}.jsonl"
-    run(options.recordings.resolve(), options.parts, options.device, options.runs, out)
+    run(options.recordings.resolve(), options.parts, options.device, options.runs, out, options.only)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,46 @@
+#!/usr/bin/env bash
+# Build, run the CUDA tests, and measure every recording with default settings, and four rooms, on one or two NVIDIA GPUs.
+# Usage: benchmarks/gpu_generality.sh OUT [RUNS]
+#   OUT    folder of the logs; OUT/cuda.jsonl is the log for benchmarks/logs/generality, OUT/rooms_cutting.jsonl for logs/cuda
+#   RUNS   runs of each command (default 3)
+# INTRASPLAT_RECORDINGS is the folder of the recordings, PYTHON the interpreter (default python3). With two GPUs, live runs have the
+# first GPU and half of the processor cores for themselves; tests and most offline runs take the other half at the same time.
+set -uo pipefail
+cd "$(dirname "$0")/.."
+out=$(realpath -m "$1") runs=${2:-3} recordings=$(realpath "${INTRASPLAT_RECORDINGS:?names the folder of the recordings}")
+python=${PYTHON:-python3}
+# Offline recordings that the first GPU takes after its live runs.
+late=(cutting heart others/organ_still)
+mkdir -p "$out"
+export PYTHONPATH=$PWD${PYTHONPATH:+:$PYTHONPATH} PYTHONUNBUFFERED=1
+benchmarks/gpu_build.sh > "$out/build.txt" 2>&1 || exit 1
+
+measure() {
+  local name=$1
+  shift
+  "$python" benchmarks/generality.py "$recordings" --device cuda --runs "$runs" --out "$out/$name.part.jsonl" "$@" >> "$out/$name.txt" 2>&1
+}
+tests() { benchmarks/gpu_tests.sh > "$out/tests.txt" 2>&1; }
+live() { measure live --parts live && measure live_own_rate --parts live_own_rate; }
+others() {
+  mapfile -t names < <("$python" -c 'import sys; sys.path.insert(0, "benchmarks"); import generality, pathlib
+print(*(name for name in generality.recordings(pathlib.Path(sys.argv[1])) if name not in sys.argv[2:]), sep="\n")' "$recordings" "${late[@]}")
+  measure offline --parts offline --only "${names[@]}"
+}
+rooms() { "$python" benchmarks/suite.py --device cuda --only rooms_cutting --out "$out" > "$out/rooms.txt" 2>&1; }
+last() { measure offline_late --parts offline --only "${late[@]}"; }
+
+if [ "$(nvidia-smi --list-gpus | wc -l)" -gt 1 ]; then
+  half=$(($(nproc) / 2))
+  (export CUDA_VISIBLE_DEVICES=1; taskset -cp "$half-$((2 * half - 1))" "$BASHPID" > /dev/null; tests; rooms; others) &
+  beside=$!
+  (export CUDA_VISIBLE_DEVICES=0; taskset -cp "0-$((half - 1))" "$BASHPID" > /dev/null; live && last)
+  wait "$beside"
+else
+  tests
+  rooms
+  live
+  others
+  last
+fi
+cat "$out"/live.part.jsonl "$out"/live_own_rate.part.jsonl "$out"/offline.part.jsonl "$out"/offline_late.part.jsonl > "$out/cuda.jsonl"
