@@ -99,6 +99,17 @@ def prediction_db(prediction: Prediction | None) -> float:
 
 
 @dataclass(frozen=True)
+class BetweenNeighbours:
+    """Scores over the held-out frames that have a previous and a next frame."""
+
+    psnr_tissue_db: float
+    """Mean tissue PSNR of the displayed pictures, in dB."""
+    neighbour_mean_db: float
+    """Mean tissue PSNR in dB of the mean of the previous and the next raw frame (trivial baseline, which sees the future)."""
+    frames: int
+
+
+@dataclass(frozen=True)
 class QualityResult:
     """Scores of all displayed frames of a run."""
 
@@ -118,9 +129,8 @@ class QualityResult:
     """Mean tissue PSNR in dB of the previous raw frame over the scored frames (trivial baseline); None if there is none."""
     heldout_previous_frame_db: float | None = None
     """That mean over held-out frames only."""
-    heldout_neighbour_mean_db: float | None = None
-    """Mean tissue PSNR in dB of the mean of the previous and the next raw frame over held-out frames that have both (trivial
-    baseline, which sees the future); None if there is none."""
+    heldout_between: BetweenNeighbours | None = None
+    """Comparison with the mean of the previous and the next raw frame; None if no held-out frame has both."""
 
 
 LOOK_NS = 500_000_000
@@ -278,8 +288,9 @@ class MetricsOp(Operator):
 
     _previous: Frame | None
     """Newest raw frame that the display follows, the trivial baseline for the next frame; None at the start of a stream."""
-    _without_next: tuple[Frame, Frame] | None
-    """Newest held-out frame, after its previous frame, until the next frame arrives; None otherwise."""
+    _without_next: tuple[Frame, Frame, float] | None
+    """Newest held-out frame, after its previous frame and before its own PSNR in dB, until the next frame arrives; None otherwise.
+    """
 
     def __init__(
         self,
@@ -330,7 +341,8 @@ class MetricsOp(Operator):
         self.next_frame = NextFrameScores()
         self.settled, self.before = ScoredMean(), ScoredMean()
         self.before_all, self.before_held_out = ScoredMean(), ScoredMean()
-        self.neighbour_mean = ScoredMean()
+        self.between, self.neighbour_mean = ScoredMean(), ScoredMean()
+        """Pictures of held-out frames with both neighbours, and means of these neighbours."""
         self.worst: tuple[float, int] | None = None
         self.not_on_screen = 0
         self._digest.close()
@@ -434,19 +446,26 @@ class MetricsOp(Operator):
         if tracker is self.held_out:
             self.before_held_out.add(before_db)
             if previous is not None and math.isfinite(before_db):
-                self._without_next = previous, frame
+                self._without_next = previous, frame, quality.psnr_tissue_db
         return ScoredFrame(rendered, quality, before_db, self._next_frame_db(frame, before_db))
 
     def _follow(self, frame: Frame) -> None:
         if not frame.can_be_shown:
             return
         if self._without_next is not None:
-            before, held_out = self._without_next
+            before, held_out, own_db = self._without_next
             self._without_next = None
             if frame.image.shape == held_out.image.shape:
                 mean = (before.image.astype(np.float32) + frame.image) / np.float32(2 * 255)
                 self.neighbour_mean.add(psnr_tissue_db(mean, held_out.image, held_out.tissue))
+                self.between.add(own_db)
         self._previous = frame
+
+    def _between_neighbours(self) -> BetweenNeighbours | None:
+        own_db, mean_db = self.between.mean, self.neighbour_mean.mean
+        if own_db is None or mean_db is None:
+            return None
+        return BetweenNeighbours(own_db, mean_db, self.between.count)
 
     def _log(self, entry: Mapping[str, Value]) -> None:
         if self.log is not None and self._log_works:
@@ -489,7 +508,7 @@ class MetricsOp(Operator):
                     self.frames,
                     previous_frame_db=self.before_all.mean,
                     heldout_previous_frame_db=self.before_held_out.mean,
-                    heldout_neighbour_mean_db=self.neighbour_mean.mean,
+                    heldout_between=self._between_neighbours(),
                 )
             )
         outcome.add(self.next_frame.result)

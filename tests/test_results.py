@@ -246,6 +246,15 @@ def test_a_recording_without_an_estimate_counts_as_the_worst(tmp_path):
     assert "| 3 | 3 | 0.80; 2.10 | 1.00; 1.00 | 2 | 1; 2: missed |" in check_text(tmp_path, "stereo", *stereo)
 
 
+def test_held_out_frames_are_compared_over_the_frames_that_have_both_neighbours(tmp_path):
+    quality = {
+        "heldout": {"psnr_tissue_db": 25.0},
+        "heldout_between": {"psnr_tissue_db": 31.0},
+        "baselines": {"heldout_neighbour_mean_db": 26.5},
+    }
+    assert "| 25.0 | 31.0 | 26.5 | – | – | – | met |" in check_text(tmp_path, "offline", {"quality": quality})
+
+
 def test_tool_masks_and_gates_are_met_by_their_figures(tmp_path):
     masks = [
         {"recording": "a", "frames": 2, "iou": 0.54, "iou_min": 0.1, "large": 3, "missed": 1, "false_share": 0.012}

@@ -97,13 +97,19 @@ def print_report(report: RunReport, out: Path, *, as_json: bool) -> None:
         f"{frames.displayed} of {frames.ingested} frames displayed, {frames.dropped} dropped, in {run.wall_s:.1f} s"
     ]
     baselines = quality.baselines
-    for name, part, previous_db, mean_db in (
+    held_out, between, mean_db = quality.heldout, quality.heldout_between, baselines.heldout_neighbour_mean_db
+    # The first or the last frame of a recording can be held out, and has one neighbour.
+    apart = None
+    if held_out is not None and between is not None and between.frames < held_out.frames:
+        apart, mean_db = mean_db, None
+    for name, part, previous_db, next_db in (
         ("displayed frame (training error)", quality.live, baselines.previous_frame_db, None),
-        ("held-out frames", quality.heldout, baselines.heldout_previous_frame_db, baselines.heldout_neighbour_mean_db),
+        ("held-out frames", held_out, baselines.heldout_previous_frame_db, mean_db),
+        ("held-out frames with both neighbours", between if apart is not None else None, None, apart),
         ("training frames (training error)", quality.training, baselines.previous_frame_db, None),
     ):
         if part is not None:
-            lines += quality_line(name, part.psnr_tissue_db, previous_db, mean_db)
+            lines += quality_line(name, part.psnr_tissue_db, previous_db, next_db)
     lines += next_frame_line(report)
     typer.echo("\n".join(lines))
     typer.echo(str(out / "report.html"))

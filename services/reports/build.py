@@ -31,6 +31,7 @@ from services.reports.figures import hidden_pictures, keyframe_pictures
 from services.reports.html import write_html
 from services.reports.schema import (
     BaselineQuality,
+    BetweenQuality,
     BinEntry,
     DepthErrors,
     FrameCounts,
@@ -194,16 +195,20 @@ def _training_steps(chosen: ChosenSteps) -> TrainingSteps:
 
 def _qualities(outcome: RunOutcome, quality: QualityResult) -> QualityReport:
     offline = outcome.command == "reconstruct"
+    between = quality.heldout_between
     return QualityReport(
         live=None if offline else _quality(quality.trained),
         next_frame=_next_frame(outcome.find(NextFrameResult)),
         truth=_truth(outcome.find(TruthResult)),
         training=_quality(quality.trained) if offline else None,
         heldout=_quality(quality.held_out) if outcome.settings.heldout else None,
+        heldout_between=None
+        if between is None
+        else BetweenQuality(psnr_tissue_db=between.psnr_tissue_db, frames=between.frames),
         baselines=BaselineQuality(
             previous_frame_db=quality.previous_frame_db,
             heldout_previous_frame_db=quality.heldout_previous_frame_db,
-            heldout_neighbour_mean_db=quality.heldout_neighbour_mean_db,
+            heldout_neighbour_mean_db=None if between is None else between.neighbour_mean_db,
         ),
     )
 

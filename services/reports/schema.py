@@ -164,7 +164,8 @@ class BaselineQuality(Part):
     """Mean of all training frames, for every held-out frame; null except in older reports (`evaluate` measures it)."""
     heldout_previous_frame_db: float | None = None
     heldout_neighbour_mean_db: float | None = None
-    """Tissue PSNR in dB of the mean of the previous and the next frame. Uses a future frame."""
+    """Tissue PSNR in dB of the mean of the previous and the next frame, over the frames of `heldout_between`. Uses a future
+    frame."""
 
 
 class DepthErrors(Part):
@@ -196,6 +197,11 @@ class TruthFacts(Part):
     """Errors over tissue behind tools that was seen earlier."""
 
 
+class BetweenQuality(Part):
+    psnr_tissue_db: float
+    frames: Count
+
+
 class QualityReport(Part):
     live: Quality | None
     """Training error: each displayed frame right after training on it. Null for an offline reconstruction."""
@@ -203,6 +209,9 @@ class QualityReport(Part):
     """Prediction score, which is no training error. Null for an offline reconstruction and in older reports."""
     heldout: Quality | None
     """Scores of frames without training; null without `--heldout`."""
+    heldout_between: BetweenQuality | None = None
+    """Scores of the held-out frames that have a previous and a next frame, to compare with
+    `baselines.heldout_neighbour_mean_db`; null if there are none, and in older reports."""
     baselines: BaselineQuality
     truth: TruthFacts | None = None
     """Scores against ground truth. Null if the recording has none of depth or of the tissue behind its tools."""

@@ -58,17 +58,24 @@ def test_held_out_frames_are_compared_with_the_mean_of_both_neighbours(rendered,
         frame(0), frame(1, mask=mask), frame(2, withheld="black"), frame(3, withheld="blur"), frame(4), frame(5), frame(6)
     ]  # fmt: skip
     operator = MetricsOp(None)
-    score(operator, compute, [rendered(frame=each, trained=each.seq not in (1, 5, 6)) for each in given])
+    offsets = {1: 4, 5: 8, 6: 16}
+    scored = score(
+        operator,
+        compute,
+        [rendered(frame=each, trained=each.seq not in offsets, offset=offsets.get(each.seq, 2)) for each in given],
+    )
 
     def expected(before, held_out, after, columns):
         mean = (given[before].image.astype(float) + given[after].image) / 2
         return -10 * math.log10((((mean - given[held_out].image) / 255)[:, :columns] ** 2).mean())
 
-    found = result(operator)[0].heldout_neighbour_mean_db
-    assert found == pytest.approx((expected(0, 1, 3, 12) + expected(4, 5, 6, 24)) / 2, abs=1e-3)
-    assert operator.neighbour_mean.count == 2
+    quality = result(operator)[0]
+    found = quality.heldout_between
+    assert found.neighbour_mean_db == pytest.approx((expected(0, 1, 3, 12) + expected(4, 5, 6, 24)) / 2, abs=1e-3)
+    assert found.psnr_tissue_db == pytest.approx(np.mean([scored[k].quality.psnr_tissue_db for k in (1, 5)]))
+    assert (found.frames, quality.held_out.count) == (2, 3)
     operator.start()
-    assert result(operator)[0].heldout_neighbour_mean_db is None
+    assert result(operator)[0].heldout_between is None
 
 
 def test_the_baseline_is_the_previous_raw_frame(rendered, compute, tmp_path):

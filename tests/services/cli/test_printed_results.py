@@ -32,12 +32,13 @@ class Report(SimpleNamespace):
 def report(**changed: Any) -> Any:
     next_frame = SimpleNamespace(psnr_tissue_db=31.0, previous_frame_db=30.0)
     baselines = SimpleNamespace(previous_frame_db=35.5, heldout_previous_frame_db=None, heldout_neighbour_mean_db=34.5)
-    scores = [SimpleNamespace(psnr_tissue_db=each) for each in (36.25, 33.0)]
+    scores = [SimpleNamespace(psnr_tissue_db=each, frames=4) for each in (36.25, 33.0)]
+    between = SimpleNamespace(psnr_tissue_db=33.5, frames=4)
     given = {
         "notes": ["a note"], "live": SimpleNamespace(**FACTS),
         "frames": SimpleNamespace(ingested=33, displayed=30, dropped=3),
         "run": SimpleNamespace(wall_s=12.34, stop_reason="the stream ended", interrupted=False),
-        "quality": SimpleNamespace(next_frame=next_frame, live=scores[0], heldout=scores[1], training=None, baselines=baselines),
+        "quality": SimpleNamespace(next_frame=next_frame, live=scores[0], heldout=scores[1], training=None, baselines=baselines, heldout_between=between),
     }  # fmt: skip
     return Report(**{**given, **changed})
 
@@ -90,6 +91,13 @@ def test_a_report_is_printed_with_its_baselines(capsys: pytest.CaptureFixture[st
         "tissue PSNR, held-out frames: 33.00 dB (mean of both neighbours: 34.50 dB)",
         "tissue PSNR, next frame, predicted before training on it: 31.00 dB (previous frame shown instead: 30.00 dB)",
         "out/report.html",
+    ]
+    one_at_the_end = SimpleNamespace(psnr_tissue_db=33.5, frames=3)
+    quality = SimpleNamespace(**{**vars(report().quality), "heldout_between": one_at_the_end})
+    print_report(report(quality=quality), Path("out"), as_json=False)
+    assert capsys.readouterr().out.splitlines()[2:4] == [
+        "tissue PSNR, held-out frames: 33.00 dB",
+        "tissue PSNR, held-out frames with both neighbours: 33.50 dB (mean of both neighbours: 34.50 dB)",
     ]
     stopped = SimpleNamespace(wall_s=1.0, stop_reason="", interrupted=True)
     quality = SimpleNamespace(**{**vars(report().quality), "next_frame": None})

@@ -74,6 +74,18 @@ def test_it_says_what_it_must(text):
     assert "prefers-color-scheme: dark" in text
 
 
+def test_held_out_frames_with_one_neighbour_are_told_apart(report, text):
+    assert "with both neighbours" not in text
+    quality = report.quality.model_dump() | {"heldout_between": {"psnr_tissue_db": 26.125, "frames": 2}}
+    quality["heldout"]["frames"] = 3
+    changed = report.model_validate(report.model_dump() | {"quality": quality})
+    rows = re.sub(r"<[^>]*>", "|", render_html(changed, []))
+    assert re.search(r"IntraSplat, held-out frames with both neighbours, 2 frames\|+26\.12", rows)
+    assert re.search(
+        r"Held-out frames with both neighbours: mean of both neighbours \(sees the future\)\|+24\.50", rows
+    )
+
+
 def test_a_series_that_is_summed_up_says_so(report, text):
     binned = report.model_copy(update={"series_frames_per_entry": 12})
     assert "Each point is the mean of 12 frames." in render_html(binned, [])
