@@ -23,7 +23,7 @@ from gsplat_core.endoscope.artefacts import Deinterlacer, FieldOfView, StripDete
 from gsplat_core.endoscope.changes import CutDetector, SharpnessGate
 from gsplat_core.endoscope.out_of_body import BodyGate
 from gsplat_core.endoscope.sequence import (
-    LOOK_EVERY_S,
+    CHECK_EVERY_S,
     OUT_OF_ORDER,
     DepthCheck,
     MaskCheck,
@@ -169,7 +169,7 @@ class PictureStagesOp(StageOp):
 
     def _reset(self) -> None:
         self.pictures.reset()
-        self._turns = Turns(len(self.stages) - 1, LOOK_EVERY_S)
+        self._turns = Turns(len(self.stages) - 1, CHECK_EVERY_S)
         self._settled = False
         """True if the previous frame allows the next to be ordinary: no stage changed its picture or withheld it, and it did not
         begin a scene."""
@@ -189,7 +189,7 @@ class PictureStagesOp(StageOp):
         if ordinary:
             due = self._turns.due(frame.pts_ns)
         else:
-            self._turns.all_looked(frame.pts_ns)
+            self._turns.all_ran(frame.pts_ns)
         for number, stage in enumerate(self.stages[1:]):
             frame = stage.carried(frame) if ordinary and number not in due else stage.apply(frame)
             ordinary = ordinary and _settled(frame, came)

@@ -89,14 +89,14 @@ class DepthCounts:
         if self._estimated:
             unit = "its unit is that of the calibration" if metric else "it is relative: its unit is not known"
             outcome.note(
-                f"the depth of {self._estimated} frames was found in them, of {share:.0%} of their pixels; {unit}"
+                f"depth was estimated from the pictures for {self._estimated} frames, in {share:.0%} of their pixels; {unit}"
             )
         if self.passed_over:
-            outcome.note(f"depth was not looked for in {self.passed_over} frames, for newer ones that had come")
+            outcome.note(f"depth was not estimated for {self.passed_over} frames, because newer ones had arrived")
         for remark in finder.remarks.counted() if finder else ():
             outcome.note(remark)
         for doubt, frames in doubts.items():
-            outcome.note(f"{frames} frames were given no depth: {doubt}")
+            outcome.note(f"{frames} frames got no depth: {doubt}")
         if self._dropped:
             outcome.note(f"the depth that {self._dropped} frames came with was not used (depth is {choice!r})")
 
@@ -116,7 +116,7 @@ def without_depth(choice: str, fields: frozenset[str], config: ReconstructorConf
         ways += [each for each in evidence(config.depth_of_recording, fields) if each not in ways]
     found = f"unless {' or '.join(ways)} show how far away it is, " if ways else ""
     lacking = (
-        f"the recording's depth is left out (depth is {choice!r})"
+        f"the recording's depth is not used (depth is {choice!r})"
         if "depth" in fields
         else "the recording has no depth"
     )

@@ -8,8 +8,9 @@ FOLDER holds the files `test_*.py` of gsplat 1.5.3's source distribution. They a
 
 The tests compare functions with gsplat's own functions in plain torch. With `--oracle`, the folder `gsplat` of an unpacked
 wheel of 1.5.3, these are gsplat's (`cuda/_torch_impl.py`, `cuda/_torch_impl_2dgs.py`, `_rasterization`), and the constants
-are those of 1.5.3. On the CPU `_rasterize_to_pixels_2dgs` stays this package's: gsplat's needs more than 10 GB for its test. Two functions of nerfacc that they call are part of this script. Without it they are this package's
-reference, and the tests compare the compiled functions with that.
+are those of 1.5.3. On the CPU `_rasterize_to_pixels_2dgs` stays this package's, because gsplat's needs more than 10 GB for its
+test. This script contains the two functions of nerfacc that gsplat's functions call. Without `--oracle`, the tests compare the
+compiled functions with this package's reference in `gsplat_core/reference/`.
 """
 
 from __future__ import annotations
@@ -115,7 +116,7 @@ def synthetic_scene(path: Path, points: int, width: int, height: int) -> None:
 
 
 def prepared(source: Path, folder: Path, device: str, chosen: argparse.Namespace) -> str:
-    """Copy the tests for the device; return what the test scene is."""
+    """Copy the tests to `folder`, adapted to the device. Return a description of the test scene."""
     tests = folder / "tests"
     tests.mkdir()
     for path in source.glob("test_*.py"):
@@ -145,9 +146,10 @@ def prepared(source: Path, folder: Path, device: str, chosen: argparse.Namespace
 def run(
     folder: Path, name: str, oracle: bool, timeout_s: float, further: list[str], peer: Path | None = None
 ) -> dict[str, dict[str, Any]]:
-    """Run one file with this package, or with the gsplat in the folder `peer`.
+    """Run one test file with this package, or with the gsplat in the folder `peer`.
 
-    Returns the outcome and the seconds of each test, with the first lines of its failure.
+    Returns:
+        By test, its `outcome`, its duration in `seconds`, and the start of the failure message as `why`.
     """
     report = folder / f"{name}{'' if peer is None else '-peer'}.xml"
     command = [sys.executable]

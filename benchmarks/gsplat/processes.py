@@ -3,7 +3,7 @@
     python benchmarks/gsplat/processes.py
     python benchmarks/gsplat/processes.py --device cuda     # one GPU for each process, over NCCL
 
-All pictures and gradients of one process are compared with those that the processes give together.
+The pictures and gradients of one process are compared with those of several processes together.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def share(values: dict[str, Tensor], rank: int, size: int) -> dict[str, Tensor]:
 
 
 def rendered(values: dict[str, Tensor], weights: Tensor, **options: Any) -> dict[str, Tensor]:
-    """Return the picture, and the gradients of a weighting of it."""
+    """Return the picture, and the gradients of the sum of its values times `weights`."""
     leaves = {name: values[name].detach().clone().requires_grad_() for name in LEAVES}
     image, _, _ = rasterization(
         **leaves, Ks=values["Ks"], width=WIDTH, height=HEIGHT, sh_degree=2, render_mode="RGB+ED", **options

@@ -30,7 +30,7 @@ def config_of_command_line(configs: Mapping[str, tuple[str, Any]]) -> Any:
     """Return the configuration that the first argument names, with the values of the further arguments.
 
     Flags are names of fields, with `.` before the field of a nested object, `_` or `-` between words, and `--no-` before
-    a truth value that is off.
+    the name of a boolean to set it to False.
     """
     name, *words = sys.argv[1:]
     config = configs[name][1]
@@ -138,7 +138,7 @@ class Ssim(torch.nn.Module):
 
 
 class NotMeasured(torch.nn.Module):
-    """NaN for any pictures."""
+    """Metric whose value is always NaN."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__()

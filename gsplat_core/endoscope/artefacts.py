@@ -158,16 +158,17 @@ class FieldOfView:
 
 
 def seen_in_recording(pictures: Iterable[NDArray[np.uint8]]) -> NDArray[np.uint8] | None:
-    """Find the pixels that the scope saw at some time of a recording, without drawn strips and text.
+    """Find the pixels that are inside the field of view at some time of a recording and not covered by drawn strips or text.
 
-    The field of view counts from the first complete window on; in shorter recordings the last one counts. Strips and text
-    are those of the last pictures.
+    Fields of view that were detected before the first complete window (`WINDOW_FRAMES` pictures) are preliminary and
+    ignored. In a shorter recording, the last detected one counts. Strips and text are those detected at the end of the
+    recording.
 
     Args:
         pictures: usable pictures in order, RGB uint8 [H, W, 3], all of one size.
 
     Returns:
-        Mask uint8 [H, W], 1 = seen; None if the whole picture is.
+        Mask uint8 [H, W], 1 = seen; None if the whole picture is seen.
     """
     view, strips = FieldOfView(), StripDetector()
     held: list[NDArray[np.uint8] | None] = []

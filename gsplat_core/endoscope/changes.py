@@ -135,7 +135,8 @@ def colours(one: View, other: View) -> float:
 def structure(one: View, other: View, least: float = -1.0) -> float:
     """Return the median correlation of blocks with the surroundings of their position in the other picture.
 
-    It is 1 if every block is found, and 0.3 to 0.65 for unrelated pictures. The search ends with the result 0 when more than half of the correlations are below `least`.
+    It is 1 if every block is found, and 0.3 to 0.65 for unrelated pictures. The search ends early, with the result 0, when
+    more than half of the correlations are below `least`.
     """
     found: list[float] = []
     below = 0
@@ -154,7 +155,8 @@ def structure(one: View, other: View, least: float = -1.0) -> float:
 def moved(one: View, other: View, enough: float = 1.0) -> float:
     """Return the best correlation of a quarter of one picture anywhere in the other.
 
-    It is 1 if a quarter is found, and 0.4 to 0.8 for unrelated pictures. The search ends at a correlation of `enough`.
+    It is 1 if a quarter is found, and 0.4 to 0.8 for unrelated pictures. The search ends early at a correlation of at least
+    `enough`.
     """
     best = 0.0
     for parts, around in ((one.quarters, other.detail), (other.quarters, one.detail)):

@@ -293,15 +293,21 @@ class Turns:
     due at another time, spread evenly over the period.
     """
 
-    def __init__(self, looks: int, every_s: float) -> None:
-        self._looks, self._every_ns = looks, round(1e9 * every_s)
-        self._due_ns: list[int] = [0] * looks
+    def __init__(self, checks: int, every_s: float) -> None:
+        """Create a schedule in which every check is due at the first picture.
+
+        Args:
+            checks: number of checks; their indices count from 0.
+            every_s: period of each check in seconds.
+        """
+        self._checks, self._every_ns = checks, round(1e9 * every_s)
+        self._due_ns: list[int] = [0] * checks
         self._last_ns = 0
 
-    def all_looked(self, pts_ns: int) -> None:
+    def all_ran(self, pts_ns: int) -> None:
         """Record that all checks ran on the picture at `pts_ns`, and schedule the next ones."""
         self._last_ns = pts_ns
-        self._due_ns = [pts_ns + self._every_ns * (k + 1) // self._looks for k in range(self._looks)]
+        self._due_ns = [pts_ns + self._every_ns * (k + 1) // self._checks for k in range(self._checks)]
 
     def due(self, pts_ns: int) -> frozenset[int]:
         """Return the indices of the checks that are due up to half a frame interval after this time, and schedule them again."""
@@ -324,7 +330,7 @@ LEAST_CHANGE = 0.2
 """Mean change of a horizontal band, in levels of 255, below which a picture may be a repetition and is not ordinary."""
 
 
-LOOK_EVERY_S = 0.2
+CHECK_EVERY_S = 0.2
 """Interval in seconds at which each detailed check runs in any case (every sixth frame at 30
 frames/s), and at which the reference is renewed.
 """
@@ -375,7 +381,7 @@ class OrdinaryPictures:
         self._usual = np.where(usual > 0, usual + USUAL_DECAY * (np.minimum(change, 3 * usual) - usual), change)
         if not (expected and in_time and self._matches_reference(colour, sharpness)):
             return self._renew_reference(colour, sharpness, pts_ns)
-        if pts_ns >= self._referenced_ns + 1e9 * LOOK_EVERY_S:
+        if pts_ns >= self._referenced_ns + 1e9 * CHECK_EVERY_S:
             self._renew_reference(colour, sharpness, pts_ns)
         return True
 

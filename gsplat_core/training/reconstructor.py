@@ -102,7 +102,7 @@ class Reconstructor:
         self._slots, self._version = SnapshotSlots(self.device, rows=self._fixed_rows), 0
         self._first_time_s = self._last_time_s = self._learned_s = 0.0
         self._certain: tuple[Frame, Observation] | None = None
-        """Newest frame that surely shows the current scene (not observed as `doubtful`), and its observation; None before."""
+        """Newest frame that was not observed as `doubtful`, and so shows the current scene, with its observation; None before."""
         self._depth_source: DepthSource | None = None
         self.depth_doubts: Mapping[str, int] = {}
         """Reasons for frames without depth in the last `fit`, each with its number of frames; for moving cameras."""
@@ -164,7 +164,8 @@ class Reconstructor:
             budget: training budget of the frame; None for the configured number of steps.
             steps: shorthand for `budget=Budget.of_steps(steps)`.
             train: False only advances the time.
-            doubtful: the frame may not belong to the scene. If the scene ends with it, the state before it is left.
+            doubtful: the frame may belong to the next scene. If the scene ends with this frame, the scene is stored in its
+                state before the frame.
 
         Raises:
             InvalidInput: if the first frame is not trained on, if time runs backwards, or if the

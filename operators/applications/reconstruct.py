@@ -274,7 +274,7 @@ class _Fitting:
         if steps is None and not self._is_stopped:
             self._notes.append(chosen.sentence)
         for doubt, count in sorted(learning.depth_doubts.items()):
-            self._notes.append(f"{count} key frames were given no depth to learn from: {doubt}")
+            self._notes.append(f"{count} key frames got no depth to train on: {doubt}")
         return Fitted(
             learning.with_depth_errors(learning.snapshot()),
             inputs.eyes,

@@ -1,7 +1,7 @@
 """Deterministic replay: frame-by-frame reconstruction, display and scoring of a recording or finite source.
 
 Timestamps come from the recording, the work per frame is a fixed number of steps, and no frame is dropped. The same recording, settings and device
-therefore give the same `frames_sha256`. A recorded session is replayed faithfully, with its prepared frames, calls and settings.
+therefore give the same `frames_sha256`. A recorded session is repeated exactly, with its prepared frames, training calls and settings.
 """
 
 from __future__ import annotations
@@ -321,7 +321,7 @@ def followed_session(settings: ReplaySettings, notes: list[str]) -> FollowedSess
     made = reader.made
     why = None
     if made is None:
-        why = "its beginning is not there any more, or it has no schedule"
+        why = "its beginning was deleted, or it has no schedule"
     elif settings.given_scale != 1 or settings.heldout or settings.steps_per_frame is not None:
         why = "scale, held-out frames or steps per frame were given, which it does not have"
     if made is None or why is not None:
@@ -340,6 +340,6 @@ def followed_session(settings: ReplaySettings, notes: list[str]) -> FollowedSess
             f"{path}: its schedule has settings that this version does not take ({first}); give --ignore-schedule"
         ) from error
     if made.device != settings.device:
-        notes.append(f"the session ran on {made.device}: on {settings.device} its pictures come out otherwise")
+        notes.append(f"the session ran on {made.device}: on {settings.device} its pictures differ")
     source = SessionSource(reader, open_recording(path), max_frames=settings.max_frames)
     return FollowedSession(reader, source, made, config, training, settings.device)

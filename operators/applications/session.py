@@ -323,10 +323,17 @@ class FirstFrames:
 
 
 def judged(source: FrameSource) -> JudgedSource:
-    """Return a closed source whose pictures that show nothing are withheld, and whose pixels that the scope does not see, such as
-    those outside of a round view, are excluded from the loss.
+    """Wrap a source for offline runs, which have no checks of a stream.
 
-    The source is read once. Held-out frames are not examined. A source that can be read only once has no pixels excluded.
+    Frames whose picture shows nothing (black, single-coloured or noise) are withheld. Pixels that the scope never saw, such
+    as those outside of a round view, are excluded from the loss. To find them, all frames but the held-out ones are read
+    once. If the source cannot be read again, no pixels are excluded.
+
+    Returns:
+        The wrapped source, not open.
+
+    Raises:
+        RecordingError: a frame cannot be read.
     """
     about, bare = source.description, JudgedSource(source)
     if about.digest is None or about.frame_count is None:

@@ -110,10 +110,11 @@ class PosedSource(DerivedSource):
 
 
 class JudgedSource(DerivedSource):
-    """`FrameSource` that withholds the frames of another source whose picture shows nothing, such as a black one, and excludes
-    pixels that the scope does not see.
+    """`FrameSource` that withholds frames of another source whose picture shows nothing, such as a black one, and excludes
+    given pixels from the loss.
 
-    Unlike the checks of a stream, it judges each picture alone, so that a frame has the same verdict whenever it is read.
+    Unlike the checks of a stream, it examines each picture alone. The result for a frame is therefore the same each time
+    that the frame is read.
     """
 
     def __init__(self, source: FrameSource, seen: NDArray[np.uint8] | None = None) -> None:
@@ -121,7 +122,7 @@ class JudgedSource(DerivedSource):
 
         Args:
             source: opened and closed together with this one.
-            seen: pixels of all pictures that the scope sees, uint8 [H, W], 0 = excluded from the loss; None for all.
+            seen: mask for all pictures, uint8 [H, W], 0 = excluded from the loss; None to exclude no pixel.
         """
         super().__init__(source, source.description)
         self._seen = seen
@@ -200,9 +201,8 @@ class SplitSource(DerivedSource):
 class JoinedSource(LiveSource):
     """Pairs each frame of the left source with the frame of the right source closest in arrival time.
 
-    A left frame waits for its right one for at most half a frame interval. Without one it is
-    emitted alone and counted
-    as `without_right`, so that a lost eye never interrupts the stream.
+    A left frame waits for its right one for at most half a frame interval. Without one it is emitted alone and counted as
+    `without_right`, so that a lost eye never interrupts the stream.
     """
 
     def __init__(self, left: FrameSource, right: FrameSource, *, waiting: int = 2) -> None:

@@ -80,8 +80,8 @@ class FrameOrder:
         return self._counts
 
     def begin(self) -> None:
-        """Forget the previous stream. The next frame gets number 0 and time 0. If the sender is trusted, it keeps
-        its own number and timestamp."""
+        """Discard the state of the previous stream. The next frame gets number 0 and time 0, or keeps its own number and
+        timestamp if the sender is trusted."""
         self._counts.clear()
         self._out: Frame | None = None  # last frame that was passed on, with repaired number and timestamp
         self._in: Frame | None = None  # the same frame as it was received
@@ -258,12 +258,12 @@ class LiveSource(ThreadedSource):
         """State of the source as a sentence."""
         name, state = self.description.name, self.state
         if state is SourceState.RECONNECTING:
-            return self._lost or f"the connection to {name} is being made again"
+            return self._lost or f"the connection to {name} is being re-established"
         if state is SourceState.STALLED:
-            return f"{name} has given no frame for {time.monotonic() - self._last_s:.1f} s"
+            return f"{name} has delivered no frame for {time.monotonic() - self._last_s:.1f} s"
         if state is SourceState.ENDED:
             return self._ending or f"{name} is not open"
-        return f"{name} gives frames"
+        return f"{name} delivers frames"
 
     def counts(self) -> Mapping[str, int]:
         """Return the numbers of dropped or repaired items since `open`, by reason."""
@@ -289,7 +289,7 @@ class LiveSource(ThreadedSource):
         self._ending = None
 
     def _ended(self, error: BaseException | None) -> None:
-        self._ending = f"{self.description.name} has given its last frame" if error is None else str(error)
+        self._ending = f"{self.description.name} has delivered its last frame" if error is None else str(error)
         self._lost = None
 
     def _run(self, stop: threading.Event) -> None:

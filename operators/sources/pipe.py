@@ -212,7 +212,7 @@ class PipeSource(StreamSource):
                 if not self._again:
                     return
                 if seq > given:
-                    self.lost(f"nobody writes to {self._name} any more; another writer is waited for")
+                    self.lost(f"the writer of {self._name} has closed it; waiting for another writer")
                 given, self._pending = seq, b""
                 self.wait(LOOK_S)
                 if self._describes_itself:
@@ -228,7 +228,7 @@ class PipeSource(StreamSource):
                 line = self._line(None)
                 if not line.startswith(FRAME):
                     raise SourceLost(
-                        f"{self._name} is out of step: {line[:16]!r} stands where a frame begins. Start its writer again."
+                        f"{self._name} is out of sync: {line[:16]!r} instead of the start of a frame. Restart its writer."
                     )
             yield self._exactly(self._raw.frame_bytes)
 

@@ -584,7 +584,7 @@ class ProcessSource(LiveSource):
                 self._note(message)
                 stalls = self._child_state is not None and self._child_state[0] is SourceState.STALLED
                 if stalls and child.message_s - last_s > self._stuck_after_s:
-                    raise ChildLost(f"it has given no frame for {self._stuck_after_s:g} s")
+                    raise ChildLost(f"it has delivered no frame for {self._stuck_after_s:g} s")
 
     def _frame(self, child: ChildProcess, message: dict[str, Any]) -> Frame:
         try:

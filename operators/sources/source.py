@@ -250,7 +250,7 @@ class ThreadedSource:
         self.interrupt()
         thread.join(self.close_timeout_s)
         if thread.is_alive():
-            log.warning("%s does not end; it is left behind", thread.name)
+            log.warning("%s does not end; it is abandoned", thread.name)
         with self._changed:
             self._ready.clear()
             self._done, self._error = True, None

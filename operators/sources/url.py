@@ -250,7 +250,7 @@ class ConnectedSource(StreamSource):
                     connection = None
             delay_s = backoff.failed()
             self.lost(
-                f"the connection to {self.description.name} is lost ({why}); attempt {backoff.failures} to make it again follows in {delay_s:g} s"
+                f"the connection to {self.description.name} is lost ({why}); attempt {backoff.failures} to reconnect follows in {delay_s:g} s"
             )
             if self.wait(delay_s):
                 return

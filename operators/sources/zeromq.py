@@ -241,7 +241,7 @@ class ZeroMqSource(StreamSource):
         if self._monitor in found:
             if recv_monitor_message(self._monitor)["event"] == zmq.EVENT_DISCONNECTED:
                 self._lost_s = now_s
-                self.lost(f"the connection to {self._name} is lost; it is being made again")
+                self.lost(f"the connection to {self._name} is lost; it is being re-established")
             else:
                 self._lost_s = math.inf
         if self._socket not in found:

@@ -216,10 +216,12 @@ WAITING = ("uploaded", "validated")
 class Client(ReplayMethods, SnapshotMethods):
     """Client of one server with one API key.
 
-        with Client("http://127.0.0.1:8000", key) as client: version = client.upload("liver", Path("liver.isplat"))
-        client.checked("liver", version.version) client.activate("liver", version.version, expected_current=None)
+        with Client("http://127.0.0.1:8000", key) as client:
+            version = client.upload("liver", Path("liver.isplat"))
+            client.checked("liver", version.version)
+            client.activate("liver", version.version, expected_current=None)
 
-    All methods raise Unreachable and Refused.
+    All methods raise Unreachable if the server does not answer, and Refused if it rejects the request.
     """
 
     def __init__(self, url: str, key: str, *, timeout_s: float = TIMEOUT_S, verify: bool | str = True) -> None:

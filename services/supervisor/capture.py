@@ -249,7 +249,7 @@ class Capture:
                 given_s = time.monotonic()
                 self._send(frame, publisher)
                 backoff.worked()
-                worker.say("live", f"{source.description.name} gives frames")
+                worker.say("live", f"{source.description.name} delivers frames")
             else:
                 state = source.state
                 worker.say(state.value, _sentence(source))
@@ -257,7 +257,7 @@ class Capture:
                     worker.wait(LOOK_S)
                 elif time.monotonic() - given_s > stuck_after_s:
                     log.error(
-                        "the camera's driver has given nothing for %g s; the process ends to be started again",
+                        "the camera's driver has delivered nothing for %g s; the process exits and is restarted",
                         stuck_after_s,
                     )
                     os._exit(FAILED)  # the thread blocked in the driver cannot be ended otherwise

@@ -89,7 +89,7 @@ def test_the_newest_frame_is_next_and_the_others_are_counted(beside, estimator, 
     outcome = OutcomeBuilder()
     beside.counts.contribute(outcome, "gated", beside.finder)
     assert outcome.find(FoundDepth).passed_over == 2
-    assert "depth was not looked for in 2 frames, for newer ones that had come" in outcome.notes
+    assert "depth was not estimated for 2 frames, because newer ones had arrived" in outcome.notes
 
 
 def test_the_newest_depth_is_taken_where_two_were_found(beside, estimator, frame):

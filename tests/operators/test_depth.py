@@ -95,7 +95,7 @@ def test_what_is_found_counts_where_it_is_believed(frame, compute, registered):
     outcome = outcome_of(operator)
     assert outcome.find(FoundDepth) == FoundDepth({"light": 1}, 0.5, False, {})
     assert outcome.notes == (
-        "the depth of 1 frames was found in them, of 50% of their pixels; it is relative: its unit is not known",
+        "depth was estimated from the pictures for 1 frames, in 50% of their pixels; it is relative: its unit is not known",
     )
 
 
@@ -105,7 +105,7 @@ def test_a_doubted_depth_is_not_used_and_the_doubt_is_said(frame, compute, regis
     for seq in range(3):
         (passed,) = compute(operator, frame=frame(seq))
         assert passed.depth is None
-    assert outcome_of(operator).notes == ("3 frames were given no depth: the eyes are swapped",)
+    assert outcome_of(operator).notes == ("3 frames got no depth: the eyes are swapped",)
 
 
 def test_an_estimator_gets_the_camera_where_the_frame_was_taken(frame, compute, registered):
@@ -132,7 +132,7 @@ def test_it_is_said_what_a_model_without_depth_means():
     config = ReconstructorConfig()
     assert without_depth("auto", frozenset({"depth"}), config) is None
     said = without_depth("none", frozenset({"depth"}), config)
-    assert said.startswith("the recording's depth is left out (depth is 'none'): the scene starts on a plane")
+    assert said.startswith("the recording's depth is not used (depth is 'none'): the scene starts on a plane")
     assert without_depth("auto", frozenset(), config).startswith(
         "the recording has no depth: the scene starts on a plane"
     )
@@ -217,10 +217,10 @@ def test_counts_of_depth_are_shares_and_sentences(frame):
     assert result.passed_over == 5 and result.doubts == {"dark": 4}
     text = " | ".join(outcome.notes)
     for said in (
-        "the depth of 1 frames was found in them, of 62% of their pixels",
-        "not looked for in 5 frames",
+        "depth was estimated from the pictures for 1 frames, in 62% of their pixels",
+        "not estimated for 5 frames",
         "it was slow",
-        "4 frames were given no depth: dark",
+        "4 frames got no depth: dark",
         "the depth that 1 frames came with was not used (depth is 'stereo')",
     ):
         assert said in text
@@ -239,7 +239,7 @@ def test_without_frames_there_is_nothing_to_say():
     [
         ("auto", {"depth"}, False, None),
         ("recorded", {"depth"}, False, None),
-        ("none", {"depth"}, False, "the recording's depth is left out (depth is 'none'): the scene"),
+        ("none", {"depth"}, False, "the recording's depth is not used (depth is 'none'): the scene"),
         ("auto", set(), False, "the recording has no depth: the scene"),
         ("auto", {"right_image"}, False, "unless the two eyes show"),
         ("stereo", {"right_image"}, False, "unless the two eyes show"),

@@ -56,9 +56,9 @@ class MCMCStrategy(Strategy):
     noise_lr: float = 5e5
     """Factor of the noise, multiplied by the learning rate of the positions."""
     refine_start_iter: int = 500
-    """Step after which Gaussians move and grow in number."""
+    """Step after which dead Gaussians are moved and copies are added."""
     refine_stop_iter: int = 25_000
-    """Step at which Gaussians stop to move and grow in number."""
+    """Step at which moves and additions of Gaussians end."""
     refine_every: int = 100
     """Number of training steps between two refinements, in which dead Gaussians move and copies are added."""
     min_opacity: float = 0.005
@@ -196,10 +196,15 @@ MOST_DEATHS = 0.05
 
 @torch.no_grad()
 def birth_death(step: TrainingStep, shares: Shares, count: int) -> None:
-    """Remove invisible Gaussians and draw deaths, then split drawn parents until there are `count`.
+    """Remove invisible Gaussians and randomly drawn others, then split randomly drawn parents until there are `count` Gaussians.
 
-    Each is split once at most. Nothing changes if `count` or more would remain. The same scene at the same step gives
-    the same moves.
+    Each parent is split at most once. Nothing changes if `count` or more Gaussians would remain. The random numbers depend
+    only on the number of the step, so that the same scene gives the same changes.
+
+    Args:
+        step: scene and optimiser.
+        shares: visibility of each Gaussian.
+        count: wanted number of Gaussians.
     """
     gaussians = step.gaussians
     phi = (step.mean_gradients("logit_opacities") / (1 - gaussians.opacities).clamp(min=1e-3)).cpu().double()
@@ -220,7 +225,7 @@ def birth_death(step: TrainingStep, shares: Shares, count: int) -> None:
 
 
 def _first(waiting: Tensor, most: int) -> Tensor:
-    """Mark the `most` smallest of the waiting times [N], bool [N]."""
+    """Return a mask, bool [N], of the `most` smallest waiting times [N]."""
     marks = torch.zeros(len(waiting), dtype=torch.bool)
     marks[waiting.argsort(stable=True)[:most]] = True
     return marks
@@ -229,8 +234,8 @@ def _first(waiting: Tensor, most: int) -> Tensor:
 def relocated(parents: Gaussians) -> tuple[Gaussians, Gaussians]:
     """Replace each Gaussian by two copies with the opacity and the scale that keep the picture.
 
-    o' = 1 - √(1 - o) and s' = s o / (2 o' - o'²/√2). The centres are apart as those of `halves`, because copies at one place
-    would have equal gradients for ever.
+    o' = 1 - √(1 - o) and s' = s o / (2 o' - o'²/√2). The centres are separated as by `halves`, because copies at one place
+    would always have equal gradients.
     """
     before = parents.opacities.double().clamp(1e-6, 1 - 1e-6)
     after = 1 - (1 - before).sqrt()

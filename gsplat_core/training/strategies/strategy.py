@@ -286,7 +286,11 @@ def _sampled(
 
 @torch.no_grad()
 def duplicate(params: Params, optimizers: Optimizers, state: State, mask: Tensor) -> None:
-    """Append a copy of each Gaussian in `mask`, bool [N]. Copies start with zero moments."""
+    """Append a copy of each Gaussian in `mask`, bool [N]. Copies start with zero moments.
+
+    Raises:
+        InvalidParameters: if `mask` has another type or length, or a trainable parameter has no optimiser.
+    """
     chosen = _checked(params, mask).nonzero()[:, 0]
     _append(params, optimizers, chosen, lambda name, tensor: tensor[chosen])
     for name, rows in _rows_of(state):
@@ -314,6 +318,9 @@ def split(
         mask: Gaussians to split.
         revised_opacity: give the samples the opacity 1 - √(1 - o), which keeps the picture (Rota Bulò et al. 2024).
         generator: source of the random numbers, on the device of `mask`.
+
+    Raises:
+        InvalidParameters: if `mask` has another type or length, or a trainable parameter has no optimiser.
     """
     mask = _checked(params, mask)
     rearrange(params, optimizers, state, multiplied(params, torch.zeros_like(mask), mask, revised_opacity, generator))
@@ -321,7 +328,11 @@ def split(
 
 @torch.no_grad()
 def remove(params: Params, optimizers: Optimizers, state: State, mask: Tensor) -> None:
-    """Remove the Gaussians in `mask`, bool [N]; the others keep their order and moments."""
+    """Remove the Gaussians in `mask`, bool [N]; the others keep their order and moments.
+
+    Raises:
+        InvalidParameters: if `mask` has another type or length, or a trainable parameter has no optimiser.
+    """
     rest = (~_checked(params, mask)).nonzero()[:, 0]
     rearrange(params, optimizers, state, Rows(rest, len(rest)))
 
@@ -362,6 +373,9 @@ def relocate(
         binoms: see `compute_relocation`.
         min_opacity: smallest opacity after the move.
         generator: source of the random numbers, on the device of `mask`.
+
+    Raises:
+        InvalidParameters: if `mask` has another type or length, or a trainable parameter has no optimiser.
     """
     mask = _checked(params, mask)
     dead, alive = mask.nonzero()[:, 0], (~mask).nonzero()[:, 0]
@@ -379,7 +393,7 @@ def relocate_rows(
     min_opacity: float,
     generator: torch.Generator | None,
 ) -> None:
-    """Move the Gaussians in the rows `dead` to places of those in `alive`, int64 each; otherwise as `relocate`."""
+    """Move the Gaussians in the rows `dead` to places of those in `alive`, both int64 row numbers; otherwise as `relocate`."""
     weights = params["opacities"][alive].sigmoid().flatten()
     places = alive[draw(weights, len(dead), generator)]
     shared = _shared(params, places, binoms, min_opacity)
@@ -587,8 +601,8 @@ def every_of(steps: int) -> int:
 NAMES = {"log_scales": "scales", "logit_opacities": "opacities"}
 """Names of tensors in gsplat by their names in `Gaussians`, where the two differ."""
 SOURCE = "source row"
-"""Name of an auxiliary parameter of former row numbers. After a strategy's changes it tells from which Gaussian each row was
-copied.
+"""Name of an auxiliary parameter that holds row numbers. After a strategy's changes, its value is the former row from which each
+Gaussian was copied.
 """
 
 
@@ -602,8 +616,9 @@ def views_of(step: TrainingStep) -> dict[str, Parameter]:
 def change_rows(step: TrainingStep, state: dict[str, Any], change: Callable[[Params, Optimizers], None]) -> None:
     """Change a scene's Gaussians by functions in gsplat's calling convention.
 
-    A further parameter of row numbers takes part in all row operations. It states the source of each row, from which the
-    deformation field's rows follow. Extra tensors and Adam's moments take part like any other.
+    An auxiliary parameter of row numbers (`SOURCE`) goes through all row operations. Its result states the source of each
+    row, by which the rows of the deformation field are rearranged. Extra tensors and Adam's moments are changed like those
+    of any other parameter.
 
     Args:
         step: scene and optimiser.

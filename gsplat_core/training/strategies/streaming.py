@@ -59,8 +59,8 @@ def shares_of(step: TrainingStep, observations: Sequence[Observation]) -> Shares
 
 @torch.no_grad()
 def on_tissue(step: TrainingStep, observations: Sequence[Observation]) -> Tensor:
-    """Return which Gaussians have their centre on tissue in at least one picture, bool [N]; all if
-    a camera is not a pinhole.
+    """Return a mask, bool [N], of the Gaussians whose centre is on tissue in at least one picture; all True if a camera is not a
+    pinhole.
     """
     if any(one.camera.model != "pinhole" for one in observations):
         return torch.ones(step.gaussians.count, dtype=torch.bool, device=step.gaussians.device)
@@ -129,9 +129,14 @@ class Rounds:
 
 @torch.no_grad()
 def densify(step: TrainingStep, shares: Shares, count: int) -> None:
-    """Remove invisible Gaussians, and split those with the largest error, each once at most, until there are `count`.
+    """Remove invisible Gaussians, and split those with the largest error until there are `count` Gaussians.
 
-    Nothing changes if `count` or more would remain.
+    Each is split at most once. Nothing changes if `count` or more Gaussians would remain.
+
+    Args:
+        step: scene and optimiser.
+        shares: visibility and error of each Gaussian.
+        count: wanted number of Gaussians.
     """
     unseen = shares.seen_px < UNSEEN_PX
     left = step.gaussians.count - int(torch.count_nonzero(unseen))

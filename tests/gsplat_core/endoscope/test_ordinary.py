@@ -38,7 +38,7 @@ def test_most_pictures_of_an_even_stream_are_ordinary(stream):
 def test_a_change_that_is_slower_than_what_pictures_are_compared_with_is_renewed_is_ordinary(stream):
     dimmed = [np.clip(picture * (1 - 0.001 * k), 0, 255).astype(np.uint8) for k, picture in enumerate(stream)]
     wide = {"MOST_CHANGE_RATIO": 50.0, "LEAST_CHANGE_RATIO": 0.01}
-    renewed, kept = (judged(dimmed, LOOK_EVERY_S=every_s, **wide)[10:] for every_s in (0.2, 30.0))
+    renewed, kept = (judged(dimmed, CHECK_EVERY_S=every_s, **wide)[10:] for every_s in (0.2, 30.0))
     assert all(renewed) and not all(kept)
 
 
@@ -66,7 +66,7 @@ def test_no_faulty_picture_is_ordinary(stream, rng, fault):
 
 def test_a_slow_change_is_looked_at_before_it_is_large(stream):
     dimmed = [np.clip(picture * (1 - 0.004 * k), 0, 255).astype(np.uint8) for k, picture in enumerate(stream)]
-    assert judged(dimmed, LOOK_EVERY_S=30.0).count(False) > 5
+    assert judged(dimmed, CHECK_EVERY_S=30.0).count(False) > 5
 
 
 def test_a_gap_or_a_step_back_in_time_is_not_ordinary(stream):

@@ -83,7 +83,9 @@ def test_a_stall_is_a_state_with_a_sentence_and_is_counted_when_it_is_over(camer
     hold = threading.Event()
     source = opened(Scripted([frame(0), hold, frame(1)], camera, stalled_after_s=0.0))
     assert source.read(SOON_S).seq == 0
-    assert source.state is SourceState.STALLED and source.state_sentence.startswith("camera 1 has given no frame for")
+    assert source.state is SourceState.STALLED and source.state_sentence.startswith(
+        "camera 1 has delivered no frame for"
+    )
     hold.set()
     assert source.read(SOON_S).seq == 1
     assert source.counts()["stalls"] >= 1

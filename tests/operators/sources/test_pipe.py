@@ -88,7 +88,7 @@ def test_a_writer_that_goes_and_one_that_comes(fifo, reading):
     assert [int(stream.frame().image[0, 0, 0]) for _ in range(2)] == [1, 2]
     first.close()
     stream.until(lambda: stream.source.state is SourceState.RECONNECTING)
-    assert "another writer is waited for" in stream.source.state_sentence
+    assert "waiting for another writer" in stream.source.state_sentence
     second = Writer(fifo)
     second.write(flat(4))
     frame = stream.frame()
@@ -212,11 +212,11 @@ def test_a_header_that_makes_no_sense_is_a_sentence(fifo, written, header):
         open_source(f"pipe:{fifo}")
 
 
-def test_a_writer_that_is_out_of_step_is_said_to_be(fifo, reading, written):
+def test_a_writer_that_is_out_of_sync_is_reported(fifo, reading, written):
     written(fifo, b"YUV4MPEG2 W6 H4 F25:1 Cmono\n", b"FRAME\n", bytes(24), b"12345678\n")
     stream = reading(open_source(f"pipe:{fifo}", ALL))
     assert stream.frame().seq == 0
-    with pytest.raises(SourceLost, match="out of step: b'12345678' stands where a frame begins"):
+    with pytest.raises(SourceLost, match="out of sync: b'12345678' instead of the start of a frame"):
         stream.source.read(30)
 
 

@@ -169,7 +169,7 @@ def test_a_source_that_is_stuck_in_its_driver_gets_another_process(stand_in):
     source.open()
     assert read(source).seq == 0
     until(lambda: source.state is SourceState.STALLED)
-    assert source.state_sentence.startswith("stand-in has given no frame for")
+    assert source.state_sentence.startswith("stand-in has delivered no frame for")
     assert read(source).seq == 1 and source.counts()["process_restarts"] == 1
 
 

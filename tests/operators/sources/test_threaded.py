@@ -129,7 +129,7 @@ def test_a_reader_that_does_not_end_is_left_behind_and_never_gives_frames_to_a_l
     source.open()
     assert source.read(SOON_S).seq == 0
     source.close()
-    assert "read listed does not end; it is left behind" in caplog.text
+    assert "read listed does not end; it is abandoned" in caplog.text
     source.script = [frame(7)]
     source.open()
     stuck.set()

@@ -179,7 +179,7 @@ def test_a_video_by_http_ends_with_its_last_frame(web, tmp_path, reading):
     stream = reading(open_source(f"{web}/video.mp4", SourceOptions(process=False, waiting=64)))
     assert [stream.frame().seq for _ in range(30)] == list(range(30))
     assert stream.source.read(SOON_S) is None and stream.source.state is SourceState.ENDED
-    assert stream.source.state_sentence.endswith("has given its last frame")
+    assert stream.source.state_sentence.endswith("has delivered its last frame")
 
 
 @pytest.mark.slow

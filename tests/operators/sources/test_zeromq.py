@@ -100,7 +100,7 @@ def test_a_sender_that_goes_and_comes_back(sending, reading, tmp_path):
     before = stream.frame()
     first.close()
     stream.until(lambda: stream.source.state is SourceState.RECONNECTING)
-    assert "is being made again" in stream.source.state_sentence
+    assert "is being re-established" in stream.source.state_sentence
     while (last := stream.source.read(0)) is not None:
         before = last
     second = sending(endpoint)

@@ -231,7 +231,7 @@ def test_a_source_is_opened_again_after_errors_and_waits_longer_each_time(monkey
     worker, publisher, capture, before = published(monkeypatch, none, none, first, none, second, most=3)
     assert [state for state, _ in worker.said] == ["opening", "opening", "live", "live", "lost", "opening", "live"]
     assert worker.said[0][1] == "connection refused" and worker.said[4][1] == "cable unplugged"
-    assert worker.said[2][1] == "a camera gives frames"
+    assert worker.said[2][1] == "a camera delivers frames"
     assert 0 < worker.waits[0] < worker.waits[1] and worker.waits[2] == worker.waits[0], "frames end the back-off"
     assert worker.waits[3] == worker.waits[1]
     assert publisher.runs == [before + 1, before + 1, before + 2]
