@@ -36,6 +36,8 @@ CORNER, DARK_CORNER = 1 / 16, 0.75
 """Side of the corners of a picture, as a share of its sides, and the share of a corner that is dark if the view is round. A patient's name or
 the time may be printed over the rest.
 """
+ASPECTS = 0.75, 1.5
+"""Smallest and largest aspect ratio of pictures with a round view whose black bars are kept, relative to that of the network's input."""
 LOGARITHMS = np.log(np.arange(256, dtype=np.float32) / 255 + np.float32(0.06))
 """Logarithm of each byte value / 255 plus 0.06, which keeps noise small where it is dark. The network was trained with the same values."""
 SURROUND = 16
@@ -134,7 +136,9 @@ class NetworkToolFinder:
             return self._found(image, self._network)
         rows, columns = between_bars(small)
         if round_view(small[rows, columns]):
-            return self._found(image, self._round)
+            rows, columns = around_view(image, self._round.input_px)
+            tissue[rows, columns] = self._found(np.ascontiguousarray(image[rows, columns]), self._round)
+            return tissue
         # Black bars make the corners dark, too. The network for full pictures was not trained with them.
         rows, columns = between_bars(image)
         if min(tissue[rows, columns].shape) >= SMALLEST_PX:
@@ -177,6 +181,36 @@ def between_bars(image: NDArray[np.uint8]) -> tuple[slice, slice]:
         content = np.flatnonzero(count >= (1 - DARK_CORNER) * max(1, count.max()))
         sides.append(slice(int(content[0]), int(content[-1]) + 1) if content.size else slice(None))
     return sides[0], sides[1]
+
+
+def around_view(image: NDArray[np.uint8], input_px: tuple[int, int]) -> tuple[slice, slice]:
+    """Return the rows and columns of a picture with a round view that the network examines.
+
+    They are the whole picture unless its aspect ratio is beyond `ASPECTS`. Resizing would then distort the view, and the network
+    would take tissue for tools. Instead the black bars along the longer side are removed, at most down to the input's aspect ratio.
+
+    Args:
+        image: RGB uint8 [H, W, 3].
+        input_px: width and height of the network's input.
+    """
+    height, width = image.shape[:2]
+    aspect = input_px[0] / input_px[1]
+    whole = slice(0, height), slice(0, width)
+    if ASPECTS[0] * aspect <= width / height <= ASPECTS[1] * aspect:
+        return whole
+    rows, columns = between_bars(image)
+    if width < aspect * height:
+        return _lengthened(rows, round(width / aspect), height), whole[1]
+    return whole[0], _lengthened(columns, round(height * aspect), width)
+
+
+def _lengthened(part: slice, length: int, limit: int) -> slice:
+    """Return a part of a side of `limit` pixels, extended at both ends to at least `length` pixels."""
+    start, stop, _ = part.indices(limit)
+    if stop - start < length:
+        start = min(max(0, (start + stop - length) // 2), limit - length)
+        stop = start + length
+    return slice(start, stop)
 
 
 def along_edges(logits: NDArray[np.float32], planes: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -12,6 +12,7 @@ from gsplat_core.endoscope.tools import (
     ROUND_INPUTS,
     ROUND_NETWORK,
     NetworkToolFinder,
+    around_view,
     between_bars,
     remove_inner_regions,
     round_view,
@@ -132,11 +133,50 @@ def test_black_bars_do_not_change_what_is_found_between_them(finder, bars):
     assert not found.all()
 
 
-@pytest.mark.parametrize("bars", BARS.values(), ids=BARS)
+@pytest.mark.parametrize("bars", [(20, 20, 0, 0), (0, 0, 60, 60), (30, 31, 40, 41)], ids=str)
 def test_black_bars_around_a_round_view_do_not_change_its_network(finder, bars):
     image = barred(in_round_view(with_rod(256, 320)[0])[0], bars)
-    only_round = NetworkToolFinder(ROUND_NETWORK, ROUND_INPUT_PX, ROUND_INPUTS)
-    np.testing.assert_array_equal(finder.find(image), only_round.find(image))
+    np.testing.assert_array_equal(finder.find(image), only_round().find(image))
+
+
+def only_round():
+    return NetworkToolFinder(ROUND_NETWORK, ROUND_INPUT_PX, ROUND_INPUTS)
+
+
+@pytest.mark.parametrize("bars", [(300, 300, 0, 0), (150, 451, 0, 0), (0, 0, 400, 400), (0, 0, 100, 601)], ids=str)
+def test_long_black_bars_around_a_round_view_do_not_change_what_is_found(finder, bars):
+    """The view has the aspect ratio of the network's input."""
+    view, _ = in_round_view(with_rod(240, 320)[0])
+    found = finder.find(barred(view, bars))
+    np.testing.assert_array_equal(found, 1 - barred(1 - finder.find(view), bars))
+    assert not found.all()
+    squashed = only_round().find(barred(view, bars))
+    assert (squashed != found).any(), "a view that is resized with its bars is seen differently"
+
+
+def test_a_round_view_is_examined_whole_from_three_quarters_to_one_and_a_half_of_the_input_s_aspect_ratio():
+    def examined(height, width, view=96):
+        image = np.zeros((height, width, 3), np.uint8)
+        top, left = (height - view) // 2, (width - view) // 2
+        image[top : top + view, left : left + view] = 100
+        return around_view(image, (128, 96))
+
+    assert examined(120, 120) == (slice(0, 120), slice(0, 120))
+    assert examined(120, 240) == (slice(0, 120), slice(0, 240))
+    # A longer picture keeps the bars up to the aspect ratio of the input, 4:3, and the view in any case.
+    assert examined(120, 242) == (slice(0, 120), slice(41, 201))
+    assert examined(121, 120) == (slice(12, 108), slice(0, 120))
+    assert examined(300, 120) == (slice(102, 198), slice(0, 120))
+    assert examined(300, 120, view=60) == (slice(105, 195), slice(0, 120))
+
+
+def test_the_part_with_the_view_stays_within_the_picture():
+    image = np.zeros((300, 120, 3), np.uint8)
+    for top, rows in ((0, slice(0, 90)), (260, slice(210, 300))):
+        shown = image.copy()
+        shown[top : top + 40, 40:80] = 100
+        assert around_view(shown, (128, 96)) == (rows, slice(0, 120))
+    assert around_view(image, (128, 96)) == (slice(0, 300), slice(0, 120))
 
 
 def test_text_in_a_black_bar_is_no_content():
