@@ -14,7 +14,7 @@ def draw(*shape, seed=0):
     return torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-def test_differences_are_those_of_each_value():
+def test_l1_and_mse_loss_return_the_difference_of_each_value():
     own, other = draw(2, 5, 3), draw(2, 5, 3, seed=1)
     assert torch.equal(contrib.l1_loss(own, other), (own - other).abs())
     assert torch.equal(contrib.mse_loss(own, other), (own - other) ** 2)

@@ -14,17 +14,17 @@ from tests.gsplat_core.cuda.frame_checks import assert_near, check, plain, scene
 
 @pytest.mark.parametrize("model", ["pinhole", "ortho", "fisheye"])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
-def test_picture_for_every_degree_and_camera_model(degree: int, model: str) -> None:
+def test_pictures_of_every_degree_and_camera_model_equal_the_reference(degree: int, model: str) -> None:
     assert check(scene(400, degree=degree, model=model)).alphas.max() > 0.5
 
 
 @pytest.mark.parametrize("size", [(1, 1), (16, 16), (17, 33), (200, 131)])
-def test_any_image_size(size: tuple[int, int]) -> None:
+def test_pictures_of_any_size_equal_the_reference(size: tuple[int, int]) -> None:
     check(scene(300, *size, seed=1, background=False))
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 127, 128, 129, 1000])
-def test_any_number_of_gaussians(count: int) -> None:
+def test_pictures_of_any_number_of_gaussians_equal_the_reference(count: int) -> None:
     check(scene(count, deltas=count % 2 == 0, seed=2))
 
 
@@ -49,7 +49,7 @@ def test_deltas_are_added_to_the_raw_parameters() -> None:
     assert torch.equal(replace(s, deltas=unused).render().image, s.render().image)
 
 
-def test_all_behind_the_camera() -> None:
+def test_gaussians_behind_the_camera_show_nothing() -> None:
     s = scene(200, seed=5)
     s.viewmat[2, 3] -= 100
     frame = check(s)
@@ -67,7 +67,7 @@ def test_gaussians_that_cover_the_screen() -> None:
     assert frame.splat_starts.diff().max() == 44 * 38
 
 
-def test_a_cloud_of_medium_splats() -> None:
+def test_a_cloud_of_medium_splats_equals_the_reference() -> None:
     check(scene(2000, 500, 300, seed=7, size=0.2), capacity=1 << 20)
 
 

@@ -57,23 +57,23 @@ def check(scene: FrameScene, with_alphas: bool = True) -> RawGradients:
 
 @pytest.mark.parametrize("deltas", [True, False])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
-def test_every_degree_of_spherical_harmonics(degree: int, deltas: bool) -> None:
+def test_gradients_of_every_degree_equal_the_reference(degree: int, deltas: bool) -> None:
     check(frame_scene(300, degree=degree, deltas=deltas))
 
 
 @pytest.mark.parametrize("camera_model", MODELS)
 @pytest.mark.parametrize("with_alphas", [True, False])
-def test_every_camera_model(camera_model: str, with_alphas: bool) -> None:
+def test_gradients_of_every_camera_model_equal_the_reference(camera_model: str, with_alphas: bool) -> None:
     check(frame_scene(400, degree=2, camera_model=camera_model, background=with_alphas), with_alphas)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (16, 16), (33, 50), (130, 17)])
-def test_any_image_size(size: tuple[int, int]) -> None:
+def test_gradients_of_any_picture_size_equal_the_reference(size: tuple[int, int]) -> None:
     check(frame_scene(200, *size))
 
 
 @pytest.mark.parametrize("count", [1, 31, 33, 129])
-def test_any_number_of_gaussians(count: int) -> None:
+def test_gradients_of_any_number_of_gaussians_equal_the_reference(count: int) -> None:
     check(frame_scene(count, degree=3, median_px=6.0, deltas=True))
 
 
@@ -99,7 +99,7 @@ def test_gaussians_behind_the_camera_get_none() -> None:
     assert not gradients.sh.any()
 
 
-def test_faint_opaque_and_dark_gaussians() -> None:
+def test_gradients_of_faint_opaque_and_dark_gaussians_equal_the_reference() -> None:
     scene = frame_scene(400, degree=1)
     scene.logit_opacities[::4] = 12.0
     scene.logit_opacities[1::4] = math.log(1.5 / 253.5)
@@ -111,7 +111,7 @@ def test_faint_opaque_and_dark_gaussians() -> None:
     assert not gradients.raw[1::3, 11].any()
 
 
-def test_one_over_the_whole_screen_among_thin_and_tiny_ones() -> None:
+def test_one_splat_over_the_whole_picture_among_thin_and_tiny_ones_equals_the_reference() -> None:
     scene = frame_scene(300, 200, 150, degree=1, median_px=2.0)
     scene.log_scales[7] = 4.0
     scene.logit_opacities[7] = -1.0
@@ -120,7 +120,7 @@ def test_one_over_the_whole_screen_among_thin_and_tiny_ones() -> None:
     check(scene)
 
 
-def test_very_many_in_one_tile() -> None:
+def test_gradients_of_very_many_splats_in_one_tile_equal_the_reference() -> None:
     scene = frame_scene(100_000, 16, 16, degree=0)
     scene.logit_opacities[:] = math.log(0.0045 / 0.9955)  # about 2,000 are blended before a pixel ends
     scene.log_scales[:] = 6.0  # over the whole tile: no pixel is near the cut-off of 1/255

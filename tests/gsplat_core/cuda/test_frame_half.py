@@ -110,7 +110,7 @@ def test_splats_that_cover_the_screen() -> None:
     check(scene)
 
 
-def test_needles() -> None:
+def test_needles_equal_the_reference() -> None:
     scene = frame_scene(500, 200, 150, seed=6)
     scene.log_scales[:, 0] += 3.5
     scene.log_scales[:, 1:] -= 3.0
@@ -152,7 +152,7 @@ def test_depths_of_very_different_size() -> None:
 
 
 @pytest.mark.parametrize("eps2d", [0.0, 1e-6, 1e-3])
-def test_splats_without_a_least_size(eps2d: float) -> None:
+def test_splats_without_a_minimum_size_are_close_to_float32(eps2d: float) -> None:
     scene = frame_scene(2000, median_px=0.3, seed=11)
     scene.log_scales[::2, 0] += 5.0
     scene.log_scales[::3, 1:] -= 9.0

@@ -78,7 +78,7 @@ def test_lists_that_are_too_short_are_made_longer(make_gaussians, camera, count,
     assert_same_picture(output, render(scene, camera))
 
 
-def test_the_same_bits_twice(scene, camera):
+def test_two_frames_of_one_camera_have_the_same_bits(scene, camera):
     renderer = FrameRenderer(scene, camera)
     first = [t.clone() for t in renderer.render().result()]
     renderer.render(shifted(camera, 4.0)).result()
@@ -86,7 +86,7 @@ def test_the_same_bits_twice(scene, camera):
         assert torch.equal(a, b)
 
 
-def test_background(scene, camera):
+def test_the_background_equals_that_of_render(scene, camera):
     background = torch.tensor([0.2, 0.5, 0.9], device="cuda")
     output = FrameRenderer(scene, camera, background=background).render().result()
     assert_same_picture(output, render(scene, camera, background))

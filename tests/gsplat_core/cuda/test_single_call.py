@@ -90,7 +90,7 @@ def test_degrees_and_camera_models_equal_the_reference(make_scene, model, degree
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4])
 @pytest.mark.parametrize("per_camera", [False, True])
-def test_plain_colours(make_scene, calls, count, per_camera):
+def test_plain_colours_equal_the_chain(make_scene, calls, count, per_camera):
     scene = make_scene(120, cameras=2)
     random = torch.Generator().manual_seed(8)
     colors = torch.rand(*((2,) if per_camera else ()), 120, count, generator=random)
@@ -102,13 +102,13 @@ def test_plain_colours(make_scene, calls, count, per_camera):
     assert_same(seen, run(step_by_step.rasterization, scene, leaves, **options)[0])
 
 
-def test_coefficients_per_camera(make_scene):
+def test_coefficients_per_camera_equal_the_chain(make_scene):
     scene = make_scene(90, cameras=2)
     leaves = inputs(scene, colors=scene.sh * torch.tensor([1.0, -0.5])[:, None, None, None])
     assert_same(*(run(f, scene, leaves, packed=False)[0] for f in (rasterization, step_by_step.rasterization)))
 
 
-def test_covariances_in_place_of_quaternions(make_scene):
+def test_covariances_in_place_of_quaternions_equal_the_chain(make_scene):
     scene = make_scene(100)
     covars, _ = quat_scale_to_covar_preci(scene.quats.float(), scene.scales.float(), compute_preci=False)
     leaves = inputs(scene, covars=covars)
@@ -130,7 +130,7 @@ def test_few_gaussians_and_none_that_is_seen(make_scene, count, packed):
         check_lists(meta)
 
 
-def test_large_and_many_in_one_tile(make_scene):
+def test_large_splats_and_many_in_one_tile_equal_the_chain(make_scene):
     scene = make_scene(6000, width=200, height=40)
     scene.scales[:40] = 5.0
     scene.opacities[:] *= 0.1

@@ -13,7 +13,7 @@ from tests.gsplat_core.cuda.single_call_checks import assert_same, inputs, run
 
 
 @pytest.mark.parametrize("mode", ["RGB", "RGB+ED", "ED"])
-def test_gradient_of_the_background(make_scene, mode):
+def test_gradient_of_the_background_equals_the_chain(make_scene, mode):
     scene = make_scene(100, cameras=2)
     found = []
     for function in (rasterization, step_by_step.rasterization):
@@ -26,7 +26,7 @@ def test_gradient_of_the_background(make_scene, mode):
 @pytest.mark.parametrize("degree", [0, 1, 2, 3, 4, None])
 @pytest.mark.parametrize("bases", [16, 25])
 @pytest.mark.parametrize("cameras", [1, 2])
-def test_of_the_gaussians_alone(make_scene, degree, bases, cameras):
+def test_gradients_of_the_gaussians_alone_equal_the_chain(make_scene, degree, bases, cameras):
     degree = min(degree, math.isqrt(bases) - 1) if degree is not None else None
     scene = make_scene(150, cameras=cameras, degree=4)
     leaves = inputs(scene, colors=scene.sh[:, :bases] if degree is not None else scene.sh[:, 0])

@@ -100,7 +100,7 @@ def test_lists_that_do_not_fit_are_skipped(gpu):
     assert weighted_sums(*inputs, WIDTH, HEIGHT, offsets - 1000, ids).isfinite().all()
 
 
-def test_captured_in_a_cuda_graph(gpu):
+def test_a_replayed_cuda_graph_equals_the_eager_call(gpu):
     inputs = [t.to(gpu) for t in splats(300)]
     lists = lists_of(inputs[0], inputs[1], inputs[3])
     v_sums = torch.rand(5, HEIGHT, WIDTH, device=gpu)
@@ -190,18 +190,18 @@ def check_frame(inputs, gpu):
 
 @pytest.mark.parametrize("model", ["pinhole", "ortho", "fisheye"])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
-def test_frame_for_every_degree_and_camera_model(gpu, degree, model):
+def test_frames_of_every_degree_and_camera_model_equal_the_reference(gpu, degree, model):
     assert check_frame(frame_inputs(400, degree, model), gpu).alphas.max() > 0.5
 
 
 @pytest.mark.parametrize("size", [(1, 1), (16, 16), (17, 33), (200, 131)])
 @pytest.mark.parametrize("count", [0, 1, 127, 129, 1000])
-def test_frame_of_any_size(gpu, count, size):
+def test_frames_of_any_size_equal_the_reference(gpu, count, size):
     width, height = size
     check_frame(frame_inputs(count, background=count % 2 == 0, seed=count, width=width, height=height), gpu)
 
 
-def test_frame_with_more_splats_in_a_tile_than_a_batch(gpu):
+def test_a_tile_with_more_splats_than_a_batch_equals_the_reference(gpu):
     inputs = frame_inputs(3000, width=20, height=20)
     inputs[0][2] += 1
     check_frame(inputs, gpu)

@@ -26,7 +26,7 @@ def decibels(difference):
     return -20 * np.log10(difference / 255)
 
 
-def test_by_hand():
+def test_baselines_of_three_grey_frames_equal_values_by_hand():
     measured = measure_baselines([frame(0, 100), frame(1, 120), frame(2, 180)])
     assert measured.previous_frame_db == pytest.approx((decibels(20) + decibels(60)) / 2, abs=1e-4)
     assert measured.heldout_previous_frame_db == pytest.approx(decibels(20), abs=1e-4)
@@ -176,7 +176,7 @@ class CuttingRecording:
     not CuttingRecording.folder.exists() and "CI" not in os.environ, reason=f"no recording at {CuttingRecording.folder}"
 )
 @pytest.mark.slow
-def test_the_protocols_figures_on_the_cutting_recording():
+def test_baselines_of_cutting_equal_the_published_figures():
     assert sum(is_heldout(index) for index in range(156)) == 20
     measured = measure_baselines(CuttingRecording())
     assert measured.heldout_previous_frame_db == pytest.approx(37.24, abs=0.05)
@@ -187,7 +187,7 @@ def test_the_protocols_figures_on_the_cutting_recording():
 
 @pytest.mark.recordings
 @pytest.mark.slow
-def test_the_baselines_by_flow_and_by_older_frames(recordings_dir):
+def test_baselines_by_flow_and_older_frames_equal_the_published_figures(recordings_dir):
     """Baselines of the first frames only, because optical flow takes long."""
     cutting = measure_baselines(CuttingRecording(42), ages=AGES, flow=True)
     assert cutting.heldout["half_way_flow"].psnr_tissue_db == pytest.approx(41.26, abs=0.05)

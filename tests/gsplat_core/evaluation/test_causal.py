@@ -88,7 +88,7 @@ def test_one_frame_has_no_prediction(frame, picture):
     assert score.psnr_tissue_db is None and shown == []
 
 
-def test_another_way_to_predict(frame, picture):
+def test_a_given_prediction_function_is_used(frame, picture):
     always = lambda learner, unseen: 105
     score, _ = evaluate([frame(0, 100), frame(1, 105)], picture, predict=always)
     assert score.psnr_tissue_db == 100.0

@@ -30,7 +30,7 @@ def test_an_exact_model_scores_the_cap_on_the_held_out_frames_alone(frame, pictu
 
 
 @pytest.mark.parametrize("excluded", ["mask", "loss_mask"])
-def test_both_definitions_and_the_picture_before_it_was_rounded(frame, picture, decibels, excluded):
+def test_psnr_over_tissue_over_the_frame_and_before_rounding(frame, picture, decibels, excluded):
     mask = np.ones((16, 20), np.uint8)
     mask[:, :15] = 0
     shown = evaluate_heldout([frame(1, 100, **{excluded: mask})], lambda _: picture(110.4), window_s=ALWAYS)

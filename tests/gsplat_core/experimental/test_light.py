@@ -144,7 +144,7 @@ def test_a_camera_without_a_pinhole_gets_no_answer():
     assert LightDepth().estimate(Frame(0, 0, picture(bowl())), fisheye) is None
 
 
-def test_it_is_found_by_its_name():
+def test_light_depth_is_found_by_its_name():
     assert DEPTHS["light"] is LightDepth
 
 
@@ -172,7 +172,7 @@ def test_a_quarter_of_the_picture_must_be_seen(share, is_enough):
 
 
 @pytest.mark.parametrize(("elapsed_s", "is_new"), [(0.29, False), (0.3, True)])
-def test_a_look_every_three_tenths_of_a_second(elapsed_s, is_new):
+def test_depth_is_estimated_anew_every_three_tenths_of_a_second(elapsed_s, is_new):
     estimator, frame = LightDepth(), Frame(0, 0, picture(bowl()))
     first = estimator.estimate(frame, CAMERA)
     second = estimator.estimate(Frame(1, round(elapsed_s * 1e9), picture(bowl())), CAMERA)

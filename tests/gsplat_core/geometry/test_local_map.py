@@ -96,7 +96,7 @@ def test_anchors_share_six_points_at_least_and_five_are_taken():
     assert [each.position[0] for each in few._anchors(window)] == [0, 2]
 
 
-def test_poses_and_places():
+def test_positions_scaled_poses_and_unprojected_points_agree():
     pose = key(3.0, y=4.0).pose
     np.testing.assert_allclose(position_of(pose), [3, 4, 0])
     np.testing.assert_allclose(position_of(scaled(pose, 2.0)), [6, 8, 0])

@@ -81,7 +81,7 @@ def test_what_is_not_known_has_no_say():
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 40), (40, 1), (7, 5), (33, 300)])
-def test_any_size_is_taken(size):
+def test_disparities_of_any_size_are_smoothed(size):
     known = np.zeros(size, bool)
     known.flat[size[0] * size[1] // 2] = True
     found = smooth_disparity(np.full(size, 12.0, np.float32), known, np.full(size, 0.02, np.float32))

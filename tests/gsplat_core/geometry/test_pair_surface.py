@@ -152,7 +152,7 @@ def test_highlights_are_brighter_than_their_surroundings():
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 40), (40, 1), (7, 5), (33, 300)])
-def test_any_size_is_taken(size):
+def test_surfaces_of_any_size_are_fitted(size):
     planes = np.full(size, 12.0, np.float32)
     assert np.isfinite(first_planes(planes, np.ones(size, bool), np.full(size, 0.02, np.float32))).all()
     picture = np.full(size, 100, np.uint8)

@@ -35,7 +35,7 @@ def test_vectors_are_rotated_as_by_the_matrix(angle: float) -> None:
     torch.testing.assert_close(rotated(vectors, points), expected, rtol=1e-7, atol=1e-9)
 
 
-def test_both_are_differentiable_at_the_identity() -> None:
+def test_rotations_and_rotation_vectors_are_differentiable_at_the_identity() -> None:
     still = torch.zeros(3, requires_grad=True)
     (slope,) = torch.autograd.grad(rotated(still, torch.tensor([1.0, 0, 0]))[1], still)
     assert slope.tolist() == [0, 0, 1], "a turn about z moves x towards y"

@@ -310,7 +310,7 @@ def test_depth_times_disparity_is_the_focal_length_times_the_baseline(left, righ
 @pytest.mark.parametrize(
     ("behind", "said"), [(0.0, None), (0.02, None), (0.03, "behind the scope"), (0.5, "behind the scope"), (0.51, "swapped")]
 )  # fmt: skip
-def test_shares_of_points_behind_the_scope(behind, said):
+def test_stereo_is_doubted_by_the_share_of_points_behind_the_scope(behind, said):
     count = round(100 * behind)
     look = SimpleNamespace(disparities=np.array([-20.0] * count + [20.0] * (100 - count)) + 7)
     found = stereo._why_implausible(look, 7.0, calibrated=True)

@@ -117,7 +117,9 @@ LEAST = stereo.LEAST_DISPARITY_PX
     ],
 )
 @pytest.mark.parametrize("calibrated", [True, False])
-def test_disparities_that_cannot_be(shift: np.ndarray, said: str | None, calibrated: bool) -> None:
+def test_implausible_disparities_are_rejected_with_a_reason(
+    shift: np.ndarray, said: str | None, calibrated: bool
+) -> None:
     found = stereo._why_implausible(look(shift + 30), 30.0, calibrated=calibrated)
     assert (found is None) if said is None else (found is not None and said in found)
     if found is not None and "behind" in found:

@@ -39,7 +39,7 @@ def test_the_share_is_the_reference_picture_of_the_chosen_ones_in_white(count):
     assert torch.allclose(found[there].double(), wanted[there], atol=2e-3)
 
 
-def test_all_none_and_the_others():
+def test_shares_of_a_part_and_of_the_rest_add_up_to_one():
     gaussians = cloud(100)
     everyone = torch.ones(100, dtype=torch.bool)
     some = torch.arange(100) < 40

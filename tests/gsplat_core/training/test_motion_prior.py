@@ -106,7 +106,7 @@ def test_irregular_times_give_a_velocity_in_time_and_not_in_frames() -> None:
     assert 0.4 < moved_px < 0.8  # one pixel an interval, damped
 
 
-def test_it_ends_at_its_horizon() -> None:
+def test_the_prediction_ends_at_its_horizon() -> None:
     model = learned(learner(), stream([0.0, 1.0, 2.0]))
     newest_s = 2 * INTERVAL_S
     assert torch.equal(model.at(newest_s + HORIZON_S).means, model.at(newest_s + 5.0).means)
@@ -193,7 +193,7 @@ def test_widening_grows_with_the_motion_and_is_bounded() -> None:
     assert 0 < float(added[1, 0]) < float(added[2, 0]) < 1.0
 
 
-def test_the_prior_of_a_configuration() -> None:
+def test_the_configuration_selects_the_motion_prior() -> None:
     field = learner()
     field.observe(next(stream([0.0])), steps=1)
     assert field._step is not None

@@ -91,7 +91,7 @@ def test_a_frame_of_another_size_is_fitted_into_the_video(tmp_path, rendered, fr
     assert 150 < second.max() <= 255
 
 
-def test_what_it_contributes(tmp_path, rendered, compute):
+def test_the_sink_contributes_the_number_of_frames_and_the_video_if_any(tmp_path, rendered, compute):
     operator, outcome = VideoSinkOp(None, path=tmp_path / "out.mp4", fps=25.0), OutcomeBuilder()
     operator.contribute(outcome)
     assert outcome.find(DisplayResult) == DisplayResult(0) and outcome.outputs == {}

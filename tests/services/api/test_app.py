@@ -156,7 +156,7 @@ def test_every_problem_has_a_status_of_its_own_kind():
         assert 400 <= kind.status < 600 and kind.title
 
 
-def test_readiness(new_plane):
+def test_readyz_reports_the_state_of_each_check(new_plane):
     async def well():
         return CheckResult(True, "one model is active")
 

@@ -94,7 +94,7 @@ def raw(port: int, data: bytes, timeout_s: float = 300.0) -> bytes:
         return answer
 
 
-def test_it_answers_and_says_nothing_about_itself(served):
+def test_the_server_answers_without_naming_its_software(served):
     _, port, key = served
     answer, body = ask(port, "/v1/version", key)
     assert answer.status == 200 and json.loads(body)["api"] == "v1"
@@ -255,7 +255,7 @@ def test_a_certificate_that_cannot_be_used_is_refused(certificate, files):
 
 
 @pytest.mark.slow
-def test_tls(certificate, tmp_path):
+def test_the_server_answers_over_tls(certificate, tmp_path):
     options = [
         "--set",
         f"server.certfile={certificate / 'cert.pem'}",

@@ -34,7 +34,7 @@ def endpoint(runtime):
     server.close()
 
 
-def test_answers(endpoint):
+def test_a_command_returns_the_answer_of_its_handler(endpoint):
     assert ask(endpoint, "echo", x=1, y="z") == {"x": 1, "y": "z"}
     assert ask(endpoint, "silent") == {}
     assert asyncio.run(ask_async(endpoint, "echo", x=2)) == {"x": 2}

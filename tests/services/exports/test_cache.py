@@ -150,7 +150,7 @@ def test_what_was_left_half_made_goes_at_start(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_program_itself(tmp_path):
+def test_the_export_program_writes_a_file_or_refuses(tmp_path):
     save_bundle(uniform((0.9, 0.1, 0.1)), tmp_path / "model")
     cache = ExportCache(tmp_path / "exports")
     with cache.get("a", lambda: tmp_path / "model", PLY).file as ply:

@@ -86,7 +86,7 @@ def test_a_model_of_another_renderer_is_rendered_by_it(checked, tmp_path):
     assert (validated["renderer"], ready["stage"]) == ("weighted_sum", "ready")
 
 
-def test_words_for_people(checked_words, tmp_path):
+def test_a_check_states_its_result_in_words(checked_words, tmp_path):
     first, second = checked_words(save_model(tmp_path / "model"))
     assert first.startswith("validated: gaussians 5, ") and second.startswith("ready: render_ms ")
 

@@ -64,7 +64,7 @@ def test_depth_has_both_planes_beside_it() -> None:
 @pytest.mark.parametrize(
     ("level", "baselines"), [(None, "best-fit plane 12.4°"), (40.0, "level plane 40.0°, best-fit plane 12.4°")]
 )
-def test_normals(level: float | None, baselines: str) -> None:
+def test_normals_have_a_row_with_their_baselines(level: float | None, baselines: str) -> None:
     normals = Facts(mean_deg=5.04, plane_mean_deg=12.41, level_mean_deg=level)
     assert rows(normals=normals) == [("Normals, mean angle", "5.0°", baselines, True)]
 
@@ -79,7 +79,7 @@ def test_views_after_one_scale_are_named_only_where_they_differ() -> None:
     ]
 
 
-def test_followed_points() -> None:
+def test_followed_points_have_rows_with_their_baselines() -> None:
     facts = Facts(model=track(1.0, 4.0), scaled=track(0.9, 3.0), still=track(2.0, 8.0))
     still = "no motion 2.00 mm, 2.50 mm"
     assert rows(tracking=facts) == [

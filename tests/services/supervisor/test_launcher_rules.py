@@ -49,7 +49,9 @@ def asked(launcher: Launcher, request: bytes) -> dict[str, object]:
         ({"command": "status", "pid": 8}, {"ok": True, "status": None}),
     ],
 )
-def test_answers(launcher: Launcher, request_: dict[str, object], answer: dict[str, object], monkeypatch) -> None:
+def test_a_request_to_the_launcher_gets_its_answer(
+    launcher: Launcher, request_: dict[str, object], answer: dict[str, object], monkeypatch
+) -> None:
     monkeypatch.setattr(launcher, "_reap", lambda: launcher._ends.update({7: "signal 9"}))
     assert asked(launcher, packed_json(request_)) == answer
     assert not launcher._stopped
@@ -260,7 +262,7 @@ def test_a_launcher_that_is_still_loading_is_ended_by_its_process_id(tmp_path, m
     ("answer", "error"),
     [(b'{"ok": true, "pid": 7}', None), (b'{"ok": false, "error": "no memory"}', "refuses 'start': no memory"), (b"{}", "refuses"), (None, "has not answered 'start' within")],
 )  # fmt: skip
-def test_the_answer_of_a_launcher(tmp_path, monkeypatch, answer, error):
+def test_a_wrong_answer_of_the_launcher_is_an_error(tmp_path, monkeypatch, answer, error):
     by = launchers.ByLauncher(RuntimeFolder(tmp_path))
     requests = []
 
