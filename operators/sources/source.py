@@ -51,7 +51,7 @@ class SourceDescription:
     width_px: int
     height_px: int
     fps: float
-    """Nominal frame rate in frames/s."""
+    """Nominal frame rate in frames/s; the mean rate of a recording with a variable frame rate."""
     camera: Camera
     """Camera of the first frame, at the frames' size."""
     fields: frozenset[str] = frozenset()

@@ -80,6 +80,8 @@ class FrameImages(Protocol):
     """Capture times in frame durations since the first frame; None if evenly spaced."""
     fps: float | None
     """Frame rate in Hz; None if the files do not state it."""
+    keeps_times: bool
+    """True if `times` come from the file and are not scaled to a frame rate that `recording.json` states."""
 
     def frames(self, findings: Findings) -> Iterator[Picture | None]:
         """Yield the pictures in order; None for one that cannot be read at all."""

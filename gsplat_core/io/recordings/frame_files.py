@@ -220,6 +220,7 @@ class ImageFiles:
         self.width_px = width_px
         self.height_px = height_px
         self.fps = fps
+        self.keeps_times = False
 
     def frames(self, findings: Findings) -> Iterator[Picture | None]:
         """Yield the pictures in order; None for one that cannot be decoded."""

@@ -380,6 +380,13 @@ def _with_sidecars(
     if fps is None:
         findings.warn(root, "the frame rate is not stated", f"{DEFAULT_FPS:g} frames/s are assumed")
         fps = DEFAULT_FPS
+    if images.keeps_times and images.fps is not None and fps != images.fps:
+        findings.warn(
+            root,
+            f"{DESCRIPTION_FILE} states {fps:g} frames/s, and the video has {images.fps:.4g} frames/s on average",
+            "Its frames keep their times in the file",
+        )
+        fps = images.fps
     last = images.times[-1] if images.times else images.frame_count - 1
     if last > LONGEST_RECORDING_S * fps:
         findings.problem(

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from itertools import pairwise
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
 import av
 from av.stream import Disposition
@@ -46,7 +46,12 @@ class VideoIndex:
     frame_count: int
     """Number of displayed pictures, including those lost to container damage."""
     times: tuple[int, ...] | None
-    """Display times of the pictures in units of the stream's time base; None without distinct times, and after container damage."""
+    """Display times of the pictures in units of the stream's time base.
+
+    None without increasing times, and after container damage.
+    """
+    unordered: str | None
+    """Reason as a phrase why the stated times cannot be used; None if they can, or if none are stated."""
     ordered: bool
     """True if `positions` is reliable.
 
@@ -102,10 +107,27 @@ def read_index(opened: av.container.InputContainer, stream: av.VideoStream, cont
         keys.append(packet.is_keyframe)
         shown.append(not packet.is_discard and is_shown(name, bytes(packet)))
     duration = _frame_duration(stream)
-    positions, count, ordered = _positions(times, shown, lost, duration, stream.codec_context.has_b_frames)
     displayed = [time for time, is_visible in zip(times, shown, strict=True) if is_visible and time is not None]
-    is_timed = len(set(displayed)) == count and not lost
-    return VideoIndex(positions, bytes(keys), damaged, count, tuple(sorted(displayed)) if is_timed else None, ordered)
+    unordered = None if lost else _disorder(displayed, stream.codec_context.codec.reorder)
+    if unordered is not None:
+        times = [None] * len(times)
+    positions, count, ordered = _positions(times, shown, lost, duration, stream.codec_context.has_b_frames)
+    is_timed = len(displayed) == count and unordered is None and not lost
+    in_order = tuple(sorted(displayed)) if is_timed else None
+    return VideoIndex(positions, bytes(keys), damaged, count, in_order, unordered, ordered)
+
+
+def _disorder(times: Sequence[int], reordered: bool) -> str | None:
+    """Return what is wrong with display times in file order, as a phrase; None if nothing is.
+
+    Args:
+        times: display times of the displayed pictures that state one.
+        reordered: True if the codec may store pictures in another order than they are displayed.
+    """
+    if repeated := len(times) - len(set(times)):
+        return f"{repeated} of its {len(times)} frame times are repeated"
+    back = 0 if reordered else sum(later < earlier for earlier, later in pairwise(times))
+    return f"its frame times go backwards {back} times" if back else None
 
 
 def _frame_duration(stream: av.VideoStream) -> Fraction | None:
@@ -145,7 +167,17 @@ def _positions(
 VIDEO_SUFFIXES = frozenset({".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm"})
 _REENCODE = "Copy the file again from its source, or re-encode it (ffmpeg -i IN -c:v libx264 OUT.mp4)"
 MAX_JITTER = 0.5
-"""Largest deviation of a display time from even spacing, in frame durations, that is ignored as rounding or jitter."""
+"""Largest deviation of an evenly spaced display time from the stated frame rate, in frame durations, that is ignored."""
+EVEN_WITHIN_S = 0.002
+"""Largest deviation of a display time from even spacing that counts as rounding, in seconds.
+
+Matroska rounds times to 1 ms, and a copy into another container may round again.
+"""
+SAME_RATE = 0.01
+"""Largest relative difference of the stated frame rate from the mean rate of evenly spaced frames. Beyond it the stated rate
+is wrong, and the mean rate replaces it.
+"""
+LEAST_FPS, MOST_FPS = 0.1, 1000.0
 _MOST_LATE = 64
 """Number of packets for which reasons to suspect damage are kept, more than a decoder can delay a picture."""
 
@@ -158,17 +190,17 @@ class VideoFrames:
         path: Path,
         container: Container,
         index: VideoIndex,
-        fps: float,
+        timing: FrameTiming,
         orientation: Orientation,
-        times: Sequence[float] | None = None,
     ) -> None:
         self.path = path
         self.files: tuple[Path, ...] = (path,)
         self.frame_count = index.frame_count
         self.numbers: list[int | None] = list(range(index.frame_count))
         self.width_px = self.height_px = 0
-        self.times = times
-        self.fps: float | None = fps
+        self.times: Sequence[float] | None = timing.times
+        self.fps: float | None = timing.fps
+        self.keeps_times = timing.is_uneven
         self._container = container
         self._index = index
         self._orientation = orientation
@@ -350,17 +382,16 @@ def _inspect(
     _warn_of_format(path, opened, stream, findings)
     fps = frame_rate(stream)
     index = read_index(opened, stream, container)
-    times = _frame_times(index, stream, findings, path)
+    timing = _timing(index, stream, findings, path)
     announced = stream.frames or int(fps * _duration_s(opened, stream))
     # Without a stated count, a video of irregular frame times has fewer frames than its duration suggests.
-    found = index.frame_count if stream.frames or times is None else round(times[-1]) + 1
+    found = index.frame_count
+    if not stream.frames and timing.times is not None and index.times and stream.time_base:
+        found = round((index.times[-1] - index.times[0]) * stream.time_base * Fraction(fps)) + 1
     if found < 0.98 * announced - 2 and not _is_edited(index):
         findings.problem(path, f"the video ends early: {found} of about {announced} frames are there", _REENCODE)
         return None
-    if not 0.1 <= fps <= 1000:
-        findings.warn(path, f"the container announces {fps} frames/s", "30 frames/s are assumed")
-        fps, times = 30.0, None
-    return _with_first_frame(path, container, index, fps, times, findings)
+    return _with_first_frame(path, container, index, timing, findings)
 
 
 _SQUARE_WITHIN = 0.01
@@ -388,29 +419,68 @@ def _warn_of_format(
         )
 
 
-def _frame_times(index: VideoIndex, stream: av.VideoStream, findings: Findings, path: Path) -> tuple[float, ...] | None:
-    """Return the display times in frame durations since the first picture, with a warning if they are irregular; None if
-    they are unknown, or agree with the frame rate up to `MAX_JITTER`.
+class FrameTiming(NamedTuple):
+    """Frame rate and display times of a video."""
+
+    fps: float
+    """Frame rate in Hz: the stated one, or the mean rate of uneven times and in place of a wrong statement."""
+    times: tuple[float, ...] | None = None
+    """Display times in units of 1 / `fps` since the first picture; None if frame i is at i / `fps`."""
+    is_uneven: bool = False
+    """True if the times are not evenly spaced."""
+
+
+def _timing(index: VideoIndex, stream: av.VideoStream, findings: Findings, path: Path) -> FrameTiming:
+    """Return the frame rate and the display times of a video, with a warning about times that are not evenly spaced or
+    cannot be used.
+
+    Evenly spaced times that agree with the stated frame rate up to `MAX_JITTER` are replaced by multiples of the frame
+    duration, so that rounded times do not matter.
     """
-    duration = _frame_duration(stream)
-    if not index.times or duration is None:
-        return None
-    times = tuple(float((time - index.times[0]) / duration) for time in index.times)
-    if all(abs(time - place) <= MAX_JITTER for place, time in enumerate(times)):
-        return None
-    spacing = times[-1] / (len(times) - 1)
-    if any(abs(time - place * spacing) > MAX_JITTER for place, time in enumerate(times)):
-        steps = [(later - earlier) * float(duration * (stream.time_base or 0)) for earlier, later in pairwise(times)]
+    fps = frame_rate(stream)
+    is_usable = LEAST_FPS <= fps <= MOST_FPS
+    times = index.times or ()
+    tick = stream.time_base or Fraction(1)
+    span_s = (times[-1] - times[0]) * tick if times else Fraction(0)
+    mean = Fraction(len(times) - 1) / span_s if span_s else Fraction(0)
+    if not is_usable:
+        rate, how = (float(mean), "the mean rate") if LEAST_FPS <= mean <= MOST_FPS else (30.0, "assumed")
+        findings.warn(path, f"the container announces {fps:g} frames/s", f"{rate:g} frames/s are used, {how}")
+        fps = rate
+    if index.unordered is not None:
+        findings.warn(path, index.unordered, f"Its frames are taken as evenly spaced, at {fps:g} frames/s")
+    if not span_s:
+        return FrameTiming(fps)
+    within = min(MAX_JITTER, max(float(tick), EVEN_WITHIN_S) * float(mean))
+    if any(abs(time - place) > within for place, time in enumerate(_scaled(times, tick * mean))):
+        steps = [float((later - earlier) * tick) for earlier, later in pairwise(times)]
         findings.warn(
             path, f"its frames are {min(steps):.3g} to {max(steps):.3g} s apart", "They keep their times in the file"
         )
-    return times
+        unit = mean if LEAST_FPS <= mean <= MOST_FPS else Fraction(fps)
+        return FrameTiming(float(unit), _scaled(times, tick * unit), is_uneven=True)
+    duration = _frame_duration(stream) if is_usable else None
+    if duration is None:
+        return FrameTiming(fps)
+    stated = _scaled(times, 1 / duration)
+    if all(abs(time - place) <= MAX_JITTER for place, time in enumerate(stated)):
+        return FrameTiming(fps)
+    if LEAST_FPS <= mean <= MOST_FPS and abs(float(mean) / fps - 1) > SAME_RATE:
+        return FrameTiming(float(mean), _scaled(times, tick * mean))
+    return FrameTiming(fps, stated)
+
+
+def _scaled(times: Sequence[int], factor: Fraction) -> tuple[float, ...]:
+    """Return the times since the first one, multiplied by `factor`, correctly rounded."""
+    return tuple((time - times[0]) * factor.numerator / factor.denominator for time in times)
 
 
 def _duration_s(opened: av.container.InputContainer, stream: av.VideoStream) -> float:
     if stream.duration and stream.time_base:
         return float(stream.duration * stream.time_base)
-    return (opened.duration or 0) / av.time_base
+    # Matroska states the time of the end, and its first frame may be later than 0.
+    start = max(0, stream.start_time or 0) * (stream.time_base or 0)
+    return max(0.0, (opened.duration or 0) / av.time_base - float(start))
 
 
 def _is_edited(index: VideoIndex) -> bool:
@@ -449,12 +519,11 @@ def _with_first_frame(
     path: Path,
     container: Container,
     index: VideoIndex,
-    fps: float,
-    times: Sequence[float] | None,
+    timing: FrameTiming,
     findings: Findings,
 ) -> VideoFrames | None:
     """Return the video; None after a problem with its first frame, which must be intact to initialise the scene."""
-    video = VideoFrames(path, container, index, fps, _orientation(path, container, findings), times)
+    video = VideoFrames(path, container, index, timing, _orientation(path, container, findings))
     first = video.look_at_first()
     if first is None:
         findings.problem(path, "no frame of the video can be decoded", _REENCODE)

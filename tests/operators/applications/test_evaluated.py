@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import math
+from fractions import Fraction
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from gsplat_core.errors import InvalidSetting, RecordingInvalid
+from gsplat_core.io.recordings import open_recording
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from operators.applications import evaluated
-from operators.applications.evaluated import Playback, SeenFrames
+from operators.applications.evaluated import Playback, SeenFrames, fitting_source
+from operators.sources.recording import RecordingSource
 from operators.sources.source import SourceDescription
+from tests.gsplat_core.io.recordings import videos
 
 CAMERA = Camera.from_focal(60.0, 64, 48)
 
@@ -57,6 +61,17 @@ def test_frames_within_a_time_range(seen):
     assert seen(0.25, 0.55) == ([3, 4, 5], [1, 2, 3, 4, 5, 6]), "frames before the range are read, too"
     assert seen(0.0, 99.0)[0] == list(range(10)), "a recording that is not looped ends"
     assert seen(0.0, 99.0, stop=lambda: True) == ([], [])
+
+
+def test_the_last_frame_of_a_variable_frame_rate_is_at_its_time_in_the_file(tmp_path):
+    times_ms = [0, 33, 99, 132, 232, 265, 331, 364]
+    path = videos.write_timed(tmp_path / "v.mkv", times_ms, 30, Fraction(1, 1000))
+    source = RecordingSource(open_recording(path))
+    made = SimpleNamespace(
+        camera=source.description.camera, training_digest=source.description.digest, time_window_s=(0.0, 0.364)
+    )
+    _, _, playback, notes = fitting_source(path, made, None, None)
+    assert playback.last_s == pytest.approx(0.364) and notes == []
 
 
 def test_frames_of_later_rounds_of_a_looped_recording(seen):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from fractions import Fraction
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,6 +17,7 @@ from operators.sources.address import SourceOptions
 from operators.sources.recording import RealtimeSource, RecordingSource
 from operators.sources.registry import open_source
 from operators.sources.source import FrameSource, SourceState
+from tests.gsplat_core.io.recordings import videos
 
 SOON_S = 300.0
 
@@ -69,6 +71,15 @@ def test_times_that_are_uneven_stay_uneven(recording, clock, frame):
     recording.frames[:] = [frame(k, pts_ns=pts * 10**6) for k, pts in enumerate((7, 47, 167))]
     source = RealtimeSource(recording, SourceOptions(loop=True))
     assert [pts for _, pts, _ in released(source, clock, 6)] == [0, 40, 160, 200, 240, 360]
+
+
+def test_a_video_of_variable_frame_rate_is_played_at_the_times_that_a_replay_has(tmp_path, clock):
+    times_ms = [0, 33, 99, 132, 232, 265]
+    path = videos.write_timed(tmp_path / "v.mkv", times_ms, 30, Fraction(1, 1000))
+    replayed = [frame.pts_ns / 1e6 for frame in RecordingSource(open_recording(path)).frames()]
+    played = released(RealtimeSource(open_recording(path)), clock)
+    assert replayed == [pts_ms for _, pts_ms, _ in played] == pytest.approx(times_ms, abs=1e-6)
+    assert [at_ms for _, _, at_ms in played] == pytest.approx(times_ms, abs=1e-3)
 
 
 @pytest.mark.parametrize(

@@ -78,21 +78,13 @@ def test_containers_without_exact_frame_count(tmp_path: Path, make: SimpleNamesp
     assert recording.frame_count == 7 == len(list(recording))
 
 
-def write_timed(path: Path, ticks: list[int]) -> None:
-    """Write one frame for each display time, in units of 1/25 s, to a Matroska file, which states no number of frames."""
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("ffv1", rate=25)
-        stream.width, stream.height, stream.pix_fmt = 48, 40, "bgr0"
-        for index, tick in enumerate(ticks):
-            frame = av.VideoFrame.from_ndarray(np.full((40, 48, 3), 20 * index, np.uint8), format="rgb24")
-            frame.pts = tick
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())
+def times_ms(recording: Recording) -> list[float]:
+    return [frame.pts_ns * 1e-6 for frame in recording]
 
 
 @pytest.mark.parametrize(("ticks", "is_noted"), [([0, 1, 2, 50, 51, 900], True), ([0, 3, 6, 9, 12, 15], False)])
 def test_frames_keep_their_times_in_the_file(tmp_path: Path, ticks: list[int], is_noted: bool) -> None:
-    write_timed(tmp_path / "v.mkv", ticks)
+    videos.write_timed(tmp_path / "v.mkv", ticks)
     recording = open_recording(tmp_path / "v.mkv")
     assert [frame.pts_ns for frame in recording] == [tick * 40_000_000 for tick in ticks]
     assert any("0.04 to 34 s apart" in note for note in recording.notes) == is_noted
@@ -100,14 +92,87 @@ def test_frames_keep_their_times_in_the_file(tmp_path: Path, ticks: list[int], i
 
 def test_even_times_are_multiples_of_the_frame_duration(tmp_path: Path) -> None:
     """Matroska rounds times to milliseconds."""
-    write_timed(tmp_path / "v.mkv", [0, 1, 2, 3, 4, 5])
+    videos.write_timed(tmp_path / "v.mkv", [0, 1, 2, 3, 4, 5])
     recording = open_recording(tmp_path / "v.mkv")
     assert [frame.pts_ns for frame in recording] == [index * 40_000_000 for index in range(6)]
     assert not any("apart" in note for note in recording.notes)
 
 
+VARIABLE_MS = [0, 33, 99, 132, 232, 265, 331, 364, 464]
+
+
+@pytest.mark.parametrize("suffix", [".mkv", ".mp4"])
+@pytest.mark.parametrize("start_ms", [0, 5000])
+def test_a_variable_frame_rate_gives_the_files_times_and_the_mean_rate(
+    tmp_path: Path, suffix: str, start_ms: int
+) -> None:
+    path = tmp_path / f"v{suffix}"
+    videos.write_timed(path, [start_ms + time for time in VARIABLE_MS], 30, Fraction(1, 1000))
+    recording = open_recording(path)
+    assert times_ms(recording) == pytest.approx(VARIABLE_MS, abs=1e-6)
+    assert recording.fps == pytest.approx(8 / 0.464)
+    assert any("0.033 to 0.1 s apart. They keep their times" in note for note in recording.notes)
+    assert times_ms(open_recording(path, max_frames=5)) == pytest.approx(VARIABLE_MS[:5], abs=1e-6)
+
+
+@pytest.mark.parametrize("suffix", [".mkv", ".mp4"])
+@pytest.mark.parametrize(("off_ms", "is_kept"), [(8, True), (1, False)])
+def test_times_within_half_a_frame_are_kept_unless_the_container_rounded_them(
+    tmp_path: Path, suffix: str, off_ms: int, is_kept: bool
+) -> None:
+    even = [40 * index for index in range(9)]
+    written = [time + off_ms * (index % 4 == 2) for index, time in enumerate(even)]
+    recording = open_recording(videos.write_timed(tmp_path / f"v{suffix}", written, 25, Fraction(1, 1000)))
+    assert times_ms(recording) == pytest.approx(written if is_kept else even, abs=1e-6)
+    assert any("apart" in note for note in recording.notes) == is_kept
+
+
+def test_a_constant_rate_has_the_times_of_its_rate_in_a_file_that_rounds_them(tmp_path: Path) -> None:
+    path = videos.write_timed(
+        tmp_path / "v.mkv", [round(index * 1000 / 30) for index in range(12)], 30, Fraction(1, 1000)
+    )
+    recording = open_recording(path)
+    assert (recording.fps, [frame.pts_ns for frame in recording]) == (30, [round(k * 1e9 / 30) for k in range(12)])
+    assert not any("apart" in note for note in recording.notes)
+
+
+def test_evenly_spaced_times_replace_a_stated_rate_that_is_wrong(tmp_path: Path) -> None:
+    path = videos.write_timed(tmp_path / "v.mkv", [20 * index for index in range(12)], 25, Fraction(1, 1000))
+    recording = open_recording(path)
+    assert recording.fps == pytest.approx(50)
+    assert times_ms(recording) == pytest.approx([20 * index for index in range(12)], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ([0, 40, 80, 80, 160, 200], "1 of its 6 frame times are repeated"),
+        ([0] * 6, "5 of its 6 frame times are repeated"),
+        ([0, 40, 120, 80, 160, 200], "its frame times go backwards 1 times"),
+    ],
+)
+def test_times_that_do_not_increase_are_replaced_by_the_rate(tmp_path: Path, changed: list[int], said: str) -> None:
+    path = videos.write_timed(tmp_path / "v.mkv", list(range(6)))
+    videos.set_times(path, changed)
+    recording = open_recording(path)
+    frames = list(recording)
+    assert [frame.pts_ns for frame in frames] == [index * 40_000_000 for index in range(6)]
+    assert [int(frame.image[0, 0, 0]) for frame in frames] == [20 * index for index in range(6)], "in file order"
+    assert any(f"{said}. Its frames are taken as evenly spaced, at 25 frames/s" in note for note in recording.notes)
+
+
+def test_a_stated_rate_does_not_change_the_times_of_a_variable_rate(tmp_path: Path) -> None:
+    videos.write_timed(tmp_path / "video.mkv", VARIABLE_MS, 30, Fraction(1, 1000))
+    (tmp_path / "recording.json").write_text(
+        '{"format": "intrasplat-recording", "version": 1, "fps": 60}', encoding="utf-8"
+    )
+    recording = open_recording(tmp_path)
+    assert times_ms(recording) == pytest.approx(VARIABLE_MS, abs=1e-6)
+    assert any("states 60 frames/s, and the video has 17.24 frames/s on average" in note for note in recording.notes)
+
+
 def test_a_video_longer_than_a_day_is_refused(tmp_path: Path, refused: Refused) -> None:
-    write_timed(tmp_path / "v.mkv", [0, 1, 25 * 86_401])
+    videos.write_timed(tmp_path / "v.mkv", [0, 1, 25 * 86_401])
     refused(tmp_path / "v.mkv", RecordingInvalid, "86401 s after the first one", "25 frames/s")
 
 

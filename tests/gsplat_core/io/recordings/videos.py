@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Sequence
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +59,34 @@ def encode(path: Path, codec: str, images: Sequence[np.ndarray] | None = None, *
             container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
         container.mux(stream.encode(None))
     return path
+
+
+def write_timed(path: Path, ticks: list[int], rate: int = 25, tick: Fraction = Fraction(1, 25)) -> Path:
+    """Write one frame for each display time, in units of `tick` seconds, to a file that states `rate`.
+
+    Matroska states no number of frames. Its blocks have no checksum, so that `set_times` may change them.
+    """
+    with av.open(str(path), "w", options={"write_crc32": "0"} if path.suffix == ".mkv" else {}) as container:
+        stream = container.add_stream("ffv1" if path.suffix == ".mkv" else "mjpeg", rate=rate)
+        stream.width, stream.height, stream.pix_fmt = 48, 40, "bgr0" if path.suffix == ".mkv" else "yuvj420p"
+        stream.codec_context.time_base = tick
+        for index, time in enumerate(ticks):
+            frame = av.VideoFrame.from_ndarray(np.full((40, 48, 3), 20 * index % 240, np.uint8), format="rgb24")
+            frame.pts, frame.time_base = time, tick
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    return path
+
+
+def set_times(path: Path, times_ms: list[int]) -> None:
+    """Overwrite the times of a Matroska file's blocks, which an encoder would refuse to write."""
+    with av.open(str(path)) as container:
+        packets = [(packet.pos, bytes(packet)) for packet in container.demux(video=0) if packet.size]
+    data = bytearray(path.read_bytes())
+    for (position, payload), time_ms in zip(packets, times_ms, strict=True):
+        at = data.index(payload, position)  # before it: the track, the time in 2 bytes, flags
+        data[at - 3 : at - 1] = time_ms.to_bytes(2, "big", signed=True)
+    path.write_bytes(data)
 
 
 def name_of(codec: str) -> str:
