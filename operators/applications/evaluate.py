@@ -205,7 +205,9 @@ def evaluate(
     """
     check_device(settings.device)
     check_renderer(settings.renderer, settings.device)
-    source, scale, playback, notes = fitting_source(settings.recording, model, settings.scale, settings.max_frames, run)
+    source, scale, playback, notes = fitting_source(
+        settings.recording, model, settings.scale, settings.max_frames, run, stop_requested
+    )
     check_picture(source.description.camera, scale)
     work = _Work(model, run, settings, source, playback, scale, folder, progress, stop_requested)
     work.notes += [*source.description.notes, *notes]

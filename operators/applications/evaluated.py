@@ -110,7 +110,12 @@ def frame_tolerance_s(fps: float) -> float:
 
 
 def fitting_source(
-    address: Path | str, model: Model, scale: float | None, max_frames: int | None, run: EvaluatedRun | None = None
+    address: Path | str,
+    model: Model,
+    scale: float | None,
+    max_frames: int | None,
+    run: EvaluatedRun | None = None,
+    stop_requested: Callable[[], bool] = lambda: False,
 ) -> tuple[FrameSource, float, Playback, list[str]]:
     """Open the recording at the model's size and check that it fits the model.
 
@@ -120,6 +125,7 @@ def fitting_source(
         scale: scale of the frames; None selects the scale that gives the model's size.
         max_frames: number of frames to read; None for all.
         run: settings of the run that made the model; None if unknown.
+        stop_requested: polled while the recording is read; True ends that.
 
     Returns:
         The source as `judged` returns it, its scale, the mapping of its timestamps, and notes for the report.
@@ -157,7 +163,7 @@ def fitting_source(
         playback, more = _session_playback(model, Path(address), description)
     else:
         playback, more = _playback(model, description, None if run is None else run.fps, max_frames is not None)
-    return judged(source), scale, playback, [*notes, *more]
+    return judged(source, stop_requested), scale, playback, [*notes, *more]
 
 
 def poses_of_run(source: FrameSource, run: EvaluatedRun | None) -> Path | None:

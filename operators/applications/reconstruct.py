@@ -257,7 +257,7 @@ class _Fitting:
         """
         settings = self._settings
         with seeded(settings.seed, settings.device):
-            inputs = _Inputs(judged(self._source), settings)
+            inputs = _Inputs(judged(self._source, self._stop_requested), settings)
             if settings.poses == "estimated":
                 try:
                     inputs = _posed(inputs)

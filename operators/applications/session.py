@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from itertools import takewhile
 from pathlib import Path
 from time import perf_counter
 from typing import Protocol, TypeVar, cast
@@ -322,12 +323,16 @@ class FirstFrames:
             self.source.close()
 
 
-def judged(source: FrameSource) -> JudgedSource:
+def judged(source: FrameSource, stop_requested: Callable[[], bool] = lambda: False) -> JudgedSource:
     """Wrap a source for offline runs, which have no checks of a stream.
 
     Frames whose picture shows nothing (black, single-coloured or noise) are withheld. Pixels that the scope never saw, such
     as those outside of a round view, are excluded from the loss. To find them, all frames but the held-out ones are read
     once. If the source cannot be read again, no pixels are excluded.
+
+    Args:
+        source: closed source.
+        stop_requested: polled for each frame; True ends the reading, and the pixels are those of the frames so far.
 
     Returns:
         The wrapped source, not open.
@@ -343,7 +348,7 @@ def judged(source: FrameSource) -> JudgedSource:
         source,
         seen_in_recording(
             frame.image
-            for frame in FirstFrames(bare, about.frame_count)
+            for frame in takewhile(lambda _: not stop_requested(), FirstFrames(bare, about.frame_count))
             if frame.unusable is None and not is_heldout(frame.seq) and frame.image.shape[:2] == size
         ),
     )

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from operators.applications import session as session_module
-from operators.applications.session import FirstFrames, saves_model
+from operators.applications.session import FirstFrames, judged, saves_model
 from operators.outcome import OutcomeBuilder
 from operators.reconstruct import ModelResult
 from operators.sources.source import SourceState
@@ -72,3 +72,16 @@ def test_the_newest_model_is_saved(tmp_path, monkeypatch, reached_its_own, has_f
     assert run.reached.outputs == ({"model": tmp_path / "model"} if model else {})
     result = run.reached.find(ModelResult)
     assert (None if result is None else result.model) == model
+
+
+def test_the_search_for_the_field_of_view_ends_at_a_stop_request(monkeypatch, frame):
+    monkeypatch.setattr(session_module, "seen_in_recording", lambda pictures: looked.extend(pictures))
+    source = Scripted([frame(k) for k in range(12)])
+    source.description.frame_count = 12
+    source.description.height_px, source.description.width_px = frame(0).image.shape[:2]
+    looked = []
+    judged(source)
+    assert len(looked) == 10, "frames 1 and 9 are held out"
+    looked = []
+    judged(source, lambda: len(source.left) <= 7)
+    assert len(looked) == 3 and source.calls == ["open", "close"] * 2
