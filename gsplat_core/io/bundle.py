@@ -60,7 +60,7 @@ def safetensors_pieces(tensors: Mapping[str, Tensor]) -> Iterator[bytes | memory
 
 
 RUN_MODEL = "model"
-"""Name of the model's folder in the folder of a run, which is proposed where the latter is given."""
+"""Name of the model's folder inside the folder of a run; named in the error of a user who gives the folder of the run."""
 TENSORS, NEXT_TENSORS = "model.safetensors", "model.next.safetensors"
 MANIFEST, NEXT_MANIFEST = "manifest.json", "manifest.next.json"
 MAX_HEADER_BYTES = 1 << 20

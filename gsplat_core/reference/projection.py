@@ -181,7 +181,7 @@ def _blurred(covars2d: Tensor, eps2d: float, compensation_floor: float) -> _Elli
     det = torch.where(positive, det, torch.ones_like(det))
     conics = torch.stack([c / det, -b / det, a / det], -1)
     ratio = (a0 * c0 - b * b) / det
-    # Not clamp: at a floor of 0 the square root's gradient is infinite.
+    # `clamp` is not used, because at a floor of 0 the square root's gradient is infinite.
     above = ratio > compensation_floor**2
     compensations = torch.where(above, torch.where(above, ratio, 1).sqrt(), compensation_floor)
     return _Ellipses(torch.stack([a, c], -1), conics, compensations, positive)

@@ -114,6 +114,7 @@ class RightEye:
 
     @cached_property
     def observation(self) -> Observation:
+        """Observation of the right eye; the first access creates it."""
         return self._make()
 
 
@@ -201,7 +202,12 @@ class ObservationWindow:
         return self._frames[-1 if newest else int(self._random.integers(0, len(self._frames)))]
 
     def schedule(self, steps: int) -> list[Observation]:
-        """Return observations for the next steps, ending with the newest frame, which is displayed next."""
+        """Return one observation for each of the next `steps` optimiser steps. The last one is the newest frame, which is displayed
+        next.
+
+        Raises:
+            InvalidInput: if `steps` is negative.
+        """
         if steps < 0:
             raise InvalidInput(f"steps is {steps}; it must be at least 0")
         if steps == 0:

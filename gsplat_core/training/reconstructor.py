@@ -281,7 +281,7 @@ class Reconstructor:
             True if the frame shows a scene that was left before.
         """
         if self._step is not None and not anew:
-            # A doubtful frame may be the newest of the window, and shows the next scene if this one ends with it.
+            # The newest frame of the window may be doubtful. If the scene ends with it, that frame shows the next scene.
             seen, last = self._certain or (None, self._window.newest)
             self._left.leave(self._step, last.camera, last.time_s, seen)
         self._end_scene()

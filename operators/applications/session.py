@@ -149,6 +149,7 @@ class Start:
 
     @staticmethod
     def now() -> Start:
+        """Return the current time."""
         return Start(datetime.now(UTC), perf_counter())
 
 

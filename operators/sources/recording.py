@@ -153,7 +153,12 @@ def realtime_source(rest: str, options: SourceOptions) -> RealtimeSource:
 
 
 def play(path: str, options: SourceOptions) -> RealtimeSource:
-    """Open a recording on disk for playback in real time."""
+    """Open a recording on disk for playback in real time.
+
+    Raises:
+        InvalidSetting: the recording has no frames.
+        RecordingError: as `open_recording` raises it.
+    """
     recording = open_recording(path, scale=options.scale, max_frames=None if options.loop else options.max_frames)
     if recording.frame_count < 1:
         raise InvalidSetting(f"{recording.name} has no frames")

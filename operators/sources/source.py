@@ -227,7 +227,11 @@ class ThreadedSource:
         self._thread.start()
 
     def read(self, timeout_s: float) -> Frame | None:
-        """Return the next frame, waiting at most `timeout_s` seconds; None if there is none."""
+        """Return the next frame, waiting at most `timeout_s` seconds; None if there is none.
+
+        Raises:
+            Exception: the exception of `frames()`, once, after all earlier frames were returned.
+        """
         with self._changed:
             self._changed.wait_for(lambda: self._ready or self._done, timeout_s)
             if self._ready:

@@ -70,7 +70,8 @@ struct DeviceSsim {
 };
 constexpr int64_t kSsimMostRows = 65535 * 32;  // maximum grid size in the second dimension, times the tile height
 void ssim_on_device(const DeviceSsim& ssim, CudaScratch& scratch, cudaStream_t stream);
-// Compute the mean similarity of `values` pixels' channels: all without a mask that are not in the border.
+// Compute the mean similarity without a mask. `values` is the number of compared values: channels times pixels outside of
+// the border.
 void ssim_mean_on_device(DeviceSsim ssim, double values, float* mean, CudaScratch& scratch, cudaStream_t stream);
 
 }  // namespace gsplat::ssim
