@@ -74,6 +74,7 @@ class SourceOp(Operator):
         self._until_s: float | None = None
         """End of the duration on the monotonic clock in seconds, infinite without a limit; None until the source is opened."""
         self._out_of_time = False
+        self._failed = False
         self.stop_requested = stop_requested
         self.emitted = 0
         self.reached_end = False
@@ -92,7 +93,7 @@ class SourceOp(Operator):
         self.damaged = DamagedFrames()
         self.withheld.clear()
         self._states = _TimeInStates()
-        self._out_of_time = False
+        self._out_of_time = self._failed = False
         self._until_s = None
 
     def stop(self) -> None:
@@ -141,6 +142,16 @@ class SourceOp(Operator):
         if self.damaged.count:
             outcome.note(self.damaged.sentence(self.emitted))
 
+    @property
+    def displayed_state(self) -> SourceState:
+        """State of the source for the display. Thread-safe.
+
+        After an ordinary end or a stop it is `LIVE`, because no frame was lost. The last pictures then become stale by their
+        age. It is `ENDED` only after the source failed.
+        """
+        state = self.source.state
+        return SourceState.LIVE if state is SourceState.ENDED and not self._failed else state
+
     def _next(self) -> Frame | None:
         """Read the next frame. None if no frame arrived in time or the stream has ended."""
         if self._until_s is None:
@@ -151,7 +162,11 @@ class SourceOp(Operator):
                 self._out_of_time = time.monotonic() > self._until_s
                 self.stop_execution()
                 return None
-            frame = self.source.read(LOOK_S)
+            try:
+                frame = self.source.read(LOOK_S)
+            except Exception:
+                self._failed = True
+                raise
             self._states.saw(self.source, frame is not None)
             if frame is not None:
                 return frame

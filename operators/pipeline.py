@@ -279,7 +279,7 @@ class Pipeline(Application):
             self,
             name="display",
             clock=clock,
-            source_state=lambda: self.frame_source.state,
+            source_state=lambda: self.source_op.displayed_state,
             guard=self.pace.guard,
         )
         self.add_flow(rasterize, self.display, {("rendered", "rendered")})

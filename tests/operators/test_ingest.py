@@ -174,3 +174,24 @@ def test_states_and_counts_of_a_live_source_are_contributed(camera, frame):
     outcome = OutcomeBuilder()
     app.source.contribute(outcome)
     assert "the source scripted dropped or repaired: too_late 3" in outcome.notes
+
+
+@pytest.mark.parametrize("error", [None, ValueError("unplugged")])
+def test_the_display_takes_a_failure_for_a_loss_and_an_ordinary_end_not(camera, frame, error):
+    app = Stream(Scripted([frame(0), *([] if error is None else [error])], camera))
+    try:
+        app.run()
+    except OperatorFailed:
+        assert error is not None
+    assert app.given.state is SourceState.ENDED
+    assert app.source.displayed_state is (SourceState.LIVE if error is None else SourceState.ENDED)
+
+
+@pytest.mark.parametrize("state", [SourceState.STALLED, SourceState.RECONNECTING])
+def test_the_display_sees_a_source_that_gives_nothing_for_a_while(camera, frame, state):
+    app = Stream(Reporting([frame(0), state, None, frame(1)], camera))
+    seen = []
+    read = app.given.read
+    app.given.read = lambda timeout_s: (seen.append(app.source.displayed_state), read(timeout_s))[1]
+    app.run()
+    assert state in seen and app.source.displayed_state is SourceState.LIVE

@@ -74,6 +74,16 @@ def everything_came(watch: Watched) -> None:
     assert watch.part(SourceResult).reached_end
 
 
+def test_the_end_of_a_stream_is_no_loss_of_its_source(watched):
+    script = Script()
+    script.good(12)
+    watch = watched(script)
+    everything_came(watch)
+    assert watch.part(LiveDisplayResult).states["live"] >= 1
+    assert "source lost" not in watch.part(LiveDisplayResult).states
+    assert all(picture.state is not PictureState.SOURCE_LOST for picture in watch.shown)
+
+
 @pytest.mark.slow
 def test_pictures_that_are_none(watched):
     """Black, duplicated, frozen, torn and damaged."""
@@ -218,7 +228,7 @@ def test_a_source_that_is_gone_for_five_seconds(watched):
     everything_came(watch)
     source, states = watch.part(SourceResult), watch.part(LiveDisplayResult).states
     assert source.state_s["stalled"] > 4 and source.counts["stalls"] == 1
-    assert states["live"] >= 2 and states["source lost"] >= 1
+    assert states["live"] >= 2 and states["source lost"] == 1, "the end of the script is none"
     gone = [
         picture
         for picture in watch.shown
