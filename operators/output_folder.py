@@ -292,7 +292,7 @@ def _check_file_path(out: Path, inputs: Sequence[Path], overwrite: bool, into_re
     if not os.path.lexists(out):
         return
     if not overwrite:
-        raise OutputError(f"{out} is there already; give another {option}, or --overwrite to replace it")
+        raise OutputError(f"{out} already exists; give another {option}, or --overwrite to replace it")
     if out.is_symlink() or not out.is_file():
         raise OutputError(f"{out} is not a plain file, so that it is not replaced; give another {option}")
     if (part := _part_of(inputs, out)) is not None:

@@ -92,13 +92,13 @@ class PoseOp(Operator):
         )
         if found.explained < MOSTLY:
             outcome.note(
-                "the poses explain little of how the pictures move: the scope may stand still before tissue that moves"
+                "the poses explain little of the motion of the pictures: the scope may be at rest in front of moving tissue"
             )
         if found.not_placed:
-            outcome.note(f"{found.not_placed} frames could not be placed and stand where the one before stands")
+            outcome.note(f"{found.not_placed} frames could not be placed and have the pose of the frame before")
         if found.begun > 1:
             outcome.note(
-                f"{found.begun - 1} times the scope was lost, and poses began anew: where it is then, beside where it was before, is not known unless it came back"
+                f"the scope was lost {found.begun - 1} times, and its poses started anew: the new place relative to the earlier one is not known, unless the scope returned"
             )
 
 

@@ -281,7 +281,7 @@ def _fill(places: Places, folder: Path) -> Backup:
 
 def _refuse_target(places: Places, target: Path) -> None:
     if os.path.lexists(target):
-        raise BackupFailed(f"{target} is there already, and a backup replaces nothing; give a folder that is not there")
+        raise BackupFailed(f"{target} already exists, and a backup replaces nothing; give a new folder")
     if not target.absolute().parent.is_dir():
         raise BackupFailed(f"{target.absolute().parent} is no folder; make it, or give another place")
     # A service creates these files at its first start. An empty folder may be the mount point of a missing disk.

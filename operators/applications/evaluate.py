@@ -284,7 +284,7 @@ class _Work:
     def _why_not(self, name: str) -> str | None:
         if name == "heldout":
             if self.run is None:
-                self.notes.append("nothing says whether the held-out frames were kept from the model's training")
+                self.notes.append("it is not known whether the held-out frames were excluded from the model's training")
             elif not self.run.heldout:
                 return "the run trained on the held-out frames; make it with --heldout, or by reconstruct"
         if name == "second_eye" and not self.source.description.is_stereo:
@@ -342,11 +342,11 @@ class _Work:
         run, steps = self.run, self.settings.steps_per_frame
         if run is None:
             self.notes.append(
-                "the causal protocol learned with the default settings: nothing says how the model was made"
+                "the causal protocol trained with the default settings: the settings of the model's training are not known"
             )
         elif run.steps_per_frame is None and steps is None:
             self.notes.append(
-                "the causal protocol learned with the default steps per frame: the run did not train frame by frame"
+                "the causal protocol trained with the default steps per frame: the run did not train frame by frame"
             )
         if steps is None and run is not None:
             steps = run.steps_per_frame
@@ -386,7 +386,7 @@ class _Work:
                 record=record,
             )
         if found is None:
-            self.notes.append("second_eye was not measured: nothing says where the right eye's camera is")
+            self.notes.append("second_eye was not measured: the position of the right eye's camera is not known")
         return found
 
     def _live(self) -> Live:

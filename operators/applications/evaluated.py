@@ -156,8 +156,8 @@ def fitting_source(
         notes.append("the model does not say which recording it was made from")
     elif model.training_digest != description.digest:
         notes.append(
-            "the model was made from other files than these: the figures say how well it shows a recording that it was not made from,"
-            " unless only files beside the pictures have changed"
+            "the model was made from other files than these: the figures state how well it shows a recording that it was not made from,"
+            " unless only files next to the pictures have changed"
         )
     if is_session(Path(address)):
         playback, more = _session_playback(model, Path(address), description)

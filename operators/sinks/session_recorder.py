@@ -74,7 +74,7 @@ def stated(recorded: Recorded) -> list[str]:
         )
     if recorded.deleted_sessions:
         said.append(
-            f"earlier recordings beside {recorded.folder} were removed to keep within the bounds: {recorded.deleted_sessions}"
+            f"earlier recordings next to {recorded.folder} were removed to keep within the bounds: {recorded.deleted_sessions}"
         )
     return said
 

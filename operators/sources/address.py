@@ -359,7 +359,7 @@ class FolderAddress:
         made = cls(address.place, _fps(address, options), address.flag("every"), _open_s(address))
         address.refuse_others()
         if not address.place:
-            raise InvalidSetting("folder: say which: folder:/path/of/images")
+            raise InvalidSetting("folder: the path is empty; give folder:/path/of/images")
         return made
 
 
@@ -380,7 +380,7 @@ class PipeAddress:
         made = cls(address.place, address.size(), address.text("format"), _fps(address, options))
         address.refuse_others()
         if not made.place:
-            raise InvalidSetting("pipe: say which: pipe:- for standard input, or pipe:/path/of/a/fifo")
+            raise InvalidSetting("pipe: the path is empty; give pipe:- for standard input, or pipe:/path/of/a/fifo")
         if made.size is None and made.format not in (None, "y4m"):
             raise InvalidSetting(
                 f"pipe: raw frames in {made.format!r:.60} need their size: ?size=640x512&format={made.format:.60}"

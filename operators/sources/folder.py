@@ -149,7 +149,7 @@ class FolderSource(StreamSource):
                     seq += 1
                     picture = self._next()
             except OSError as error:
-                self.lost(f"{self._name} cannot be looked at ({error.strerror}); it is looked for again")
+                self.lost(f"{self._name} cannot be read ({error.strerror}); reading is retried")
                 self.wait(10 * LOOK_S)
             if self._files.late:
                 self.count("out_of_order", self._files.late)

@@ -110,7 +110,7 @@ class Y4mHeader:
         words = line.decode("ascii", "replace").split(" ")
         if words[0].encode() != MAGIC:
             raise InvalidSetting(
-                f"this is no YUV4MPEG2 stream (it begins with {line[:16]!r}); for raw frames say ?size=640x512&format=rgb24"
+                f"this is no YUV4MPEG2 stream (it begins with {line[:16]!r}); for raw frames give ?size=640x512&format=rgb24"
             )
         tags = {word[0]: word[1:] for word in reversed(words[1:]) if word and word[0] in "WHFCI"}
         full = "XCOLORRANGE=FULL" in words
@@ -242,7 +242,7 @@ class PipeSource(StreamSource):
         while b"\n" not in self._pending:
             if len(self._pending) > MOST_HEADER_BYTES:
                 raise InvalidSetting(
-                    f"{self._name} does not describe itself (it begins with {self._pending[:16]!r}); say ?size=640x512&format=rgb24"
+                    f"{self._name} does not describe itself (it begins with {self._pending[:16]!r}); give ?size=640x512&format=rgb24"
                 )
             self._pending += self._some(1, until_s)
         line, _, self._pending = self._pending.partition(b"\n")

@@ -262,7 +262,7 @@ def own_folder(path: Path) -> None:
         )
     if found.st_mode & 0o077:
         raise RuntimeFolderUnusable(
-            f"{path} may be looked into by others (mode {stat.S_IMODE(found.st_mode):04o}), and patients' pictures go through it;"
+            f"{path} can be read by other users (mode {stat.S_IMODE(found.st_mode):04o}), but patients' pictures pass through it;"
             f" run `chmod 700 {path}`"
         )
 

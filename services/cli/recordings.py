@@ -145,12 +145,12 @@ def _say(found: Trajectory, focal: FocalLength | None, recording: FileRecording,
         notes.append(_about_focal_length(focal, recording.camera))
     if found.explained < MOSTLY:
         notes.append(
-            f"the scope's motion explains only {found.explained:.0%} of how the pictures move: it may stand still before tissue that moves"
+            f"the scope's motion explains only {found.explained:.0%} of the motion of the pictures: it may be at rest in front of moving tissue"
         )
     notes += _about_breathing(found, float(recording.camera.K[0, 0]))
     if found.lost:
         notes.append(
-            f"{len(found.lost)} frames could not be placed and stand where the one before stands, from frame {found.lost[0]} on"
+            f"{len(found.lost)} frames could not be placed and have the pose of the frame before, from frame {found.lost[0]} on"
         )
     facts = {
         "path": str(out),

@@ -191,7 +191,7 @@ class Requests:
             ClientError: if the verification fails, the file cannot be written, or it exists and `overwrite` is False.
         """
         if os.path.lexists(file) and not overwrite:
-            raise ClientError(f"{file} is there already; give another name, or --overwrite to replace it")
+            raise ClientError(f"{file} already exists; give another name, or --overwrite to replace it")
         try:
             with (
                 PartialFile(file, overwrite=overwrite) as partial,
@@ -209,7 +209,7 @@ class Requests:
         except httpx2.HTTPError as error:
             raise self._unreachable(error) from error
         except FileExistsError as error:
-            raise ClientError(f"{file} is there already; give another name, or --overwrite to replace it") from error
+            raise ClientError(f"{file} already exists; give another name, or --overwrite to replace it") from error
         except OSError as error:
             raise ClientError(f"{file} cannot be written: {error.strerror or error}") from error
         except (httpx2.InvalidURL, ValueError) as error:

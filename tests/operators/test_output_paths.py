@@ -111,13 +111,13 @@ def test_a_file_replaces_only_what_this_program_wrote_and_only_when_asked(tmp_pa
     out = tmp_path / "a.json"
     check_file_path(out)
     out.write_text(REPORT)
-    refused("is there already; give another --to, or --overwrite", out, option="--to")
+    refused("already exists; give another --to, or --overwrite", out, option="--to")
     check_file_path(out, overwrite=True)
     out.write_text("{}")
     refused("was not written by intrasplat", out, overwrite=True)
     link = tmp_path / "b.json"
     link.symlink_to(out)
-    refused("is there already", link)
+    refused("already exists", link)
     out.write_text(REPORT)
     refused("is not a plain file", link, overwrite=True)
     (tmp_path / "gone.json").symlink_to(tmp_path / "nothing")

@@ -57,10 +57,10 @@ def test_a_model_alone_is_evaluated_and_what_is_not_known_about_it_is_said(intra
     shutil.copytree(offline / "model", tmp_path / "elsewhere")
     report = evaluated(intrasplat, tmp_path / "elsewhere", long)
     assert report.heldout is not None and report.retention is not None and report.live is None
-    assert any("nothing says whether the held-out frames" in note for note in report.notes)
+    assert any("it is not known whether the held-out frames" in note for note in report.notes)
     assert any("live was not measured" in note for note in report.notes)
     beside = evaluated(intrasplat, offline / "model", long)
-    assert beside.evaluated.command == "reconstruct" and not any("nothing says" in note for note in beside.notes)
+    assert beside.evaluated.command == "reconstruct" and not any("it is not known" in note for note in beside.notes)
 
 
 def test_reports_are_written_and_the_table_is_printed(intrasplat, long, offline, tmp_path):

@@ -50,7 +50,7 @@ def work(tmp_path: Path, run: EvaluatedRun | None = None, **settings: Any) -> ev
     ("run_steps", "asked", "steps", "note"),
     [
         (12, None, 12, None), (12, 30, 30, None), (None, 30, 30, None), (None, None, None, "did not train frame by frame"),
-        ("no run", 30, 30, "nothing says how the model was made"), ("no run", None, None, "nothing says how"),
+        ("no run", 30, 30, "the settings of the model's training are not known"), ("no run", None, None, "training are not known"),
     ],
 )  # fmt: skip
 def test_the_causal_protocol_learns_as_the_run_did(
@@ -130,7 +130,7 @@ def test_protocols_that_cannot_be_measured(
         silent = reason is None or name == "second_eye"
         notes = [note for note in made.notes if "was not measured" in note]
         assert len(notes) == (not silent) and all(reason in note for note in notes)
-        assert any("nothing says whether" in note for note in made.notes) == (name == "heldout" and run is None)
+        assert any("it is not known whether" in note for note in made.notes) == (name == "heldout" and run is None)
 
 
 def test_learning_protocols_are_measured_only_if_asked_for(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from operators.sinks.session_recorder import Recorded, stated
         ({"lost": {"frame: the recording has ended": 4}}, []),
         ({"ended": "the disk is full", "bytes": 2**20}, ["ended before the session, with 1.0 MiB: the disk is full"]),
         ({"deleted_segments": 1}, ["1 older segments"]),
-        ({"deleted_sessions": 2}, ["earlier recordings beside .*: 2$"]),
+        ({"deleted_sessions": 2}, ["earlier recordings next to .*: 2$"]),
     ],
 )  # fmt: skip
 def test_each_loss_is_one_sentence(fields, said):

@@ -129,7 +129,7 @@ def test_a_folder_that_goes_and_comes_back(images, reading):
     stream.frame()
     shutil.rmtree(images)
     stream.until(lambda: stream.source.state is SourceState.RECONNECTING)
-    assert "cannot be looked at" in stream.source.state_sentence
+    assert "cannot be read" in stream.source.state_sentence
     images.mkdir()
     time.sleep(0.05)
     write(images, 1, 60)

@@ -27,7 +27,7 @@ def test_a_file_that_is_there_is_replaced_only_on_request(tmp_path, capsys):
     model, file = save_model(tmp_path / "model"), tmp_path / "liver.isplat"
     file.write_bytes(b"mine")
     assert run(["pack", str(model), str(file)]) == BAD_INPUT
-    assert "is there already" in capsys.readouterr().err and file.read_bytes() == b"mine"
+    assert "already exists" in capsys.readouterr().err and file.read_bytes() == b"mine"
     assert run(["pack", str(model), str(file), "--overwrite"]) == BAD_INPUT
     assert "was not written by intrasplat" in capsys.readouterr().err and file.read_bytes() == b"mine"
     file.unlink()

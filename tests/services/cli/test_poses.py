@@ -116,7 +116,7 @@ def test_a_calibrated_camera_is_taken_as_it_is(clip, capsys):
 def test_a_scope_that_may_stand_still_is_said(clip, capsys):
     said = said_of(capsys, clip(STILL))
     assert said["explained"] < 0.75
-    assert any("it may stand still before tissue that moves" in note for note in said["notes"])
+    assert any("it may be at rest in front of moving tissue" in note for note in said["notes"])
 
 
 @pytest.mark.slow
@@ -152,7 +152,7 @@ def test_a_file_that_is_there_is_replaced_only_on_request(clip, capsys):
     file = folder.parent / "mine.npy"
     file.write_bytes(b"mine")
     assert run(["poses", str(folder), "--out", str(file)]) == BAD_INPUT
-    assert "is there already" in capsys.readouterr().err and file.read_bytes() == b"mine"
+    assert "already exists" in capsys.readouterr().err and file.read_bytes() == b"mine"
     assert run(["poses", str(folder), "--out", str(file), "--overwrite"]) == BAD_INPUT
     assert "was not written by intrasplat" in capsys.readouterr().err and file.read_bytes() == b"mine"
     file.unlink()

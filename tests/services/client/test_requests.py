@@ -191,7 +191,7 @@ def test_a_fetched_file_replaces_another_only_when_asked(tmp_path: Path) -> None
         return Client(httpx2.Response(200, content=content))._get_file("/", file, **options)
 
     assert get(b"whole") == 5 and file.read_bytes() == b"whole"
-    with pytest.raises(ClientError, match="is there already"):
+    with pytest.raises(ClientError, match="already exists"):
         get(b"other!")
     assert file.read_bytes() == b"whole"
     assert get(b"other!", overwrite=True) == 6 and file.read_bytes() == b"other!"
