@@ -98,7 +98,7 @@ class DepthCounts:
         for doubt, frames in doubts.items():
             outcome.note(f"{frames} frames got no depth: {doubt}")
         if self._dropped:
-            outcome.note(f"the depth that {self._dropped} frames came with was not used (depth is {choice!r})")
+            outcome.note(f"the depth delivered with {self._dropped} frames was not used (depth is {choice!r})")
 
 
 def without_depth(choice: str, fields: frozenset[str], config: ReconstructorConfig) -> str | None:

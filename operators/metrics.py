@@ -623,4 +623,4 @@ class CompareShownOp(Operator):
                 f"frame {result.first_different}: replay gives the same ones on the same device, processor and versions"
             )
         elif result.same:
-            outcome.note(f"all {result.same} pictures that the session showed came out again, byte for byte")
+            outcome.note(f"all {result.same} pictures of the session were reproduced byte for byte")

@@ -355,7 +355,7 @@ class UntilDisplay(Training):
         outcome.add(TakenDepth(self._depths_taken, age_ms, self._depths_dropped))
         if self._depths_taken:
             outcome.note(
-                f"the depth of {self._depths_taken} frames was learned after they were shown, {age_ms:.0f} ms after they had come (median)"
+                f"the depth of {self._depths_taken} frames was used in training after they were shown, {age_ms:.0f} ms after they had arrived (median)"
             )
 
 

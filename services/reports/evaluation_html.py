@@ -67,7 +67,7 @@ def measured(report: EvaluationReport) -> list[Measured]:
         add("heldout", "Held out", "frames that training never saw", report.heldout.score, against)
     if report.second_eye is not None:
         against = named("second_eye", "semi_global_matching", "previous_right", "left_shifted")
-        shown = "every tenth frame as the right eye sees the final model, a straight line per channel fitted"
+        shown = "every tenth frame, the final model seen by the right eye, after a linear fit per channel"
         add("second_eye", "Right eye", shown, report.second_eye.score, against)
     if report.retention is not None:
         start_s, end_s = report.retention.last_range_s
@@ -131,8 +131,8 @@ def scale_sentence(geometry: GeometryFacts) -> str | None:
         return None
     scale = geometry.depth.scale
     if abs(scale - 1) > RELATIVE_FROM:
-        return f"the model's lengths must be multiplied by {scale:.3g}: it is uncalibrated, and only the relative figures say something about it"
-    return f"the model's lengths must be multiplied by {scale:.3f}"
+        return f"the factor from the model's lengths to true ones is {scale:.3g}: the model is uncalibrated, and only the relative figures apply to it"
+    return f"the factor from the model's lengths to true ones is {scale:.3f}"
 
 
 def _depth(geometry: GeometryFacts) -> Iterator[GeometryRow]:
@@ -247,7 +247,7 @@ def geometry_section(report: EvaluationReport) -> str:
         for row in rows
     )
     scale = scale_sentence(geometry)
-    note = "" if scale is None else f'<p class="note">To be true in length, {escape(scale)}.</p>'
+    note = "" if scale is None else f'<p class="note">{escape(scale[0].upper() + scale[1:])}.</p>'
     return (
         f'<section><h2>In three dimensions</h2><p class="lead">{geometry.frames:,} frames, spread evenly; relative figures say nothing'
         ' about lengths.</p><table><thead><tr><th scope="col">What</th><th scope="col" class="n">the model</th>'
@@ -264,7 +264,7 @@ def geometry_lines(report: EvaluationReport) -> list[str]:
     what, value = max(len(row.what) for row in rows), max(len(row.value) for row in rows)
     lines = [f"{row.what:<{what}}  {row.value:<{value}}  {row.baselines}" for row in rows]
     scale = scale_sentence(geometry)
-    return [*lines, *([f"to be true in length, {scale}"] if scale else [])]
+    return [*lines, *([scale] if scale else [])]
 
 
 _LINES = {

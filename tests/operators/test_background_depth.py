@@ -210,7 +210,7 @@ def test_recorded_depth_is_kept_or_dropped_as_the_setting_says(frame, compute, c
         assert passed is given and outcome.find(FoundDepth).frames == {"measured": 1} and outcome.notes == ()
     else:
         assert (passed.depth, passed.depth_origin) == (None, None)
-        assert outcome.notes == (f"the depth that 1 frames came with was not used (depth is {choice!r})",)
+        assert outcome.notes == (f"the depth delivered with 1 frames was not used (depth is {choice!r})",)
 
 
 def test_the_outcome_has_what_came_and_what_was_found(estimator, frame, compute):
@@ -224,7 +224,7 @@ def test_the_outcome_has_what_came_and_what_was_found(estimator, frame, compute)
     outcome = OutcomeBuilder()
     operator.contribute(outcome)
     assert outcome.find(FoundDepth) == FoundDepth({"stereo": 1}, 1.0, False, {}, 0)
-    assert any("1 frames came with was not used" in note for note in outcome.notes)
+    assert any("delivered with 1 frames was not used" in note for note in outcome.notes)
 
 
 def test_another_name_is_refused():

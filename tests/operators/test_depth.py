@@ -74,7 +74,7 @@ def test_none_drops_recorded_depth_and_says_so(frame, compute):
     operator = started("none")
     (passed,) = compute(operator, frame=frame(0, depth=PLANE, depth_origin=DEPTH_ORIGINS["measured"]))
     assert (passed.depth, passed.depth_confidence, passed.depth_origin) == (None, None, None)
-    assert outcome_of(operator).notes == ("the depth that 1 frames came with was not used (depth is 'none')",)
+    assert outcome_of(operator).notes == ("the depth delivered with 1 frames was not used (depth is 'none')",)
 
 
 @pytest.mark.parametrize("choice", ["auto", "recorded", "stereo"])
@@ -221,7 +221,7 @@ def test_counts_of_depth_are_shares_and_sentences(frame):
         "not estimated for 5 frames",
         "it was slow",
         "4 frames got no depth: dark",
-        "the depth that 1 frames came with was not used (depth is 'stereo')",
+        "the depth delivered with 1 frames was not used (depth is 'stereo')",
     ):
         assert said in text
 

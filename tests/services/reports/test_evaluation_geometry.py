@@ -121,7 +121,7 @@ def test_trajectory_and_parts_are_shares() -> None:
 )
 def test_a_model_without_scale_is_said_to_have_none(scale: float, calibrated: bool) -> None:
     said = scale_sentence(geometry(depth=depth(scale)))
-    assert said is not None and said.startswith(f"the model's lengths must be multiplied by {scale:g}"[:44])
+    assert said is not None and said.startswith(f"the factor from the model's lengths to true ones is {scale:g}"[:54])
     assert ("uncalibrated" in said) is not calibrated
     assert scale_sentence(geometry()) is None
 
@@ -132,11 +132,9 @@ def test_the_page_and_the_terminal_have_the_rows_and_the_scale() -> None:
     )
     page = geometry_section(report)
     assert page.count("<tr><th scope") == 4 and page.count("absolute") == 1 and page.count("<td>relative") == 2
-    assert "1,200 frames" in page and "multiplied by 2: it is uncalibrated" in page
+    assert "1,200 frames" in page and "true ones is 2: the model is uncalibrated" in page
     lines = geometry_lines(report)
-    assert len(lines) == 4 and lines[-1].startswith(
-        "to be true in length, the model's lengths must be multiplied by 2:"
-    )
+    assert len(lines) == 4 and lines[-1].startswith("the factor from the model's lengths to true ones is 2:")
     assert lines[0].index("level") == lines[1].index("level") == lines[2].index("best-fit"), "columns are aligned"
     without: Any = Facts(geometry=geometry(normals=report.geometry.normals))
     assert "note" not in geometry_section(without) and len(geometry_lines(without)) == 1
