@@ -471,8 +471,8 @@ JUDGED_FRAMES = 12
 FORGOTTEN_FRAMES = 600
 """Consecutive pictures without combs after which a stream is no longer interlaced."""
 STAND_OUT_LEVELS = 4
-"""Excess over both neighbouring lines, in levels, above which a pixel of an odd line and its neighbours in the line are
-replaced.
+"""Difference from both neighbouring lines, in levels, above which a pixel of an odd line that is brighter or darker than both is
+replaced, with its neighbours in the line.
 """
 
 

@@ -1,4 +1,6 @@
-"""Export of a model to a file, at one or several times of its window, and of splats as bytes of `.ply`, compressed `.ply` and `.splat` files, with gsplat's arguments."""
+"""Export of a model to a file, at one or several times of its window.
+
+`export_splats` returns splats as the bytes of a `.ply`, compressed `.ply` or `.splat` file, with gsplat's arguments."""
 
 from __future__ import annotations
 
