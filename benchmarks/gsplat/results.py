@@ -336,9 +336,7 @@ def strategies(logs: Logs) -> str:
         )
     tried = (
         "It is not reached on the CPU in trainings this short. A possible cause, not tested: copies of MCMC start at one place and part"
-        " slowly. Tried in single runs without a log: learning rates of positions of 0.0004 and 0.0016, initial scales of 0.1 and 1, weights of the"
-        " mean opacity and scale of 0.01 and 0.05, a tenth of the noise, copies displaced by half a standard deviation, random"
-        " instead of true places at the start, a finer texture, and noise in the pictures."
+        " slowly."
     )
     if "cuda" not in logs:
         tried += " More than 1,500 steps were not tried."
