@@ -130,13 +130,18 @@ class Pace:
         """
         return {} if self.clock is None else {"policy": "drop_oldest", "capacity": capacity}
 
-    def training(self, depth: DepthOp) -> Training:
-        """Return the policy that decides how much each frame is trained on; `depth` is the graph's depth operator."""
+    def training(self, depth: DepthOp, stop_requested: Callable[[], bool]) -> Training:
+        """Return the policy that decides how much each frame is trained on.
+
+        Args:
+            depth: the graph's depth operator.
+            stop_requested: polled between the optimiser steps of a plain recording.
+        """
         if self.clock is not None:
             return UntilDisplay(self.clock, depth.background, self.guard)
         if self.session is not None:
             return RecordedCalls(self.session.schedule, self.session.late_depths)
-        return EveryFrame(self.held_out)
+        return EveryFrame(self.held_out, stop_requested)
 
 
 @dataclass(frozen=True)
@@ -221,7 +226,7 @@ class Pipeline(Application):
             self,
             name="reconstruct",
             make_reconstructor=self._make_reconstructor,
-            training=pace.training(depth),
+            training=pace.training(depth, self._stop_requested),
             recorder=outputs.recorder,
         )
         deform = DeformOp(self, name="deform")

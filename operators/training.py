@@ -135,10 +135,20 @@ class Learner:
         self._record(lambda: SceneBegun(seq=frame.seq, anew=anew))
         self.newest = None
 
-    def observe(self, frame: Frame, *, budget: Budget | None = None, train: bool) -> Reconstruction:
-        """Process the next frame, train on it if `train` is True, and publish the model."""
+    def observe(
+        self,
+        frame: Frame,
+        *,
+        budget: Budget | None = None,
+        train: bool,
+        stop_requested: Callable[[], bool] | None = None,
+    ) -> Reconstruction:
+        """Process the next frame, train on it if `train` is True, and publish the model. Arguments as for
+        `Reconstructor.observe`."""
         doubtful = frame.unusable is not None
-        report = self.reconstructor.observe(frame, budget=budget, train=train, doubtful=doubtful)
+        report = self.reconstructor.observe(
+            frame, budget=budget, train=train, doubtful=doubtful, stop_requested=stop_requested
+        )
         if train:
             self.learned = frame
             self.counts.frames += 1
@@ -230,9 +240,15 @@ class EveryFrame(Training):
     following frames need a model.
     """
 
-    def __init__(self, held_out: Callable[[Frame], bool] = lambda frame: False) -> None:
-        """held_out: returns True for frames to exclude from training."""
-        self._held_out = held_out
+    def __init__(
+        self,
+        held_out: Callable[[Frame], bool] = lambda frame: False,
+        stop_requested: Callable[[], bool] | None = None,
+    ) -> None:
+        """held_out: returns True for frames to exclude from training. stop_requested: polled between optimiser steps; True
+        ends the training of the frame.
+        """
+        self._held_out, self._stop_requested = held_out, stop_requested
 
     def learn(self, frame: Frame, learner: Learner, frame_waits: Callable[[], bool]) -> Reconstruction | None:
         """Train the configured number of optimiser steps on the frame, or display it untrained (see the class).
@@ -243,7 +259,7 @@ class EveryFrame(Training):
         if not learner.enter(frame, usable=usable):
             return None
         train = learner.newest is None or ((usable or frame.is_followed) and not self._held_out(frame))
-        return learner.observe(frame, train=train)
+        return learner.observe(frame, train=train, stop_requested=self._stop_requested)
 
     def contribute(self, outcome: OutcomeBuilder, counts: TrainingCounts) -> None:
         if counts.withheld:

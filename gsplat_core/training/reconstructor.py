@@ -156,6 +156,7 @@ class Reconstructor:
         steps: int | None = None,
         train: bool = True,
         doubtful: bool = False,
+        stop_requested: Callable[[], bool] | None = None,
     ) -> ObserveReport:
         """Process the next frame in order and train on it.
 
@@ -166,6 +167,7 @@ class Reconstructor:
             train: False only advances the time.
             doubtful: the frame may belong to the next scene. If the scene ends with this frame, the scene is stored in its
                 state before the frame.
+            stop_requested: polled between the steps of a fixed number; True ends the training of the frame.
 
         Raises:
             InvalidInput: if the first frame is not trained on, if time runs backwards, or if the
@@ -207,6 +209,8 @@ class Reconstructor:
             self._growth.prepare(step, frame, observation, self._motion)
         if budget is None:
             budget = Budget.of_steps(self.config.first_frame_steps if first else self.config.steps_per_frame)
+        if stop_requested is not None:
+            budget = replace(budget, stop_requested=stop_requested)
         return self._schedule.train(step, self._window, observation, budget, first=first)
 
     def take_depth(self, frame: Frame, late: LateDepth | None = None) -> bool:

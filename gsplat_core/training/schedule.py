@@ -25,9 +25,9 @@ from gsplat_core.training.steps.photometric import MOST_RELAXATION, check_colour
 from gsplat_core.training.steps.step import TrainingStep
 from gsplat_core.transfers import HostCopy
 
-Ending = Literal["steps", "deadline", "at_most"]
+Ending = Literal["steps", "deadline", "at_most", "stopped"]
 """Reason why training on a frame ended: the requested number of steps was made, another step would
-have missed the deadline, or `at_most` steps were made before it.
+have missed the deadline, `at_most` steps were made before it, or a stop was requested.
 """
 MAX_IN_FLIGHT = 4
 """Largest number of unfinished steps queued on a GPU under a deadline; enough to keep the GPU busy."""
@@ -53,6 +53,8 @@ class Budget:
     """Largest number of steps before the deadline; None for no limit."""
     clock: Callable[[], float] = time.monotonic
     """Monotonic clock in seconds."""
+    stop_requested: Callable[[], bool] = lambda: False
+    """Polled before each step of a fixed number but the first; True ends the training of the frame."""
 
     def __post_init__(self) -> None:
         if self.steps is not None and self.steps < 0:
@@ -131,7 +133,7 @@ class Spending:
         """
         budget = self._budget
         if budget.steps is not None:
-            return self.made < budget.steps
+            return self.made < budget.steps and not (self.made and budget.stop_requested())
         if self._was_last:
             return False
         if by_turns and self.made % TURNS == SECOND_EYE + 1:
@@ -208,7 +210,7 @@ class Spending:
     def ending(self) -> Ending:
         """Reason why no further step is made."""
         if self._budget.steps is not None:
-            return "steps"
+            return "steps" if self.made >= self._budget.steps else "stopped"
         return "at_most" if self._budget.at_most is not None and self.made >= self._budget.at_most else "deadline"
 
 
@@ -418,6 +420,9 @@ class WindowSchedule(Schedule):
         if not budget.is_timed and self._is_jump(first_loss, first):
             extra = spending.made * JUMP_EXTRA
         for turn in range(extra):
+            if budget.stop_requested():
+                extra = turn
+                break
             loss = step(observation.by_turns(turn))
         self._unsettled = observation
         if budget.is_timed or first:

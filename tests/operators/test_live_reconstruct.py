@@ -25,7 +25,7 @@ class FakeReconstructor:
         self.camera, self.device, self.step_ns = camera, torch.device("cpu"), 1e6
         self.eyes = SimpleNamespace(trained="both")
 
-    def observe(self, frame, *, budget, train, doubtful):
+    def observe(self, frame, *, budget, train, doubtful, stop_requested=None):
         self.calls.append(("observe", frame.seq, train))
         self.doubtful[frame.seq] = doubtful
         return SimpleNamespace(steps=3 if train else 0, arriving_loss=None)

@@ -39,7 +39,7 @@ def test_the_clock_decides_on_training_before_a_session_and_a_session_before_the
     session = SimpleNamespace(schedule=list, late_depths=lambda: iter(()))
     depth = SimpleNamespace(background=None)
     paces = Pace(clock=CLOCK, session=session), Pace(session=session), Pace()
-    assert [type(pace.training(depth)) for pace in paces] == [UntilDisplay, RecordedCalls, EveryFrame]
+    assert [type(pace.training(depth, lambda: False)) for pace in paces] == [UntilDisplay, RecordedCalls, EveryFrame]
 
 
 def device_of_tools(analysis):

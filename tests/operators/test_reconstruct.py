@@ -26,7 +26,7 @@ class FakeReconstructor:
         self.version = 0
         self.make_model = make_model
 
-    def observe(self, frame, *, budget=None, train=True, doubtful=False):
+    def observe(self, frame, *, budget=None, train=True, doubtful=False, stop_requested=None):
         self.calls.append(("observe", frame.seq, train))
         return SimpleNamespace(
             seq=frame.seq,

@@ -81,6 +81,33 @@ def test_the_configured_number_of_steps_is_the_default_budget(tissue_video, came
     assert plain.snapshot().sha256() == counted.snapshot().sha256()
 
 
+def test_a_stop_ends_the_frame_after_the_step_in_progress(tissue_video, camera, clock, step_takes):
+    frames = tissue_video(2)
+    stopped, counted = Reconstructor(CONFIG, camera), Reconstructor(CONFIG, camera)
+    step_takes(1.0)
+    end_s = clock() + 3
+    report = stopped.observe(frames[0], stop_requested=lambda: clock() >= end_s)
+    assert (report.steps, report.ending, clock()) == (3, "stopped", end_s)
+    counted.observe(frames[0], steps=3)
+    assert stopped.snapshot().sha256() == counted.snapshot().sha256()
+    late = stopped.observe(frames[1], stop_requested=lambda: True)
+    assert (late.steps, late.ending) == (1, "stopped"), "a displayed frame was trained on"
+
+
+def test_a_stop_ends_the_further_steps_on_a_jump(tissue_video, camera, clock, step_takes):
+    first, second, *_ = tissue_video(2)
+    jump = second.with_fields(image=255 - second.image)
+    step_takes(1.0)
+    whole, stopped = Reconstructor(CONFIG, camera), Reconstructor(CONFIG, camera)
+    for learning in (whole, stopped):
+        learning.observe(first)
+        learning.observe(second)
+    jump = jump.with_fields(seq=second.seq + 1, pts_ns=2 * second.pts_ns)
+    assert whole.observe(jump).steps > CONFIG.steps_per_frame, "a jump has further steps"
+    end_s = clock() + CONFIG.steps_per_frame + 2
+    assert stopped.observe(jump, stop_requested=lambda: clock() >= end_s).steps == CONFIG.steps_per_frame + 2
+
+
 def test_a_step_that_would_end_after_the_deadline_is_not_made(tissue_video, camera, clock, step_takes):
     learning = Reconstructor(CONFIG, camera)
     step_takes(1.0)

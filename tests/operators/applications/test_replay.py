@@ -15,6 +15,7 @@ from gsplat_core.io.bundle import load_bundle
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.training.config import ReconstructorConfig
+from gsplat_core.training.steps.step import TrainingStep
 from operators import pipeline as pipeline_module
 from operators.applications import replay as replay_module
 from operators.applications.replay import ReplaySettings, replay
@@ -74,6 +75,15 @@ def test_a_stop_request_ends_cleanly(settings):
     outcome = replay(settings, shown.append, stop_requested=lambda: len(shown) > 2)
     assert outcome.interrupted and outcome.stop_reason == "interrupted"
     assert displayed(outcome) == ingested(outcome) == 2
+    assert set(outcome.outputs) == {"video", "model", "frames"}
+
+
+def test_a_stop_request_ends_the_training_of_the_first_frame(settings, monkeypatch):
+    made = []
+    make_step = TrainingStep.__call__
+    monkeypatch.setattr(TrainingStep, "__call__", lambda *args: (made.append(1), make_step(*args))[1])
+    outcome = replay(replace(settings, steps_per_frame=50), stop_requested=lambda: len(made) >= 2)
+    assert outcome.interrupted and len(made) == 2 + displayed(outcome) - 1
     assert set(outcome.outputs) == {"video", "model", "frames"}
 
 
