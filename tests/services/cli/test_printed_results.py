@@ -56,7 +56,7 @@ def test_a_live_run_is_summed_up(capsys: pytest.CaptureFixture[str]) -> None:
         "tissue PSNR, worst displayed frame (training error): 22.00 dB",
         "tissue PSNR, next frame, predicted before training on it: 31.00 dB (previous frame shown instead: 30.00 dB)",
         "withheld: 4 x blurred",
-        "states: 6 x steady, 1 x behind",
+        "changes of state: 6 x steady, 1 x behind",
         "out/report.html",
     ]
 
