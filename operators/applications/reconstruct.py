@@ -83,7 +83,13 @@ class FittedModel:
         return False
 
     def observe(
-        self, frame: Frame, *, budget: Budget | None = None, train: bool = True, doubtful: bool = False
+        self,
+        frame: Frame,
+        *,
+        budget: Budget | None = None,
+        train: bool = True,
+        doubtful: bool = False,
+        stop_requested: Callable[[], bool] | None = None,
     ) -> ObserveReport:
         """Accept a frame without training on it, and return a report of 0 optimiser steps."""
         return ObserveReport(frame.seq, 0, None, self.model.gaussians.count)

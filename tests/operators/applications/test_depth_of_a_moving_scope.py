@@ -70,7 +70,7 @@ def test_replay_finds_it_by_parallax_unless_something_else_is_asked_for(settings
     assert set(found.frames) == {"parallax"} and found.frames["parallax"] >= 1
     assert found.known_share > 0.5 and not found.metric
     assert asked == list(range(COUNT))
-    assert any("the depth of" in note and "its unit is not known" in note for note in outcome.notes)
+    assert any("depth was estimated" in note and "its unit is not known" in note for note in outcome.notes)
 
 
 @pytest.mark.slow

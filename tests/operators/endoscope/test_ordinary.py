@@ -11,7 +11,6 @@ from operators.checks import (
     PictureStagesOp,
     Stage,
     StageOp,
-    left_out,
     picture_stages,
 )
 from operators.outcome import OutcomeBuilder
@@ -59,7 +58,7 @@ class LeavesOutTheTop(Stage):
     def annotate(self, frame):
         kept = np.ones(frame.image.shape[:2], np.uint8)
         kept[:4] = 0
-        return left_out(frame, kept)
+        return frame.excluding(kept)
 
     carried = annotate
 

@@ -24,7 +24,6 @@ from operators.checks import (
     SharpnessStage,
     StageOp,
     StripStage,
-    left_out,
     picture_stages,
 )
 from operators.outcome import OutcomeBuilder
@@ -196,7 +195,7 @@ def test_masks_of_the_loss_add_up():
     (frame,) = frames(texture(1, 1))
     one, other = (np.ones(frame.image.shape[:2], np.uint8) for _ in range(2))
     one[:10], other[-10:] = 0, 0
-    both = left_out(left_out(frame, one), other)
+    both = frame.excluding(one).excluding(other)
     assert np.array_equal(both.loss_mask, one & other)
     assert frame.tissue is None and both.tissue is both.loss_mask
     masked = dataclasses.replace(both, mask=other)
