@@ -488,6 +488,6 @@ class Reconstructor:
 
 def validation_psnr_db(learned: Reconstructor, frames: Sequence[Frame]) -> float:
     """Return the mean tissue PSNR of a reconstruction on validation frames, in dB; 0 if none has tissue."""
-    scores = [psnr_tissue_db(learned.picture(frame), frame.image, frame.mask) for frame in frames]
+    scores = [psnr_tissue_db(learned.picture(frame), frame.image, frame.tissue) for frame in frames]
     # A frame without tissue has no score.
     return fmean([each for each in scores if math.isfinite(each)] or [0.0])
