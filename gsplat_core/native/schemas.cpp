@@ -254,6 +254,18 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "neighbour_motion_backward(Tensor before, Tensor neighbours, float stiffness, Tensor v_out) -> (Tensor v_after, Tensor "
       "v_turned)");
 
+  // Robust reprojection error of camera poses [C, 4, 4] and points [P, 3], and the normal equations of its minimum, in
+  // float64 for the CPU. Observation m of `camera` and `point` (int32 [M]) has the ray rays[m] (x / z, y / z).
+  // bundle_equations: S [C, 6, C, 6] and right [C, 6] of the cameras with the points eliminated, and for the points
+  // V^-1 [P, 3, 3], h [P, 3] and W [M, 6, 3]. place_camera: the pose of one camera that sees all points, which are fixed.
+  m.def(
+      "bundle_cost(Tensor poses, Tensor points, Tensor camera, Tensor point, Tensor rays, float focal_px, float spread_px, "
+      "float flat_px) -> Tensor");
+  m.def(
+      "bundle_equations(Tensor poses, Tensor points, Tensor camera, Tensor point, Tensor rays, float focal_px, float "
+      "spread_px, float flat_px, float damping) -> (Tensor S, Tensor right, Tensor inverse, Tensor h, Tensor coupling)");
+  m.def("place_camera(Tensor pose, Tensor points, Tensor rays, float focal_px, float spread_px, int rounds) -> Tensor");
+
   // Blended optical flow of splats that carry the surface of the first picture to the second camera: [height, width, 4],
   // the sums of weight times flow x, flow y and depth in the second camera, and of the weights. intrinsics: fx, fy,
   // cx, cy of both cameras. Tiles have 16x16 pixels.

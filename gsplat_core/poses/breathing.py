@@ -23,8 +23,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.machine import one_thread
-from gsplat_core.poses.bundle import Bundle
-from gsplat_core.poses.bundle import adjust as adjust_still
+from gsplat_core.poses.bundle import Bundle, place_cameras
 from gsplat_core.poses.moving_bundle import (
     MOST_NODES,
     PLACES,
@@ -391,7 +390,7 @@ def _all_placed(sightings: Sightings, frames: Tensor, found: MovingBundle, numbe
     fixed[frames] = True
     if fixed.all():
         return poses
-    return adjust_still(between, fixed=fixed, rounds=PLACE_ROUNDS, points_move=False).poses
+    return place_cameras(between, fixed=fixed, rounds=PLACE_ROUNDS)
 
 
 def _between(frames: Tensor, poses: Tensor, count: int) -> Tensor:

@@ -1,6 +1,6 @@
 """Bundle adjustment of camera poses and static points by minimising the reprojection error.
 
-`adjust` uses Levenberg-Marquardt with Cauchy's robust weights. The points are eliminated by the Schur complement, so
+`adjust` uses Levenberg-Marquardt with Cauchy's robust weights and compiled equations (`gsplat_core.ops.bundle_adjustment`). The points are eliminated by the Schur complement, so
 the linear system has six unknowns per camera (Triggs et al., "Bundle Adjustment: a Modern Synthesis", 2000, sections
 4.2 to 6.1). The iteration, projection derivatives and segment sums are shared with `moving_bundle`.
 
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsplat_core.machine import one_thread
+from gsplat_core.ops.bundle_adjustment import BundleEquations, Sights, bundle_cost, bundle_equations, place_camera
 from gsplat_core.poses.se3 import exp
 
 State = TypeVar("State")
@@ -195,8 +196,10 @@ class Bundle:
 
 def errors_px(bundle: Bundle) -> Tensor:
     """Return the reprojection error of each observation [M] in pixels."""
-    residual, _, _ = _residuals(bundle)
-    return residual.norm(dim=1)
+    pose = bundle.poses[bundle.camera]
+    local = (pose[:, :3, :3] @ bundle.points[bundle.point][:, :, None])[:, :, 0] + pose[:, :3, 3]
+    depth = local[:, 2:].clamp(min=NEAREST * float(local[:, 2].median().abs()))
+    return (bundle.focal_px * (local[:, :2] / depth - bundle.rays)).norm(dim=1)
 
 
 @one_thread()
@@ -206,7 +209,6 @@ def adjust(
     fixed: Tensor,
     rounds: int = 15,
     spread_px: float = 1.0,
-    points_move: bool = True,
     flat_px: float = 0.0,
 ) -> Bundle:
     """Minimise the robust reprojection error.
@@ -216,76 +218,54 @@ def adjust(
         fixed: bool [C], cameras that keep their pose. At least one must be fixed, or the whole scene may drift.
         rounds: maximum number of Levenberg-Marquardt steps.
         spread_px: Cauchy scale in pixels; errors well above it have little influence.
-        points_move: optimise the points as well. If False, each camera is optimised independently.
         flat_px: weight of a prior that all points have similar depths, for worlds whose z axis is a camera's viewing direction. A point
             whose z differs from the median by a share x of it costs as much as a squared error of `flat_px` * x pixels.
 
     Returns:
         The adjusted bundle. Its robust error, with the prior, is never larger than that of the input.
     """
-    step = lambda bundle, damping: _step(bundle, fixed, spread_px, damping, points_move, flat_px)
-    return descend(bundle, step, lambda bundle: _cost(bundle, spread_px, flat_px), rounds)[0]
+    sights = Sights(bundle.camera.int(), bundle.point.int(), bundle.rays, bundle.focal_px)
+
+    def cost_of(bundle: Bundle) -> float:
+        return bundle_cost(bundle.poses, bundle.points, sights, spread_px=spread_px, flat_px=flat_px)
+
+    def step(bundle: Bundle, damping: float) -> Bundle:
+        found = bundle_equations(
+            bundle.poses, bundle.points, sights, spread_px=spread_px, damping=damping, flat_px=flat_px
+        )
+        return _stepped(bundle, found, ~fixed)
+
+    return descend(bundle, step, cost_of, rounds)[0]
 
 
-def _cost(bundle: Bundle, spread_px: float, flat_px: float) -> float:
-    residual, _, _ = _residuals(bundle)
-    seen = torch.log1p((residual / spread_px).square().sum(1)).sum()
-    return float(seen + (flat_px / spread_px * _relief(bundle)).square().sum())
+def place_cameras(bundle: Bundle, *, fixed: Tensor, rounds: int, spread_px: float = 1.0) -> Tensor:
+    """Return poses [C, 4, 4] with the lowest robust reprojection error before the points, which keep their positions.
+
+    Args:
+        bundle: start values.
+        fixed: bool [C], cameras that keep their pose.
+        rounds: maximum number of Levenberg-Marquardt steps of each camera.
+        spread_px: Cauchy scale in pixels.
+    """
+    poses = bundle.poses.clone()
+    for camera in torch.nonzero(~fixed)[:, 0].tolist():
+        here = bundle.camera == camera
+        points, rays = bundle.points[bundle.point[here]], bundle.rays[here]
+        poses[camera] = place_camera(poses[camera], points, rays, bundle.focal_px, spread_px=spread_px, rounds=rounds)
+    return poses
 
 
-def _relief(bundle: Bundle) -> Tensor:
-    """Return the difference of each point's z from the median, as a share of the median, [P]."""
-    depth = bundle.points[:, 2]
-    return depth / depth.median() - 1
-
-
-def _residuals(bundle: Bundle) -> tuple[Tensor, Tensor, Tensor]:
-    """Return residuals [M, 2] in pixels, points in camera coordinates [M, 3] and camera rotations [M, 3, 3]."""
-    pose = bundle.poses[bundle.camera]
-    rotation = pose[:, :3, :3]
-    local = (rotation @ bundle.points[bundle.point][:, :, None])[:, :, 0] + pose[:, :3, 3]
-    depth = local[:, 2:].clamp(min=NEAREST * float(local[:, 2].median().abs()))
-    local = torch.cat([local[:, :2], depth], 1)
-    return bundle.focal_px * (local[:, :2] / depth - bundle.rays), local, rotation
-
-
-def _step(bundle: Bundle, fixed: Tensor, spread_px: float, damping: float, points_move: bool, flat_px: float) -> Bundle:
-    residual, local, rotation = _residuals(bundle)
-    weight = 1 / (1 + (residual / spread_px).square().sum(1))
-    by_local, by_rotation = ray_derivatives(local)
-    by_local = bundle.focal_px * by_local
-    by_pose = torch.cat([by_local, by_local @ by_rotation], 2)
-    weighted = by_pose * weight[:, None, None]
-    cameras, points = bundle.poses.shape[0], bundle.points.shape[0]
-    H = summed(weighted.transpose(1, 2) @ by_pose, bundle.camera, cameras)
-    g = summed((weighted.transpose(1, 2) @ residual[:, :, None])[:, :, 0], bundle.camera, cameras)
-    H = H + damping * diagonal_of(H)
-    free = ~fixed
-    if not points_move:
-        twist = -torch.linalg.solve(H[free], g[free][:, :, None])[:, :, 0]
-        return replace(bundle, poses=_moved(bundle.poses, free, twist))
-    by_point = by_local @ rotation
-    weighted_point = (by_point * weight[:, None, None]).transpose(1, 2)
-    V = summed(weighted_point @ by_point, bundle.point, points)
-    h = summed((weighted_point @ residual[:, :, None])[:, :, 0], bundle.point, points)
-    if flat_px:
-        by_depth = flat_px / float(bundle.points[:, 2].median())
-        V[:, 2, 2] += by_depth**2
-        h[:, 2] += by_depth * flat_px * _relief(bundle)
-    V = V + damping * diagonal_of(V)
-    inverse = torch.linalg.inv(V)
-    # Store all camera-by-point blocks densely; this suffices for a few hundred cameras and a few thousand points.
-    W = torch.zeros(cameras * points, 6, 3, dtype=local.dtype)
-    W.index_add_(0, bundle.camera * points + bundle.point, weighted.transpose(1, 2) @ by_point)
-    W = W.view(cameras, points, 6, 3)[free]
+def _stepped(bundle: Bundle, found: BundleEquations, free: Tensor) -> Bundle:
+    """Return the bundle after a step of the free cameras and of the points; the bundle itself if the equations have no solution."""
     count = int(free.sum())
-    eliminated = torch.einsum("cpij,pjk->cpik", W, inverse)
-    rows = W.permute(0, 2, 1, 3).reshape(count * 6, points * 3)
-    S = torch.block_diag(*H[free]) - eliminated.permute(0, 2, 1, 3).reshape(count * 6, points * 3) @ rows.T
-    right = g[free] - torch.einsum("cpij,pj->ci", eliminated, h)
-    twist = -torch.linalg.solve(S, right.reshape(-1, 1)).view(count, 6)
-    shift = -(inverse @ (h + torch.einsum("cpij,ci->pj", W, twist))[:, :, None])[:, :, 0]
-    return replace(bundle, poses=_moved(bundle.poses, free, twist), points=bundle.points + shift)
+    S = found.S[free][:, :, free].reshape(6 * count, 6 * count)
+    if not bool(S.isfinite().all()):
+        return bundle
+    twist = torch.zeros_like(found.right)
+    twist[free] = -torch.linalg.solve(S, found.right[free].reshape(-1, 1)).view(count, 6)
+    along = (found.coupling.transpose(1, 2) @ twist[bundle.camera][:, :, None])[:, :, 0]
+    shift = -(found.inverse @ (found.h + summed(along, bundle.point, len(found.h)))[:, :, None])[:, :, 0]
+    return replace(bundle, poses=_moved(bundle.poses, free, twist[free]), points=bundle.points + shift)
 
 
 def _moved(poses: Tensor, free: Tensor, twist: Tensor) -> Tensor:

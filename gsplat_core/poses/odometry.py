@@ -50,6 +50,7 @@ from gsplat_core.geometry.tracks import (
     followed,
 )
 from gsplat_core.machine import one_thread, usable_cores
+from gsplat_core.ops.bundle_adjustment import place_camera
 from gsplat_core.poses.breathing import BreathingTrajectory, Sightings, breathing_trajectory
 from gsplat_core.poses.bundle import Bundle, adjust, errors_px
 from gsplat_core.poses.se3 import between
@@ -240,13 +241,15 @@ class _Odometry:
         known = self._known[self._point[here]]
         if int(known.sum()) < LEAST_POINTS:
             return False
-        pose, point = self._poses[frame : frame + 1], self._point[here][known]
-        bundle = Bundle(
-            pose, self._points[point], torch.zeros(len(point), dtype=torch.int64), torch.arange(len(point)),
-            self._rays[here][known], self._focal,
-        )  # fmt: skip
-        fixed = torch.zeros(1, dtype=torch.bool)
-        self._poses[frame] = adjust(bundle, fixed=fixed, rounds=POSE_ROUNDS, points_move=False).poses[0]
+        point = self._point[here][known]
+        self._poses[frame] = place_camera(
+            self._poses[frame],
+            self._points[point],
+            self._rays[here][known],
+            self._focal,
+            spread_px=1.0,
+            rounds=POSE_ROUNDS,
+        )
         return True
 
     def _take_up(self, frame: int) -> None:

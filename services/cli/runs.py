@@ -318,7 +318,11 @@ def _summary(report: RunReport, facts: LiveFacts) -> str:
     lines += quality_line(name, facts.settled_psnr_tissue_db, facts.previous_frame_db)
     lines += quality_line(f"worst {name}", facts.worst_psnr_tissue_db, None)
     lines += next_frame_line(report)
-    for name, counts in (("withheld", facts.withheld), ("new scenes", facts.scenes), ("changes of state", facts.states)):
+    for name, counts in (
+        ("withheld", facts.withheld),
+        ("new scenes", facts.scenes),
+        ("changes of state", facts.states),
+    ):
         if counts:
             lines.append(f"{name}: " + ", ".join(f"{count} x {reason}" for reason, count in counts.items()))
     return "\n".join(lines)

@@ -245,7 +245,7 @@ def test_depth_that_comes_late_is_learned_after_the_next_picture_and_told(live, 
     live.operator.contribute(outcome)
     taken = outcome.find(TakenDepth)
     assert (taken.frames, taken.dropped) == (1, 0) and taken.age_p50_ms == pytest.approx(133, rel=0.04)
-    assert any("the depth of 1 frames was learned" in note for note in outcome.notes)
+    assert any("the depth of 1 frames was used in training after they were shown" in note for note in outcome.notes)
 
 
 def test_depth_that_the_model_does_not_take_is_counted_and_not_told(live, one_by_one, frame):
