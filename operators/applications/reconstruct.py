@@ -62,8 +62,8 @@ from operators.storage import storage_errors
 
 MINUTES_ON_GPU, MINUTES_ON_CPU = 0.75, 10.0
 """Time limits in minutes of an offline reconstruction that chooses its number of optimiser steps automatically."""
-ALTERNATIVE_SHARE = 0.1
-"""Share of the time limit above which the first trial training was too slow to try other inputs (poses, depth, eyes)."""
+ALTERNATIVES_UNTIL = 0.4
+"""Share of the time limit at which the last trial of other inputs (poses, depth, eyes) must be expected to end."""
 
 
 @dataclass(frozen=True)
@@ -303,7 +303,8 @@ class _Fitting:
             ("depth was not used, because it makes the pictures worse", _without_depth),
             ("the right eye was not used, because it makes the pictures of the left one worse", _left_eye),
         ):
-            if self._is_stopped or first.duration_s(first.steps) > ALTERNATIVE_SHARE * limit_s:
+            ends_s = self._clock() - self._begin_s + first.duration_s(first.steps)
+            if self._is_stopped or ends_s > ALTERNATIVES_UNTIL * limit_s:
                 break
             if (other := other_than(inputs)) is None:
                 continue

@@ -48,6 +48,27 @@ def test_depth_and_the_right_eye_are_left_out_where_they_hurt(tmp_path, monkeypa
     assert run["eyes"] == ("left" if dropped else "both")
 
 
+@pytest.mark.parametrize(("trial_s", "tried"), [(7, ["depth", "right eye"]), (11, ["depth"]), (13, [])])
+def test_other_inputs_are_tried_while_they_end_early_enough(tmp_path, monkeypatch, trial_s, tried):
+    """Each trial takes the test's time, of a limit of 60 s."""
+    folder = synthesize(tmp_path / "take", frames=8, width_px=40, height_px=32)
+    monkeypatch.setattr(offline, "FIRST_STEPS", 1)
+    monkeypatch.setattr(offline, "MOST_STEPS", 1)
+    now_s = 0.0
+
+    def score(learned, frames):
+        nonlocal now_s
+        now_s += trial_s
+        return 30.0 + (learned.snapshot().depth_source is None) + (learned.config.eyes == "left")
+
+    monkeypatch.setattr(module, "validation_psnr_db", score)
+    settings = module.ReconstructSettings(recording=folder, out=tmp_path / "out", sinks=(), eyes="both", minutes=1.0)
+    outcome = module.reconstruct(settings, clock=lambda: now_s)
+    assert [
+        name for name in ("depth", "right eye") if any(f"{name} was not used" in note for note in outcome.notes)
+    ] == tried
+
+
 @pytest.fixture
 def moving(tmp_path):
     """Folder with pictures of a moving scope, without poses."""
