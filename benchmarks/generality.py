@@ -414,19 +414,21 @@ def generality_text(folder: Path = FOLDER) -> str:
             results = {part: [line["result"] for line in own if "result" in line] for part, own in found.items()}
             firsts = [own[0] for own in found.values() if own]
             parts += [f"## {title}, {name}", text_of(results)]
-            parts.append(f"{_origin(firsts[0])}; " + ", ".join(f"`{each['command']}`" for each in firsts) + ".")
+            parts.append(
+                f"{_origin(firsts[0], is_timed=False)}; " + ", ".join(f"`{each['command']}`" for each in firsts) + "."
+            )
     if len(parts) == 2:
         parts.append("Not measured yet.")
     return "\n\n".join(parts) + "\n"
 
 
-def _origin(line: Mapping[str, Any]) -> str:
-    """Return commit, date and machine of a log line as text."""
+def _origin(line: Mapping[str, Any], *, is_timed: bool = True) -> str:
+    """Return commit, date and machine of a log line as text; of timed runs with the machine's interruptions."""
     about = line["machine"]
     gpu = f"{about['gpu']}, " if "gpu" in about else ""
     return (
         f"Measured at commit {line['commit']}, {line['date']}, {gpu}{about['cores']} cores of {about['cpu']}, torch {about['torch']}"
-        f"{pauses_text(about)}"
+        f"{pauses_text(about) if is_timed else ''}"
     )
 
 
