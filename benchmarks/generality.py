@@ -246,7 +246,7 @@ def offline_table(groups: Mapping[str, list[dict[str, Any]]]) -> str:
 
 
 def _between_db(result: Mapping[str, Any]) -> float | None:
-    """Return the PSNR of the frames over which the neighbours' mean is, in dB."""
+    """Return the PSNR of the frames over which the neighbours' mean is, in dB; of all held-out frames in logs that do not state it."""
     own = value(result, "quality.heldout_between.psnr_tissue_db")
     return value(result, "quality.heldout.psnr_tissue_db") if own is None else own
 

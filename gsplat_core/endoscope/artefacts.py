@@ -175,9 +175,10 @@ def seen_in_recording(pictures: Iterable[NDArray[np.uint8]]) -> NDArray[np.uint8
     for count, picture in enumerate(pictures, 1):
         mask = view.observe(picture)
         strips.observe(picture)
-        if count == WINDOW_FRAMES or not held or mask is not held[-1]:
-            # The outline of the first frame alone is no longer needed once a whole window was examined.
-            held = [*(held if count > WINDOW_FRAMES else []), mask]
+        if count <= WINDOW_FRAMES:
+            held = [mask]
+        elif mask is not held[-1]:
+            held.append(mask)
     masks = [mask for mask in held if mask is not None]
     seen = np.maximum.reduce(masks) if masks and len(masks) == len(held) else None
     if strips.mask is None:

@@ -256,11 +256,9 @@ def place_cameras(bundle: Bundle, *, fixed: Tensor, rounds: int, spread_px: floa
 
 
 def _stepped(bundle: Bundle, found: BundleEquations, free: Tensor) -> Bundle:
-    """Return the bundle after a step of the free cameras and of the points; the bundle itself if the equations have no solution."""
+    """Return the bundle after a step of the free cameras and of the points; with NaN if the equations have no solution."""
     count = int(free.sum())
     S = found.S[free][:, :, free].reshape(6 * count, 6 * count)
-    if not bool(S.isfinite().all()):
-        return bundle
     twist = torch.zeros_like(found.right)
     twist[free] = -torch.linalg.solve(S, found.right[free].reshape(-1, 1)).view(count, 6)
     along = (found.coupling.transpose(1, 2) @ twist[bundle.camera][:, :, None])[:, :, 0]

@@ -9,10 +9,7 @@ import torch
 from torch import Tensor
 
 from gsplat_core.ops.bundle_adjustment import BundleEquations, Sights
-from gsplat_core.poses.bundle import diagonal_of, ray_derivatives, summed
-
-NEAREST = 1e-3
-"""Smallest depth used in projections, as a share of the median depth."""
+from gsplat_core.poses.bundle import NEAREST, diagonal_of, ray_derivatives, summed
 
 
 def residuals(poses: Tensor, points: Tensor, sights: Sights) -> tuple[Tensor, Tensor, Tensor]:

@@ -122,37 +122,20 @@ def _check(poses: Tensor, points: Tensor, sights: Sights) -> None:
 
 
 @torch.library.register_fake("gsplat_core::bundle_cost")
-def _cost_fake(
-    poses: Tensor,
-    points: Tensor,
-    camera: Tensor,
-    point: Tensor,
-    rays: Tensor,
-    focal_px: float,
-    spread_px: float,
-    flat_px: float,
-) -> Tensor:
+def _cost_fake(poses: Tensor, *_: object) -> Tensor:
     return poses.new_empty(())
 
 
 @torch.library.register_fake("gsplat_core::bundle_equations")
 def _equations_fake(
-    poses: Tensor,
-    points: Tensor,
-    camera: Tensor,
-    point: Tensor,
-    rays: Tensor,
-    focal_px: float,
-    spread_px: float,
-    flat_px: float,
-    damping: float,
+    poses: Tensor, points: Tensor, camera: Tensor, *_: object
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     cameras, count = poses.shape[0], points.shape[0]
-    sizes = ((cameras, 6, cameras, 6), (cameras, 6), (count, 3, 3), (count, 3), (rays.shape[0], 6, 3))
+    sizes = ((cameras, 6, cameras, 6), (cameras, 6), (count, 3, 3), (count, 3), (camera.shape[0], 6, 3))
     S, right, inverse, h, coupling = (poses.new_empty(size) for size in sizes)
     return S, right, inverse, h, coupling
 
 
 @torch.library.register_fake("gsplat_core::place_camera")
-def _place_fake(pose: Tensor, points: Tensor, rays: Tensor, focal_px: float, spread_px: float, rounds: int) -> Tensor:
+def _place_fake(pose: Tensor, *_: object) -> Tensor:
     return pose.new_empty(4, 4)

@@ -1,5 +1,6 @@
 """The trivial baselines: by hand on a small stream, and the protocol's figures on the real recording."""
 
+import dataclasses
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -84,6 +85,23 @@ def test_copies_of_several_ages_and_what_their_masks_hide():
     assert measure_baselines([old, frame(1, 90, other)]).copies[1].psnr_both_db == pytest.approx(decibels(10), abs=1e-4)
     with pytest.raises(InvalidInput, match="at least one frame old"):
         measure_baselines([frame(0, 1)], ages=(0,))
+
+
+def test_pixels_outside_of_a_round_view_do_not_count():
+    """They equal those of other frames, so the baselines would score higher."""
+    inside = np.array([[1, 1, 0], [1, 0, 0]], np.uint8)
+
+    def seen(seq, level):
+        return dataclasses.replace(
+            frame(seq, level), image=inside[..., None] * np.uint8(level) * np.ones(3, np.uint8), loss_mask=inside
+        )
+
+    measured = measure_baselines([seen(0, 100), seen(1, 120), seen(2, 130), seen(3, 150)])
+    assert measured.previous_frame_db == pytest.approx(np.mean([decibels(d) for d in (20, 10, 20)]), abs=1e-4)
+    assert measured.heldout_neighbour_mean_db == pytest.approx(decibels(5), abs=1e-4)
+    expected = np.mean([100, 130, 150]) - 120
+    assert measured.heldout_train_mean_db == pytest.approx(decibels(expected), abs=1e-3)
+    assert measured.copies[1].psnr_both_db == pytest.approx(measured.previous_frame_db)
 
 
 def moving(seq, shift_px, size=48):

@@ -107,6 +107,14 @@ def test_a_point_behind_a_camera_is_finite():
     assert float(errors_px(found)[true.point != 0].max()) < 1
 
 
+def test_a_point_that_is_not_finite_changes_nothing():
+    true = known_scene(cameras=3, points=30)
+    start = disturbed(true)
+    start.points[4, 0] = float("nan")
+    found = adjust(start, fixed=first_only(true))
+    assert torch.equal(found.poses, start.poses) and torch.equal(found.points[5:], start.points[5:])
+
+
 @pytest.mark.parametrize("points_move", [True, False])
 def test_exact_derivatives_converge_quadratically(points_move):
     """With an error in a derivative, steps still improve, but five of them do not reach 1e-7 px from 20 px."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import DEPTH_ORIGINS, Frame
 from gsplat_core.training.config import LearningRates, ReconstructorConfig
 from gsplat_core.training.metrics import psnr_tissue_db
-from gsplat_core.training.reconstructor import Reconstructor
+from gsplat_core.training.reconstructor import Reconstructor, validation_psnr_db
 
 CONFIG = ReconstructorConfig(
     gaussians=400,
@@ -330,3 +331,16 @@ def test_queued_steps_are_checked_before_the_scene_is_read_or_left(make_frame, c
     for count, call in enumerate(calls, 1):
         call()
         assert settled == [step] * count
+
+
+@pytest.mark.parametrize("excluded", ["mask", "loss_mask"])
+def test_validation_leaves_out_tools_and_what_the_scope_does_not_see(excluded):
+    """The picture is off by 10 levels where the frame counts, and by 200 elsewhere. A frame without such pixels has no score."""
+    image = np.full((8, 12, 3), 40, np.uint8)
+    kept = np.zeros((8, 12), np.uint8)
+    kept[:, :6] = 1
+    picture = np.repeat(np.where(kept[..., None], 50, 240), 3, 2).astype(np.uint8)
+    learned = SimpleNamespace(picture=lambda frame: picture)
+    frames = [Frame(0, 0, image, **{excluded: kept}), Frame(1, 1, image, **{excluded: 0 * kept})]
+    assert validation_psnr_db(learned, frames) == pytest.approx(20 * np.log10(255 / 10), abs=1e-6)
+    assert validation_psnr_db(learned, frames[1:]) == 0
