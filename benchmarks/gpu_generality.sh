@@ -9,8 +9,8 @@ set -uo pipefail
 cd "$(dirname "$0")/.."
 out=$(realpath -m "$1") runs=${2:-3} recordings=$(realpath "${INTRASPLAT_RECORDINGS:?names the folder of the recordings}")
 python=${PYTHON:-python3}
-# Offline recordings that the first GPU takes after its live runs.
-late=(cutting heart others/organ_still)
+# Offline recordings that the first GPU takes before its live runs.
+first=(cutting heart others/organ_still)
 mkdir -p "$out"
 export PYTHONPATH=$PWD${PYTHONPATH:+:$PYTHONPATH} PYTHONUNBUFFERED=1
 benchmarks/gpu_build.sh > "$out/build.txt" 2>&1 || exit 1
@@ -24,23 +24,23 @@ tests() { benchmarks/gpu_tests.sh > "$out/tests.txt" 2>&1; }
 live() { measure live --parts live && measure live_own_rate --parts live_own_rate; }
 others() {
   mapfile -t names < <("$python" -c 'import sys; sys.path.insert(0, "benchmarks"); import generality, pathlib
-print(*(name for name in generality.recordings(pathlib.Path(sys.argv[1])) if name not in sys.argv[2:]), sep="\n")' "$recordings" "${late[@]}")
+print(*(name for name in generality.recordings(pathlib.Path(sys.argv[1])) if name not in sys.argv[2:]), sep="\n")' "$recordings" "${first[@]}")
   measure offline --parts offline --only "${names[@]}"
 }
 rooms() { "$python" benchmarks/suite.py --device cuda --only rooms_cutting --out "$out" > "$out/rooms.txt" 2>&1; }
-last() { measure offline_late --parts offline --only "${late[@]}"; }
+first() { measure offline_first --parts offline --only "${first[@]}"; }
 
 if [ "$(nvidia-smi --list-gpus | wc -l)" -gt 1 ]; then
   half=$(($(nproc) / 2))
   (export CUDA_VISIBLE_DEVICES=1; taskset -cp "$half-$((2 * half - 1))" "$BASHPID" > /dev/null; tests; rooms; others) &
   beside=$!
-  (export CUDA_VISIBLE_DEVICES=0; taskset -cp "0-$((half - 1))" "$BASHPID" > /dev/null; live && last)
+  (export CUDA_VISIBLE_DEVICES=0; taskset -cp "0-$((half - 1))" "$BASHPID" > /dev/null; first && live)
   wait "$beside"
 else
   tests
   rooms
-  live
+  first
   others
-  last
+  live
 fi
-cat "$out"/live.part.jsonl "$out"/live_own_rate.part.jsonl "$out"/offline.part.jsonl "$out"/offline_late.part.jsonl > "$out/cuda.jsonl"
+cat "$out"/live.part.jsonl "$out"/live_own_rate.part.jsonl "$out"/offline.part.jsonl "$out"/offline_first.part.jsonl > "$out/cuda.jsonl"
