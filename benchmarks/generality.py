@@ -225,7 +225,7 @@ def offline_table(groups: Mapping[str, list[dict[str, Any]]]) -> str:
         gains = [
             held_out - (mean if mean < 100 else EQUAL_FRAMES_DB)
             for each in results
-            if (held_out := _between_db(each)) is not None
+            if (held_out := value(each, "quality.heldout_between.psnr_tissue_db")) is not None
             and (mean := value(each, "quality.baselines.heldout_neighbour_mean_db")) is not None
         ]
         met = ("met" if min(gains) >= 0 else "missed") if gains else "–"
@@ -243,12 +243,6 @@ def offline_table(groups: Mapping[str, list[dict[str, Any]]]) -> str:
             )
         )
     return table(head, rows)
-
-
-def _between_db(result: Mapping[str, Any]) -> float | None:
-    """Return the PSNR of the frames over which the neighbours' mean is, in dB; of all held-out frames in logs that do not state it."""
-    own = value(result, "quality.heldout_between.psnr_tissue_db")
-    return value(result, "quality.heldout.psnr_tissue_db") if own is None else own
 
 
 def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
