@@ -23,7 +23,7 @@ differ nearly by the homography of a plane. `MotionTest` is this test for a stre
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from dataclasses import dataclass
@@ -462,12 +462,15 @@ class CameraPath:
         return CameraPath(self.times_s[others], self.poses[others], self.trajectory).at(time_s)
 
 
-def camera_path_of(frames: Sequence[Frame], camera: Camera) -> CameraPath:
+def camera_path_of(
+    frames: Sequence[Frame], camera: Camera, after_frame: Callable[[], None] = lambda: None
+) -> CameraPath:
     """Estimate the path of a scope. Periodic tissue motion stays a part of it, because it moves the pictures as well.
 
     Args:
         frames: frames in temporal order. Their depth, if any, gives the unit of length.
         camera: intrinsics, and the pose of the first frame.
+        after_frame: called after each frame is tracked. An exception that it raises ends the estimation.
 
     Raises:
         InvalidInput: for more than `MOST_PATH_FRAMES` frames, and as `trajectory_of`.
@@ -476,7 +479,13 @@ def camera_path_of(frames: Sequence[Frame], camera: Camera) -> CameraPath:
         raise InvalidInput(
             f"a path is estimated for at most {MOST_PATH_FRAMES} frames, not for {len(frames)}: write poses with `intrasplat poses`"
         )
-    found = trajectory_of(frames, camera, separate_breathing=False)
+
+    def read() -> Iterator[Frame]:
+        for frame in frames:
+            yield frame
+            after_frame()
+
+    found = trajectory_of(read(), camera, separate_breathing=False)
     poses = found.poses.copy()
     poses[:, :3, 3] *= _unit(frames, found, camera)
     return CameraPath(np.array([frame.time_s for frame in frames]), poses @ camera.world_to_camera, found)

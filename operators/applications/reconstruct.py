@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
@@ -34,6 +35,7 @@ from gsplat_core.training.offline import (
     ToFit,
     Train,
     Trained,
+    Trial,
     choose_steps,
     split,
     trial_of,
@@ -62,8 +64,10 @@ from operators.storage import storage_errors
 
 MINUTES_ON_GPU, MINUTES_ON_CPU = 0.75, 10.0
 """Time limits in minutes of an offline reconstruction that chooses its number of optimiser steps automatically."""
-ALTERNATIVES_UNTIL = 0.4
+ALTERNATIVES_UNTIL = 0.5
 """Share of the time limit at which the last trial of other inputs (poses, depth, eyes) must be expected to end."""
+POLL_S = 0.05
+"""Time between two checks for a stop request and for the time limit while the path of the scope is awaited, in seconds."""
 
 
 @dataclass(frozen=True)
@@ -107,8 +111,12 @@ class FittedModel:
         return model
 
 
+IsLate = Callable[[], bool]
+"""Function that returns True if a further trial would end too late, or if a stop was requested."""
+
+
 class _StopFitting(Exception):
-    """Raised by the progress callback of `Reconstructor.fit` to end training after a stop request."""
+    """Raised by a progress callback to end the training, or the estimation of the scope's path."""
 
 
 def reconstruct(
@@ -234,6 +242,34 @@ class _Inputs:
         return chosen
 
 
+class _PathAhead:
+    """Estimation of the scope's path in a thread, while the first trial trains."""
+
+    def __init__(self, inputs: _Inputs) -> None:
+        self._is_given_up = False
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="path ahead")
+        self._path = self._pool.submit(
+            camera_path_of, inputs.given.frames, inputs.source.description.camera, after_frame=self._check
+        )
+
+    def _check(self) -> None:
+        if self._is_given_up:
+            raise _StopFitting
+
+    def awaited(self, is_late: IsLate) -> CameraPath | None:
+        """Wait for the path and return it; None if `is_late` returns True before. Raises InvalidInput as `camera_path_of`."""
+        while not self._path.done():
+            if is_late():
+                return None
+            wait([self._path], POLL_S)
+        return self._path.result()
+
+    def give_up(self) -> None:
+        """End the estimation soon if it is not complete."""
+        self._is_given_up = True
+        self._pool.shutdown(wait=False)
+
+
 class _Fitting:
     """Offline training of one model: choice of inputs and optimiser steps by validation, then training on all training
     frames of a source. Notes for the report are added to `notes`."""
@@ -252,6 +288,8 @@ class _Fitting:
         self._begin_s = clock()
         self._learning: Reconstructor | None = None
         self._is_stopped = False
+        self._path: _PathAhead | None = None
+        """Estimation of the scope's path while alternatives are tried; None if the scope is at rest or there are poses."""
         self._posed_inputs: _Inputs | None = None
         """Inputs with estimated poses while alternatives are tried; None if none were estimated."""
         self._setup_s = 0.0
@@ -266,7 +304,7 @@ class _Fitting:
             inputs = _Inputs(judged(self._source, self._stop_requested), settings)
             if settings.poses == "estimated":
                 try:
-                    inputs = _posed(inputs)
+                    inputs = _posed(inputs, camera_path_of(inputs.given.frames, inputs.source.description.camera))
                 except InvalidInput as error:
                     raise InvalidSetting(f"poses is 'estimated', but {error}") from error
             if steps is None:
@@ -295,18 +333,37 @@ class _Fitting:
         if len(inputs.validating) < LEAST_FRAMES:
             return inputs, ChosenSteps(USUAL_STEPS, (), "few frames")
         limit_s = 60 * self._minutes
+        if not inputs.have_poses and rigid_share(inputs.given.frames) >= MOVING_SHARE:
+            self._path = _PathAhead(inputs)
+        try:
+            inputs, first, learned = self._best_inputs(inputs, ALTERNATIVES_UNTIL * limit_s)
+        finally:
+            if self._path is not None:
+                self._path.give_up()
+            self._path = self._posed_inputs = None  # frees the frames that they hold
+        spent_s = self._clock() - self._begin_s
+        chosen = choose_steps(self._trial(inputs), limit_s, self._clock, spent_s, first)
+        if len(chosen.trials) == 1 and not self._is_stopped:
+            self._learning = learned
+        return inputs, chosen
+
+    def _best_inputs(self, inputs: _Inputs, until_s: float) -> tuple[_Inputs, Trial, Reconstructor | None]:
+        """Return the inputs that score best on validation frames after `FIRST_STEPS`, with their trial and its reconstructor. Other
+        inputs than the given ones are tried as long as their trial is expected to end at `until_s`, in seconds after the start."""
         first = trial_of(self._trial(inputs), offline.FIRST_STEPS, self._clock)
         learned = self._learning
+
+        def is_late() -> bool:
+            ends_s = self._clock() - self._begin_s + first.duration_s(first.steps)
+            return self._is_stopped or self._stop_requested() or ends_s > until_s
+
         for reason, other_than in (
             ("the scope moves, and its poses were estimated from the training frames", self._with_poses),
             ("the scope moves, and its poses were estimated from the training frames", self._with_poses_only),
             ("depth was not used, because it makes the pictures worse", _without_depth),
             ("the right eye was not used, because it makes the pictures of the left one worse", _left_eye),
         ):
-            ends_s = self._clock() - self._begin_s + first.duration_s(first.steps)
-            if self._is_stopped or ends_s > ALTERNATIVES_UNTIL * limit_s:
-                break
-            if (other := other_than(inputs)) is None:
+            if (other := other_than(inputs, is_late)) is None:
                 continue
             trial = trial_of(self._trial(other), offline.FIRST_STEPS, self._clock)
             if trial.psnr_db >= first.psnr_db + INPUT_GAIN_DB and not self._is_stopped:
@@ -314,30 +371,35 @@ class _Fitting:
                     f"{reason}: validation frames score {trial.psnr_db:.2f} dB, otherwise {first.psnr_db:.2f} dB"
                 )
                 inputs, first, learned = other, trial, self._learning
-        self._posed_inputs = None  # frees the frames that these inputs hold
-        spent_s = self._clock() - self._begin_s
-        chosen = choose_steps(self._trial(inputs), limit_s, self._clock, spent_s, first)
-        if len(chosen.trials) == 1 and not self._is_stopped:
-            self._learning = learned
-        return inputs, chosen
+        return inputs, first, learned
 
-    def _with_poses(self, inputs: _Inputs) -> _Inputs | None:
-        """Return inputs with estimated poses; None if there are poses, the scope is at rest or they cannot be estimated."""
-        if inputs.have_poses or rigid_share(inputs.given.frames) < MOVING_SHARE:
+    def _with_poses(self, inputs: _Inputs, is_late: IsLate) -> _Inputs | None:
+        """Return inputs with estimated poses; None if there are poses, the scope is at rest, the poses cannot be estimated or it
+        becomes too late to try them."""
+        if self._path is None:
             return None
         try:
-            self._posed_inputs = _posed(inputs)
+            path = self._path.awaited(is_late)
         except InvalidInput as error:
             self._notes.append(f"no poses of the scope were estimated: {error}")
-        return self._posed_inputs
+            return None
+        posed = None if path is None else _posed(inputs, path)
+        if posed is None or is_late():
+            if not self._is_stopped and not self._stop_requested():
+                self._notes.append(
+                    "the scope moves, but the time limit left no time to try estimated poses; --minutes raises it"
+                )
+            return None
+        self._posed_inputs = posed
+        return posed
 
-    def _with_poses_only(self, inputs: _Inputs) -> _Inputs | None:
+    def _with_poses_only(self, inputs: _Inputs, is_late: IsLate) -> _Inputs | None:
         """Return inputs with estimated poses but without the depth that these poses provide. None if no poses were estimated, if
-        `inputs` already have them, or if `inputs` have other depth."""
+        `inputs` already have them, if `inputs` have other depth, or if it is too late."""
         posed = self._posed_inputs
         if posed is None or inputs is posed or inputs.have_depth:
             return None
-        return _without_depth(posed)
+        return _without_depth(posed, is_late)
 
     def _trial(self, inputs: _Inputs) -> Train:
         """Return a function that trains for a number of optimiser steps without the validation frames, and scores the model on
@@ -387,22 +449,21 @@ class _Fitting:
         return learning
 
 
-def _posed(inputs: _Inputs) -> _Inputs:
-    """Return inputs with poses estimated from the training frames. Raises InvalidInput as `camera_path_of`."""
-    path = camera_path_of(inputs.given.frames, inputs.source.description.camera)
+def _posed(inputs: _Inputs, path: CameraPath) -> _Inputs:
+    """Return inputs with the poses of a path."""
     return _Inputs(PosedSource(inputs.source, lambda frame: path.at(frame.time_s)), inputs.settings, path)
 
 
-def _without_depth(inputs: _Inputs) -> _Inputs | None:
-    """Return inputs without depth; None if there is none."""
-    if not inputs.have_depth or inputs.settings.depth == "none":
+def _without_depth(inputs: _Inputs, is_late: IsLate) -> _Inputs | None:
+    """Return inputs without depth; None if there is none, or if it is too late."""
+    if not inputs.have_depth or inputs.settings.depth == "none" or is_late():
         return None
     return _Inputs(inputs.source, replace(inputs.settings, depth="none"), inputs.path)
 
 
-def _left_eye(inputs: _Inputs) -> _Inputs | None:
-    """Return inputs without the right eye; None if it is not used."""
-    if inputs.settings.eyes != "both":
+def _left_eye(inputs: _Inputs, is_late: IsLate) -> _Inputs | None:
+    """Return inputs without the right eye; None if it is not used, or if it is too late."""
+    if inputs.settings.eyes != "both" or is_late():
         return None
     return _Inputs(inputs.source, replace(inputs.settings, eyes="left"), inputs.path)
 

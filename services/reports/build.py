@@ -189,7 +189,10 @@ def _run(outcome: RunOutcome) -> RunFacts:
 
 
 def _training_steps(chosen: ChosenSteps) -> TrainingSteps:
-    trials = [TrialFacts(steps=one.steps, psnr_tissue_db=finite(one.psnr_db)) for one in chosen.trials]
+    trials = [
+        TrialFacts(steps=one.steps, psnr_tissue_db=finite(one.psnr_db), setup_s=one.setup_s, seconds=one.seconds)
+        for one in chosen.trials
+    ]
     return TrainingSteps(steps=chosen.steps, reason=chosen.reason, trials=trials)
 
 

@@ -65,6 +65,10 @@ class TrialFacts(Part):
 
     steps: Annotated[int, Field(ge=1)]
     psnr_tissue_db: float | None
+    setup_s: float | None = None
+    """Time before the first step, in seconds."""
+    seconds: float | None = None
+    """Duration of the training and its validation in seconds, without `setup_s`."""
 
 
 class TrainingSteps(Part):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import threading
 
 import cv2
 import numpy as np
@@ -48,7 +49,7 @@ def test_depth_and_the_right_eye_are_left_out_where_they_hurt(tmp_path, monkeypa
     assert run["eyes"] == ("left" if dropped else "both")
 
 
-@pytest.mark.parametrize(("trial_s", "tried"), [(7, ["depth", "right eye"]), (11, ["depth"]), (13, [])])
+@pytest.mark.parametrize(("trial_s", "tried"), [(7, ["depth", "right eye"]), (11, ["depth"]), (16, [])])
 def test_other_inputs_are_tried_while_they_end_early_enough(tmp_path, monkeypatch, trial_s, tried):
     """Each trial takes the test's time, of a limit of 60 s."""
     folder = synthesize(tmp_path / "take", frames=8, width_px=40, height_px=32)
@@ -95,6 +96,40 @@ def test_poses_of_a_moving_scope_are_used_where_they_help(moving, tmp_path, monk
     if kept:
         places = np.load(outcome.outputs["poses"])[:, :3, 3]
         assert places.shape == (12, 3) and np.linalg.norm(places[-1]) > 5 * np.linalg.norm(places[1])
+
+
+@pytest.mark.slow
+def test_the_path_is_estimated_while_the_first_trial_trains_and_given_up_when_it_is_late(moving, tmp_path, monkeypatch):
+    """It is estimated until the first trial is scored, in a limit of 60 s; each reading of the clock takes a second after that."""
+    monkeypatch.setattr(offline, "FIRST_STEPS", 1)
+    monkeypatch.setattr(offline, "MOST_STEPS", 1)
+    began, ended, now_s = threading.Event(), threading.Event(), 0.0
+
+    def endless(frames, camera, after_frame):
+        began.set()
+        try:
+            while True:
+                after_frame()
+                ended.wait(0.01)
+        finally:
+            ended.set()
+
+    def score(learned, frames):
+        assert began.wait(10.0) and not ended.is_set() and frames[0].pose is None
+        return 30.0
+
+    def clock():
+        nonlocal now_s
+        now_s += began.is_set()
+        return now_s
+
+    monkeypatch.setattr(module, "camera_path_of", endless)
+    monkeypatch.setattr(module, "validation_psnr_db", score)
+    settings = module.ReconstructSettings(recording=moving, out=tmp_path / "out", sinks=(), minutes=1.0)
+    outcome = module.reconstruct(settings, clock=clock)
+    assert ended.wait(10.0), "it was not given up"
+    assert any("no time to try estimated poses; --minutes raises it" in note for note in outcome.notes)
+    assert "poses" not in outcome.outputs
 
 
 @pytest.mark.slow
