@@ -24,7 +24,7 @@ from pathlib import Path
 
 from gsplat_core.io.recordings import synthesize
 
-LOOK_S = 0.02
+POLL_S = 0.02
 WITHIN_S = 1800.0
 
 
@@ -46,7 +46,7 @@ class Killed:
     seen: dict[str, int] = field(default_factory=dict)
     """Inode number of each result's folder."""
 
-    def look(self, out: Path) -> None:
+    def examine(self, out: Path) -> None:
         """Record which results exist."""
         now = {path.name: path.stat().st_ino for path in out.glob("case-*")} if out.is_dir() else {}
         self.replaced += [name for name, number in self.seen.items() if now.get(name) != number]
@@ -82,7 +82,7 @@ def run_batch(recordings: Path, out: Path, workers: int, kills: Kills) -> Killed
         batch = subprocess.Popen([*map(str, command), "--steps-per-frame", "2", "--json"], stdout=subprocess.DEVNULL)
         next_s = time.monotonic() + choose.uniform(*kills.between_s)
         while batch.poll() is None:
-            killed.look(out)
+            killed.examine(out)
             attempts = children(batch.pid)
             if time.monotonic() >= next_s and attempts and killed.attempts + killed.batches < kills.most:
                 hits_batch = choose.random() < kills.batch_share
@@ -94,8 +94,8 @@ def run_batch(recordings: Path, out: Path, workers: int, kills: Kills) -> Killed
                 killed.batches += hits_batch
                 killed.attempts += not hits_batch
                 next_s = time.monotonic() + choose.uniform(*kills.between_s)
-            time.sleep(LOOK_S)
-        killed.look(out)
+            time.sleep(POLL_S)
+        killed.examine(out)
         if batch.returncode != -signal.SIGKILL:
             assert batch.returncode == 0, f"the batch ended with {batch.returncode}"
             return killed

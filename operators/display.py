@@ -152,7 +152,7 @@ def share_of(gaussians: Gaussians, chosen: Tensor, camera: Camera) -> Tensor:
     return torch.where(seen.alpha > 0, seen.image[..., 0] / seen.alpha.clamp(min=1e-6), 0).clamp(0, 1)
 
 
-LOOK_NS = 50_000_000
+POLL_NS = 50_000_000
 """Period in nanoseconds at which the display's state is checked while no picture arrives."""
 REPEAT_NS = 200_000_000
 """Period in nanoseconds at which a stale, frozen or lost picture is emitted again with its current age."""
@@ -245,7 +245,7 @@ class DisplayOp(Operator):
         self.source_state = source_state
         self._tissue = RememberedTissue()
         self._reset()
-        super().__init__(fragment, MessageOrTimeoutCondition(fragment, LOOK_NS), *args, **kwargs)
+        super().__init__(fragment, MessageOrTimeoutCondition(fragment, POLL_NS), *args, **kwargs)
 
     def setup(self, spec: OperatorSpec) -> None:
         port = spec.input("rendered", policy="drop_oldest", type=RenderedFrame).condition(ConditionType.NONE)

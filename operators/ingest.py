@@ -19,7 +19,7 @@ from operators.sources.source import FrameSource, ReportingSource, SourceDescrip
 
 log = logging.getLogger(__name__)
 
-LOOK_S = 0.1
+POLL_S = 0.1
 """Timeout of one read from the source, in seconds. A stop request is checked between reads."""
 PATIENCE_S = 1.0
 """Longest time without a frame, in seconds, after which `compute` returns so that the graph can stop."""
@@ -157,13 +157,13 @@ class SourceOp(Operator):
         if self._until_s is None:
             self.source.open()
             self._until_s = math.inf if self.seconds is None else time.monotonic() + self.seconds
-        for _ in range(round(PATIENCE_S / LOOK_S)):
+        for _ in range(round(PATIENCE_S / POLL_S)):
             if self.stop_requested() or time.monotonic() > self._until_s:
                 self._out_of_time = time.monotonic() > self._until_s
                 self.stop_execution()
                 return None
             try:
-                frame = self.source.read(LOOK_S)
+                frame = self.source.read(POLL_S)
             except Exception:
                 self._failed = True
                 raise

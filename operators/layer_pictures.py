@@ -57,7 +57,7 @@ class DepthColours:
         picture with covered pixels.
         """
 
-    def look_at(self, depth: NDArray[np.float32], alpha: NDArray[np.float32]) -> None:
+    def adapt_range(self, depth: NDArray[np.float32], alpha: NDArray[np.float32]) -> None:
         """Adapt the range of displayed depths to a rendered picture: gradually, or at once if the median has changed by
         a factor of 2 or more.
 
@@ -89,7 +89,7 @@ class DepthColours:
         Returns:
             The picture, uint8 RGB [H, W, 3], and its legend.
         """
-        self.look_at(depth, alpha)
+        self.adapt_range(depth, alpha)
         low, high = self._range or (0.0, 1.0)
         # A minimum range keeps nearly flat tissue from looking rugged.
         spread = max(high - low, 0.05 * (self.median or 1.0))

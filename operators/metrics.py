@@ -133,7 +133,7 @@ class QualityResult:
     """Comparison with the mean of the previous and the next raw frame; None if no held-out frame has both."""
 
 
-LOOK_NS = 500_000_000
+POLL_NS = 500_000_000
 WAITING = 8
 """Capacity of each input queue, in messages. A full queue drops its oldest message; dropped frames
 are counted as unscored.
@@ -304,7 +304,7 @@ class MetricsOp(Operator):
         self.on_screen, self.log, self.report = on_screen, log, report
         self._digest = PictureDigest()
         self._reset()
-        conditions = (MessageOrTimeoutCondition(fragment, LOOK_NS),) if on_screen else ()
+        conditions = (MessageOrTimeoutCondition(fragment, POLL_NS),) if on_screen else ()
         super().__init__(fragment, *conditions, *args, **kwargs)
 
     def setup(self, spec: OperatorSpec) -> None:

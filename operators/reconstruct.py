@@ -267,7 +267,7 @@ def warm_reconstructor(
             reconstructor.take_depth(frame.with_fields(depth=depth))
             reconstructor.rehearse(2)
             reconstructor.grow(frame)
-        reconstructor.look_after_once()
+        reconstructor.grow_once()
         reconstructor.forget()
 
 

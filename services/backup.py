@@ -581,7 +581,7 @@ class StoredFilesWatch(Collector):
     ) -> None:
         self._database, self._files, self._events, self._clock = database, files, events, clock
         self._lock = threading.Lock()
-        self._looked_s: float | None = None
+        self._checked_s: float | None = None
         self._missing: list[MissingFile] = []
 
     @asynccontextmanager
@@ -605,10 +605,10 @@ class StoredFilesWatch(Collector):
             StoreUnavailable: if the database does not answer.
         """
         with self._lock:
-            if self._looked_s is None or self._clock() - self._looked_s > FRESH_S:
+            if self._checked_s is None or self._clock() - self._checked_s > FRESH_S:
                 with self._database.reading() as connection:
                     self._missing = missing_files(connection, self._files)
-                self._looked_s = self._clock()
+                self._checked_s = self._clock()
             return self._missing
 
     async def check(self) -> CheckResult:

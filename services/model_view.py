@@ -313,7 +313,7 @@ DISTANCE = 100.0
 precision, which is most accurate at this scale."""
 STEPS = 200
 """Number of positions of the time slider."""
-LOOK_S = 0.05
+POLL_S = 0.05
 
 
 def viser() -> Any:
@@ -351,7 +351,7 @@ class ModelView:
         self._server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         self.address: tuple[str, int] = host, self._server.get_port()
         self._server.scene.set_up_direction("-y")
-        self._server.on_client_connect(self._look_from_the_scope)
+        self._server.on_client_connect(self._view_from_scope)
         self._server.gui.add_markdown("Research use only, not a medical device. **Not a live view.**")
         steps = (end_s - start_s) / STEPS
         moves = model.field is not None and steps > 0
@@ -381,7 +381,7 @@ class ModelView:
             before_s = now_s
             if not self._time.disabled and self._time.value != self._drawn_s:
                 self._show(self._time.value, self._splats(self._time.value))
-            wait.wait(LOOK_S)
+            wait.wait(POLL_S)
 
     def _show(self, time_s: float, splats: dict[str, NDArray[np.float32]]) -> None:
         self._drawn_s = time_s
@@ -401,7 +401,7 @@ class ModelView:
             "opacities": rows.opacities[:, None],
         }
 
-    def _look_from_the_scope(self, client: Any) -> None:
+    def _view_from_scope(self, client: Any) -> None:
         """Place a new browser's camera at the endoscope's position."""
         client.camera.position = (0.0, 0.0, 0.0)
         client.camera.look_at = (0.0, 0.0, DISTANCE)

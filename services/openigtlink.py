@@ -203,7 +203,7 @@ def _has_left(client: socket.socket) -> bool:
     return False
 
 
-LOOK_MS = 100
+POLL_MS = 100
 SILENT_S = 1.0
 
 
@@ -233,7 +233,7 @@ def send(
     counts = {"sent": 0, "bad": 0}
     while not stop_requested():
         if not server.clients:
-            time.sleep(LOOK_MS / 1000)
+            time.sleep(POLL_MS / 1000)
             continue
         with subscribe(zmq.Context.instance().socket(zmq.SUB), endpoint) as socket:
             _send_while_watched(socket, messages, server, stop_requested, counts)
@@ -261,7 +261,7 @@ def _send_while_watched(
 
 
 def _newest(socket: zmq.Socket, counts: dict[str, int]) -> Picture | None:
-    if not socket.poll(LOOK_MS):
+    if not socket.poll(POLL_MS):
         return None
     parts = socket.recv_multipart(copy=False)
     while socket.poll(0):

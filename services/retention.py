@@ -161,19 +161,19 @@ class ClockGuard:
     ) -> None:
         self._path, self._wall, self._monotonic = folder / FILE, wall, monotonic
         self._lock = threading.Lock()
-        self._looked = wall(), monotonic()
+        self._checked = wall(), monotonic()
         self._written_s: float | None = None
         self._since_s: float | None = None
         """Monotonic time at which a jump of the clock was detected, in seconds; None while the clock is trusted."""
         seen = self._read()
-        if seen is not None and self._looked[0] - seen > JUMP_S:
-            self._doubt(self._looked[0] - seen, "since the service last ran")
+        if seen is not None and self._checked[0] - seen > JUMP_S:
+            self._doubt(self._checked[0] - seen, "since the service last ran")
 
     @property
     def doubt(self) -> str | None:
         """Check the clock. Return the reason while it is not trusted, otherwise None."""
         with self._lock:
-            self._look()
+            self._check()
             if self._since_s is None:
                 return None
             left_h = max(0.0, CONFIRM_S - (self._monotonic() - self._since_s)) / 3600
@@ -186,10 +186,10 @@ class ClockGuard:
         """Return True if data may be deleted by age."""
         return self.doubt is None
 
-    def _look(self) -> None:
+    def _check(self) -> None:
         wall_s, mono_s = self._wall(), self._monotonic()
-        stepped_s = (wall_s - self._looked[0]) - (mono_s - self._looked[1])
-        self._looked = wall_s, mono_s
+        stepped_s = (wall_s - self._checked[0]) - (mono_s - self._checked[1])
+        self._checked = wall_s, mono_s
         if abs(stepped_s) > JUMP_S:
             self._doubt(stepped_s, "while the service runs")
         elif self._since_s is not None and mono_s - self._since_s >= CONFIRM_S:

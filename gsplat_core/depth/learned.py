@@ -214,7 +214,7 @@ class LearnedDepth(Estimator):
         self._forget()
 
     def _forget(self) -> None:
-        self._looked_ns: int | None = None
+        self._estimated_ns: int | None = None
         self._answer: DepthMap | None = None
         self._before: NDArray[np.float64] | None = None
         """Last usable result on the comparison grid, as depth or inverse depth like the network's output. The next
@@ -231,17 +231,17 @@ class LearnedDepth(Estimator):
         """
         if frame.new_scene is not None or self._resized(frame):
             self._forget()
-        if self._looked_ns is not None and 0 <= frame.pts_ns - self._looked_ns < EVERY_S * 1e9:
+        if self._estimated_ns is not None and 0 <= frame.pts_ns - self._estimated_ns < EVERY_S * 1e9:
             stands_still = self._pose is not None and np.array_equal(self._pose, camera.world_to_camera)
             return self._answer if stands_still else None
-        self._answer = self._look(frame)
-        self._looked_ns, self._pose = frame.pts_ns, camera.world_to_camera.copy()
+        self._answer = self._estimated(frame)
+        self._estimated_ns, self._pose = frame.pts_ns, camera.world_to_camera.copy()
         return self._answer
 
     def _resized(self, frame: Frame) -> bool:
         return self._answer is not None and self._answer.depth.shape != frame.image.shape[:2]
 
-    def _look(self, frame: Frame) -> DepthMap:
+    def _estimated(self, frame: Frame) -> DepthMap:
         size = frame.height_px, frame.width_px
         output = self._network.run(frame.image)
         values = np.asarray(output.reshape(output.shape[-2:]), np.float32)

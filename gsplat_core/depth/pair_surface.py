@@ -30,8 +30,8 @@ from gsplat_core.depth.plane_fits import (
 )
 from gsplat_core.depth.stereo import (
     SATURATED,
+    check_pair,
     grey,
-    look_at,
     reach_of,
     shrink_of,
     shrunk,
@@ -113,7 +113,7 @@ def _compared_surface(frame: Frame, camera: Camera, disparity: Plane, known: Mas
     if frame.right_image is None:
         return None
     left, right = grey(frame.image), grey(frame.right_image)
-    look = look_at(left, right, frame.loss_mask)
+    look = check_pair(left, right, frame.loss_mask)
     if look.doubt is not None:
         return None
     # Disparity of points at infinity. It is not 0 if the principal points differ.

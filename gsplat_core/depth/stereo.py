@@ -174,7 +174,7 @@ smaller shows the same picture twice, or tissue at infinity.
 
 
 @dataclass(frozen=True)
-class PairLook:
+class PairCheck:
     """Result of the check of one stereo pair. If `doubt` is set, the other fields are meaningless."""
 
     disparities: Points
@@ -190,7 +190,7 @@ class PairLook:
     doubt: str | None = None
 
 
-def look_at(left: NDArray[np.uint8], right: NDArray[np.uint8], usable: NDArray[np.uint8] | None = None) -> PairLook:
+def check_pair(left: NDArray[np.uint8], right: NDArray[np.uint8], usable: NDArray[np.uint8] | None = None) -> PairCheck:
     """Compare two grey pictures of a stereo pair; return their row differences, disparities and any doubt.
 
     Args:
@@ -227,11 +227,11 @@ def look_at(left: NDArray[np.uint8], right: NDArray[np.uint8], usable: NDArray[n
         )
     scatter = there[agree, 1] - here[agree, 1] - _basis(here[agree], width, height) @ rows
     error_px = 1.4826 * float(np.median(np.abs(scatter)))
-    return PairLook((here - there)[agree, 0], rows, here[agree], error_px)
+    return PairCheck((here - there)[agree, 0], rows, here[agree], error_px)
 
 
-def _doubt(text: str) -> PairLook:
-    return PairLook(np.zeros(0, np.float32), np.zeros(3), np.zeros((0, 2), np.float32), 0.0, text)
+def _doubt(text: str) -> PairCheck:
+    return PairCheck(np.zeros(0, np.float32), np.zeros(3), np.zeros((0, 2), np.float32), 0.0, text)
 
 
 def _points_in_both(
@@ -298,7 +298,7 @@ def _fitted_rows(here: Points, lower: Points, width: int, height: int) -> tuple[
     starting from the median difference without slopes.
 
     Returns:
-        Coefficients [3] as in `PairLook.rows`, and the mask [N] of the inliers.
+        Coefficients [3] as in `PairCheck.rows`, and the mask [N] of the inliers.
     """
     basis = _basis(here, width, height)
     rows = np.array([float(np.median(lower)), 0.0, 0.0])
@@ -312,9 +312,9 @@ def _fitted_rows(here: Points, lower: Points, width: int, height: int) -> tuple[
     return rows, np.abs(lower - basis @ rows) < ROW_ERROR_PX
 
 
-LOOK_EVERY = 30
+CHECK_EVERY = 30
 """Number of frames between two checks of the stereo pair. The eyes are rigid, but the distance of the tissue changes."""
-KEPT_LOOKS = 15
+KEPT_CHECKS = 15
 """Number of newest pair checks whose row offsets are combined by their median."""
 MATCHED_WIDTH_PX = 800
 """Width above which pictures are matched at an integer fraction of their size. Endoscopes blur by
@@ -372,9 +372,9 @@ class StereoDepth(Estimator):
         self._size = size
         self._rows: list[NDArray[np.float64]] = []
         self._span: tuple[float, float] | None = None
-        self._looked: tuple[float, float] | None = None
+        self._checked: tuple[float, float] | None = None
         self._seen: tuple[float, float] | None = None
-        self._look_in = 0
+        self._frames_to_check = 0
 
     def estimate(self, frame: Frame, camera: Camera) -> DepthMap | None:
         """Estimate the depth of a frame by matching its two pictures; None without a right picture. The map is rejected
@@ -391,12 +391,12 @@ class StereoDepth(Estimator):
         left, right = grey(frame.image), grey(frame.right_image)
         # Disparity of points at infinity. It is not 0 if the principal points differ.
         parallel_px = 0.0 if frame.right_camera is None else float(camera.K[0, 2] - frame.right_camera.K[0, 2])
-        look = None
-        if self._look_in == 0:
-            look = self._look(left, right, frame, parallel_px)
-            if look.doubt is not None:
-                return doubted(shape, STEREO, look.doubt)
-        self._look_in -= 1
+        check = None
+        if self._frames_to_check == 0:
+            check = self._check(left, right, frame, parallel_px)
+            if check.doubt is not None:
+                return doubted(shape, STEREO, check.doubt)
+        self._frames_to_check -= 1
         span = self._span_of(frame.width_px)
         if span.count > MOST_DISPARITIES:
             why = f"the range of distances is too large: {span.count} disparities would have to be searched, at most {MOST_DISPARITIES} are supported"
@@ -409,9 +409,9 @@ class StereoDepth(Estimator):
             # Match the first frame of a scene again with its extended range, which the following frames use, too.
             planes = self._planes(left, right, frame, camera, widened, parallel_px)
             found = self._as_depth(planes, frame, camera, parallel_px)
-        why = None if look is None or found.doubt is not None else _why_wrong(found, look, frame, camera, parallel_px)
+        why = None if check is None or found.doubt is not None else _why_wrong(found, check, frame, camera, parallel_px)
         if why is not None:
-            self._look_in = 0
+            self._frames_to_check = 0
             return doubted(shape, STEREO, why)
         return found if found.doubt is not None else replace(found, error=self._typical_error(found, frame, camera))
 
@@ -433,18 +433,18 @@ class StereoDepth(Estimator):
         beside = float(np.median(self._rows, axis=0)[0]) / shrink_of(frame.width_px) if self._rows else 0.0
         return _depth_error(variance_px2(found.confidence, frame.width_px, beside**2), found.depth, frame, camera)
 
-    def _look(self, left: NDArray[np.uint8], right: NDArray[np.uint8], frame: Frame, parallel_px: float) -> PairLook:
+    def _check(self, left: NDArray[np.uint8], right: NDArray[np.uint8], frame: Frame, parallel_px: float) -> PairCheck:
         """Check the pair. Unless it is doubtful, update its row offsets and extend the disparity range."""
-        look = look_at(left, right, frame.loss_mask)
-        why = look.doubt or _why_implausible(look, parallel_px, calibrated=frame.right_camera is not None)
+        check = check_pair(left, right, frame.loss_mask)
+        why = check.doubt or _why_implausible(check, parallel_px, calibrated=frame.right_camera is not None)
         if why is not None:
-            return replace(look, doubt=why)
-        self._rows = [*self._rows, look.rows][-KEPT_LOOKS:]
-        low, high = (float(value) for value in np.percentile(look.disparities, (1, 99)))
+            return replace(check, doubt=why)
+        self._rows = [*self._rows, check.rows][-KEPT_CHECKS:]
+        low, high = (float(value) for value in np.percentile(check.disparities, (1, 99)))
         known = self._seen or (low, high)
-        self._span = self._looked = min(low, known[0]), max(high, known[1])
-        self._look_in = LOOK_EVERY
-        return look
+        self._span = self._checked = min(low, known[0]), max(high, known[1])
+        self._frames_to_check = CHECK_EVERY
+        return check
 
     def _widen_to(self, seen: tuple[float, float]) -> None:
         """Extend the search range to the disparities `seen` (lowest, highest) of the last frame.
@@ -452,8 +452,8 @@ class StereoDepth(Estimator):
         Until the next check of the pair the range only grows, by at most one margin. Wrong matches occur anywhere in
         the range and would otherwise widen it without limit. A stable range also matches similar pictures alike.
         """
-        assert self._span is not None and self._looked is not None
-        least, most = _widened(self._looked)
+        assert self._span is not None and self._checked is not None
+        least, most = _widened(self._checked)
         self._span = min(self._span[0], max(seen[0], least)), max(self._span[1], min(seen[1], most))
 
     def _span_of(self, width_px: int) -> Span:
@@ -512,7 +512,7 @@ class StereoDepth(Estimator):
         depth, confidence = planes
         believed = np.count_nonzero(confidence >= BELIEVED) / confidence.size
         if believed < LEAST_BELIEVED:
-            self._look_in = 0
+            self._frames_to_check = 0
             why = f"too little of the picture could be matched between the eyes: {believed:.1%} of its pixels, {LEAST_BELIEVED:.0%} are needed"
             return doubted(depth.shape, STEREO, why)
         step = max(1, frame.width_px // SAMPLED_PX)
@@ -588,9 +588,9 @@ def _why_not_rectified(left: Camera, right: Camera | None) -> str | None:
     return None
 
 
-def _why_implausible(look: PairLook, parallel_px: float, *, calibrated: bool) -> str | None:
+def _why_implausible(check: PairCheck, parallel_px: float, *, calibrated: bool) -> str | None:
     """Return the reason why the disparities are impossible, as a sentence; None if they are possible."""
-    shift = look.disparities - parallel_px
+    shift = check.disparities - parallel_px
     middle = float(np.median(shift))
     if abs(middle) < LEAST_DISPARITY_PX and float(np.ptp(shift)) < 4 * LEAST_DISPARITY_PX:
         return f"the two eyes show one and the same picture: points are {middle:.1f} px apart in them"
@@ -606,7 +606,7 @@ def _why_implausible(look: PairLook, parallel_px: float, *, calibrated: bool) ->
     return None
 
 
-def _why_wrong(found: DepthMap, look: PairLook, frame: Frame, camera: Camera, parallel_px: float) -> str | None:
+def _why_wrong(found: DepthMap, check: PairCheck, frame: Frame, camera: Camera, parallel_px: float) -> str | None:
     """Return the reason why depth is wrong by more than its intervals, as a sentence, or None.
 
     Points that were followed to the other eye are an independent measurement. Both measurements have errors, and 10 %
@@ -614,15 +614,15 @@ def _why_wrong(found: DepthMap, look: PairLook, frame: Frame, camera: Camera, pa
     chance explains them with a probability of less than 1 %. Intervals are at least those of barely believed depth,
     because the window of a followed point blurs the relief.
     """
-    x, y = look.points.astype(int).T
+    x, y = check.points.astype(int).T
     depth, confidence = found.depth[y, x], found.confidence[y, x]
     known = (confidence >= BELIEVED) & (depth > 0)
     if known.sum() < LEAST_POINTS:
         return None
     disparity = reach_of(frame, camera) / depth[known] + parallel_px
-    spread = np.sqrt(variance_px2(confidence[known], frame.width_px, 0.0) + look.error_px**2)
+    spread = np.sqrt(variance_px2(confidence[known], frame.width_px, 0.0) + check.error_px**2)
     spread = np.maximum(spread, HALF_BELIEVED_PX * shrink_of(frame.width_px))
-    outside = float((np.abs(disparity - look.disparities[known]) > HALF_OF_90 * spread).mean())
+    outside = float((np.abs(disparity - check.disparities[known]) > HALF_OF_90 * spread).mean())
     chance = ONE_PERCENT * float(np.sqrt(outside * (1 - outside) / known.sum()))
     if outside - chance <= MOST_OUTSIDE:
         return None
@@ -681,7 +681,7 @@ def _off_along_rows(rows: NDArray[np.float64], height: int, width: int, device: 
 
 def with_rows_of_left(right: NDArray[np.uint8], rows: NDArray[np.float64], disparity_px: float) -> NDArray[np.uint8]:
     """Warp the right picture so that points with this disparity are in the same row as in the left one. No change if
-    the absolute values of `rows` (as in `PairLook`) sum up to less than `ROWS_FROM_PX`.
+    the absolute values of `rows` (as in `PairCheck`) sum up to less than `ROWS_FROM_PX`.
     """
     if np.abs(rows).sum() < ROWS_FROM_PX:
         return right

@@ -274,7 +274,7 @@ def origin(motion: Flow) -> Flow:
     """Invert a flow: return for each cell the displacement in pixels that brought its content there."""
     came = motion
     for _ in range(INVERSE_STEPS):
-        came = _looked_up(motion, np.asarray(came / CELL_PX, np.float32))
+        came = _remapped(motion, np.asarray(came / CELL_PX, np.float32))
     return came
 
 
@@ -283,10 +283,10 @@ def moved(picture: Field, motion: Flow) -> Field:
     height, width = picture.shape[:2]
     came_from = cv2.resize(origin(motion), (width, height), interpolation=cv2.INTER_LINEAR)
     scale = width / (motion.shape[1] * CELL_PX)
-    return _looked_up(picture, np.asarray(came_from * scale, np.float32))
+    return _remapped(picture, np.asarray(came_from * scale, np.float32))
 
 
-def _looked_up(field: Field, back: Field) -> Field:
+def _remapped(field: Field, back: Field) -> Field:
     """Return the value of a field for each pixel at the pixel's position minus `back` [h, w, 2], in pixels."""
     height, width = field.shape[:2]
     columns, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))

@@ -36,46 +36,46 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsplat_core.depth.maps import DepthMap, Estimator, doubted
-from gsplat_core.experimental.shading import Cells, Change, Follower, Look, Shading, look_at
+from gsplat_core.experimental.shading import Cells, Change, Follower, ShadedPicture, Shading, shaded_picture
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import BELIEVED, LIGHT, RELATIVE_DISTANCE, Frame
 
 SOLVED_AT = (1, 2, 4, 8, 12)
-"""Numbers of pictures ("looks") in a window at which all reliefs are re-estimated jointly. At other numbers only the
+"""Numbers of pictures in a window at which all reliefs are re-estimated jointly. At other numbers only the
 newest picture's change is estimated.
 """
 
 
 class LightWindow:
-    """Consecutive pictures of a stream, as looks (shading and texture), whose tissue can be tracked from one of them, the key."""
+    """Consecutive pictures of a stream (shading and texture) whose tissue can be tracked from one of them, the key."""
 
-    def __init__(self, grid: Grid, key: Look, before: Sequence[Look] = ()) -> None:
+    def __init__(self, grid: Grid, key: ShadedPicture, before: Sequence[ShadedPicture] = ()) -> None:
         """Create a window around a key.
 
         Args:
             grid: cell grid.
-            key: look from which tissue is tracked.
-            before: earlier looks in temporal order. Looks up to the last one that cannot be tracked are dropped.
+            key: picture from which tissue is tracked.
+            before: earlier pictures in temporal order. Pictures up to the last one that cannot be tracked are dropped.
         """
         self._grid = grid
-        self.looks = [key]
+        self.pictures = [key]
         self._changes: list[Change | None] = [None]
         self._ahead, back = Follower(key), Follower(key)
-        for look in reversed(before):
-            if not self._take(look, back):
+        for picture in reversed(before):
+            if not self._take(picture, back):
                 break
         self._reliefs: list[Array] = []
         self.solve()
 
-    def add(self, look: Look) -> bool:
-        """Add a look that is later than all others, and estimate its relief.
+    def add(self, picture: ShadedPicture) -> bool:
+        """Add a picture that is later than all others, and estimate its relief.
 
         Returns:
             True if it can be tracked; otherwise the window is unchanged.
         """
-        if not self._take(look, self._ahead):
+        if not self._take(picture, self._ahead):
             return False
-        if len(self.looks) in SOLVED_AT:
+        if len(self.pictures) in SOLVED_AT:
             self.solve()
         else:
             change, key = self._changes[-1], self._reliefs[0]
@@ -85,26 +85,26 @@ class LightWindow:
 
     def solve(self) -> None:
         """Re-estimate the reliefs of all pictures of the window jointly."""
-        found = find_reliefs(self._grid, [look.shading for look in self.looks], self._changes)
+        found = find_reliefs(self._grid, [picture.shading for picture in self.pictures], self._changes)
         self._reliefs = [found.key + change for change in found.changes]
 
-    def relief_of(self, look: Look) -> Array | None:
-        """Return the relief coefficients of a look, or None if the window does not contain it."""
-        pairs = zip(self.looks, self._reliefs, strict=True)
-        return next((relief for each, relief in pairs if each is look), None)
+    def relief_of(self, picture: ShadedPicture) -> Array | None:
+        """Return the relief coefficients of a picture, or None if the window does not contain it."""
+        pairs = zip(self.pictures, self._reliefs, strict=True)
+        return next((relief for each, relief in pairs if each is picture), None)
 
-    def _take(self, look: Look, follower: Follower) -> bool:
-        change = follower.change_to(look)
+    def _take(self, picture: ShadedPicture, follower: Follower) -> bool:
+        change = follower.change_to(picture)
         if change.is_followed:
-            self.looks.append(look)
+            self.pictures.append(picture)
             self._changes.append(change)
         return change.is_followed
 
 
 EVERY_S = 0.3
 """Time in seconds from one depth estimate to the next. Frames in between reuse the previous result."""
-MOST_LOOKS = 12
-"""Largest number of looks (pictures of one window) fitted together."""
+MOST_PICTURES = 12
+"""Largest number of pictures of one window that are fitted together."""
 NEWEST = 0.2
 """Smallest weight of the newest relief in its average with the earlier, tracked relief. The first few estimates are
 averaged equally.
@@ -129,12 +129,12 @@ class LightDepth(Estimator):
         self._forget()
 
     def _forget(self) -> None:
-        self._looked_ns, self._count = 0, 0
+        self._estimated_ns, self._count = 0, 0
         self._answer: DepthMap | None = None
         self._relief: Array | None = None
         self._pose: NDArray[np.float64] | None = None
         self._window: LightWindow | None = None
-        self._recent: deque[Look] = deque(maxlen=MOST_LOOKS // 2)
+        self._recent: deque[ShadedPicture] = deque(maxlen=MOST_PICTURES // 2)
 
     def estimate(self, frame: Frame, camera: Camera) -> DepthMap | None:
         """Return the depth of a frame from shading; the last result if it is younger than `EVERY_S` seconds and the
@@ -145,9 +145,9 @@ class LightDepth(Estimator):
             return None
         if frame.new_scene is not None or self._resized(frame) or self._moved(camera):
             self._forget()
-        if self._answer is None or frame.pts_ns - self._looked_ns >= EVERY_S * 1e9:
-            self._answer = self._look(frame, camera)
-            self._looked_ns, self._pose = frame.pts_ns, camera.world_to_camera.copy()
+        if self._answer is None or frame.pts_ns - self._estimated_ns >= EVERY_S * 1e9:
+            self._answer = self._estimated(frame, camera)
+            self._estimated_ns, self._pose = frame.pts_ns, camera.world_to_camera.copy()
         return self._answer
 
     def _resized(self, frame: Frame) -> bool:
@@ -156,34 +156,34 @@ class LightDepth(Estimator):
     def _moved(self, camera: Camera) -> bool:
         return self._pose is not None and not np.array_equal(self._pose, camera.world_to_camera)
 
-    def _look(self, frame: Frame, camera: Camera) -> DepthMap:
-        look = look_at(frame, camera)
-        grid = Grid.of(camera, look.shading.brightness.shape)
-        if not shows_enough(look):
-            return answer(grid, None, look, frame)
+    def _estimated(self, frame: Frame, camera: Camera) -> DepthMap:
+        picture = shaded_picture(frame, camera)
+        grid = Grid.of(camera, picture.shading.brightness.shape)
+        if not shows_enough(picture):
+            return answer(grid, None, picture, frame)
         window = self._window
-        if window is None or not window.add(look):
-            window = LightWindow(grid, look)
-        elif len(window.looks) > MOST_LOOKS:
-            window = LightWindow(grid, look, list(self._recent))
+        if window is None or not window.add(picture):
+            window = LightWindow(grid, picture)
+        elif len(window.pictures) > MOST_PICTURES:
+            window = LightWindow(grid, picture, list(self._recent))
         self._window, self._count = window, self._count + 1
-        found = window.relief_of(look)
+        found = window.relief_of(picture)
         assert found is not None
         if self._relief is not None:
             before = window.relief_of(self._recent[-1])
             followed = self._relief if before is None else self._relief + found - before
             found = followed + max(1 / self._count, NEWEST) * (found - followed)
-        self._recent.append(look)
+        self._recent.append(picture)
         self._relief = found
-        return answer(grid, found, look, frame)
+        return answer(grid, found, picture, frame)
 
 
-def shows_enough(look: Look) -> bool:
+def shows_enough(picture: ShadedPicture) -> bool:
     """Return True if a picture has enough cells of well-exposed tissue (`LEAST_SEEN`) for depth by shading."""
-    return bool(look.shading.known.mean() >= LEAST_SEEN)
+    return bool(picture.shading.known.mean() >= LEAST_SEEN)
 
 
-def answer(grid: Grid, relief: Array | None, look: Look, frame: Frame) -> DepthMap:
+def answer(grid: Grid, relief: Array | None, picture: ShadedPicture, frame: Frame) -> DepthMap:
     """Return the depth map of a frame from its relief coefficients.
 
     The map is rejected, with zero confidence, if there are no coefficients or if the relief explains too little of the
@@ -192,14 +192,14 @@ def answer(grid: Grid, relief: Array | None, look: Look, frame: Frame) -> DepthM
     Args:
         grid: cell grid of the picture.
         relief: coefficients, or None if too little tissue is visible.
-        look: shading of the frame.
+        picture: shading of the frame.
         frame: frame that determines the size of the map.
     """
     size = frame.image.shape[0], frame.image.shape[1]
     if relief is None:
         return doubted(size, LIGHT, UNSEEN)
     share = share_of_distance(grid, relief[None])
-    return doubted(size, LIGHT, FLAT) if share < BELIEVED else shown(grid, relief, share, look, size)
+    return doubted(size, LIGHT, FLAT) if share < BELIEVED else shown(grid, relief, share, picture, size)
 
 
 def share_of_distance(grid: Grid, reliefs: Array) -> float:
@@ -215,12 +215,12 @@ def share_of_distance(grid: Grid, reliefs: Array) -> float:
     return by_distance / (by_distance + ERROR**2)
 
 
-def shown(grid: Grid, relief: Array, share: float, look: Look, size: tuple[int, int]) -> DepthMap:
+def shown(grid: Grid, relief: Array, share: float, picture: ShadedPicture, size: tuple[int, int]) -> DepthMap:
     """Return the depth map of height and width `size` for a relief. `share` is the confidence in the relief as a whole, 0 to 1."""
     logarithm = (Places.at(grid, *grid.middles()).value @ relief).reshape(grid.height, grid.width)
     return DepthMap(
         _enlarged(RELATIVE_DISTANCE * np.exp(logarithm), size),
-        np.asarray(np.clip(_enlarged(share * _near_seen(look.shading), size), 0, 1), np.float32),
+        np.asarray(np.clip(_enlarged(share * _near_seen(picture.shading), size), 0, 1), np.float32),
         LIGHT,
         metric=False,
     )
@@ -398,13 +398,13 @@ RARER, RARER_DEVIATION = 12.0, 0.4
 """Prior median of the rate, per radian, at which highlights become rarer with the surface's angle to the lamp, and the prior
 standard deviation of the rate's logarithm.
 """
-GLINT_LOOKS = 4.0
+GLINT_PICTURES = 4.0
 """Effective number of independent highlight pictures; slowly moving tissue repeats highlights at the same positions."""
 GLINT_CELL_SHARE = 1 / 64
 """Assumed size of one highlight as a share of a grid cell, by which shares of pixels are converted to numbers of highlights."""
 FEWEST_GLINTS = 0.3
 """Value added to the variance of a cell's number of highlights, so that it is not near 0."""
-BRIGHTNESS_LOOKS = 5
+BRIGHTNESS_PICTURES = 5
 """Largest number of pictures, evenly spaced in the window, whose brightness is used as a cue for the relief."""
 ROUNDS = 16
 ROUNDS_OF_CHANGE = 4
@@ -555,7 +555,7 @@ class Glints:
         self._seen = np.concatenate([each.glints.ravel() / GLINT_CELL_SHARE for each in shadings])
         self._own, self._spread = np.array([np.log(0.05), np.log(RARER)]), 1.0
         self._prior = np.array([1e-3, RARER_DEVIATION**-2])
-        self._looks = min(GLINT_LOOKS, len(shadings)) / len(shadings)
+        self._share_used = min(GLINT_PICTURES, len(shadings)) / len(shadings)
 
     def equations(self, key: Array, changes: Array) -> Equations:
         """Return the cue's normal equations, linearised at the current reliefs: `key` plus each of `changes`."""
@@ -569,7 +569,7 @@ class Glints:
         wide = expected + FEWEST_GLINTS
         off = (self._seen - expected) / wide
         counted = self._counted > 0.5 / GLINT_CELL_SHARE
-        weight = wide * counted * self._looks / self._spread
+        weight = wide * counted * self._share_used / self._spread
         self._spread = max(1.0, float(np.sum((off * off * wide)[counted]) / max(int(counted.sum()), 1)))
         own = np.stack([np.ones_like(angle), -rarer * angle], axis=1)
         self._last = Equations(own, -rarer * by_relief, off, weight, self._prior, self._own - [0, np.log(RARER)])
@@ -589,7 +589,7 @@ def find_reliefs(grid: Grid, shadings: Sequence[Shading], followed: Sequence[Cha
         followed: brightness change since the key time for each time. None at the key time, and
             where tracking failed; the relief of such a time is taken as that of the key.
     """
-    times = np.unique(np.linspace(0, len(shadings) - 1, BRIGHTNESS_LOOKS).round().astype(int)).tolist()
+    times = np.unique(np.linspace(0, len(shadings) - 1, BRIGHTNESS_PICTURES).round().astype(int)).tolist()
     kinds: list[list[Cells]] = [[shadings[k] for k in times]]
     diffuse = [each for k in times if (each := shadings[k].diffuse) is not None]
     kinds += [diffuse] if len(diffuse) == len(times) else []

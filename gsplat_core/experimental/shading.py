@@ -223,7 +223,7 @@ more.
 
 
 @dataclass(frozen=True)
-class Look:
+class ShadedPicture:
     """Precomputed shading and texture of one picture, from which its changes against other pictures are computed."""
 
     shading: Shading
@@ -258,10 +258,10 @@ class Change:
         return self.found >= LEAST_FOUND and bool(known.any()) and float(np.std(self.brighter[known])) <= WIDEST
 
 
-def look_at(frame: Frame, camera: Camera) -> Look:
+def shaded_picture(frame: Frame, camera: Camera) -> ShadedPicture:
     """Compute shading and texture of a frame."""
     picture = SmallPicture.of(frame)
-    return Look(shading_in(picture), picture, seen_by(frame, camera), *log_diffuse(picture))
+    return ShadedPicture(shading_in(picture), picture, seen_by(frame, camera), *log_diffuse(picture))
 
 
 class Follower:
@@ -269,16 +269,16 @@ class Follower:
     order away from the key, since each flow starts from the previous one.
     """
 
-    def __init__(self, key: Look) -> None:
+    def __init__(self, key: ShadedPicture) -> None:
         self._key = key
         self._there: Any = None
         self._back: Any = None
         self._method: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
 
-    def change_to(self, look: Look) -> Change:
+    def change_to(self, other: ShadedPicture) -> Change:
         """Compute the change of brightness and position of the key picture's tissue in another picture, per cell."""
         key = self._key
-        first, second = key.texture.texture, look.texture.texture
+        first, second = key.texture.texture, other.texture.texture
         self._there = self._method.calc(first, second, self._there)
         self._back = self._method.calc(second, first, self._back)
         height, width = first.shape
@@ -289,9 +289,9 @@ class Follower:
         found = np.hypot(returned[..., 0], returned[..., 1]) < RETURN_PX
         tissue = key.known & (key.texture.usable > 0)
         found &= tissue
-        for usable in (look.known.astype(np.uint8), look.texture.usable):
+        for usable in (other.known.astype(np.uint8), other.texture.usable):
             found &= read(usable, cv2.INTER_NEAREST) > 0
-        brighter = read(look.diffuse) - key.diffuse
+        brighter = read(other.diffuse) - key.diffuse
         found &= np.abs(brighter) <= MOST
         weight = found.astype(np.float32)
         mean, share = key.picture.averaged(np.asarray(brighter, np.float32), weight)

@@ -240,11 +240,11 @@ class Covering:
         """
         self.join(step)
         if not first:
-            self.look(step, observation, lambda: frame, has_depth=frame.depth is not None)
+            self.check(step, observation, lambda: frame, has_depth=frame.depth is not None)
         if (right := observation.right) is not None:
-            self.look(step, right, right.as_frame)
+            self.check(step, right, right.as_frame)
 
-    def look(
+    def check(
         self, step: TrainingStep, observation: Observation, frame: Callable[[], Frame], *, has_depth: bool = False
     ) -> None:
         """Find tissue in one eye's view that the scene does not cover, and create Gaussians for it.
@@ -301,8 +301,8 @@ class OutOfView:
         self._capacity = capacity
         self.last_seen = LastSeen(capacity, device)
         self.archive = Archive(ARCHIVED_SCENES * capacity)
-        self._looks = 0
-        self._looked_from: Camera | None = None
+        self._frames = 0
+        self._checked_from: Camera | None = None
         """Camera for which the archive was last searched."""
         self._unseen_s: torch.Tensor | None = None
         """Cached result of `unseen_s` since the last test."""
@@ -312,7 +312,7 @@ class OutOfView:
         self.last_seen.restart()
         self._unseen_s = None
         self.archive = Archive(ARCHIVED_SCENES * self._capacity)
-        self._looks = 0
+        self._frames = 0
 
     def unseen_s(self, count: int) -> torch.Tensor:
         """Return for each of the `count` Gaussians how long it was out of view at the last test, in
@@ -328,12 +328,12 @@ class OutOfView:
         """
         self._unseen_s = None
         kept_free = round(ROOM_SHARE * self._capacity)
-        if self._looks % SEE_EVERY == 0 or self._capacity - step.gaussians.count < kept_free // 2:
+        if self._frames % SEE_EVERY == 0 or self._capacity - step.gaussians.count < kept_free // 2:
             self.last_seen.see(step.at(observation.time_s), observation)
             self.make_room(step, observation, kept_free, UNSEEN_S)
-        self._looks += 1
-        if len(self.archive) and observation.camera != self._looked_from:
-            self._looked_from = observation.camera
+        self._frames += 1
+        if len(self.archive) and observation.camera != self._checked_from:
+            self._checked_from = observation.camera
             if self.has_in_view(observation.camera):
                 with torch.no_grad():
                     alpha = step.picture(step.at(observation.time_s), observation.camera, depth=False).alpha
@@ -393,7 +393,7 @@ class LastSeen:
     def __init__(self, capacity: int, device: torch.device) -> None:
         self._times = torch.zeros(capacity, dtype=torch.float64, device=device)
         self._count = 0
-        self._looked_s = 0.0
+        self._checked_s = 0.0
 
     def times(self) -> Tensor:
         """Return the times of the Gaussians in use, float64 [N], without a copy."""
@@ -409,7 +409,7 @@ class LastSeen:
         float64 [count] seconds, as a copy. Visible and newly added ones get 0.
         """
         unseen = torch.zeros(count, dtype=self._times.dtype, device=self._times.device)
-        unseen[: self._count] = (self._looked_s - self.times()).clamp(min=0)
+        unseen[: self._count] = (self._checked_s - self.times()).clamp(min=0)
         return unseen
 
     def restart(self) -> None:
@@ -422,7 +422,7 @@ class LastSeen:
         `now` is the scene at the observation's time. Occluded Gaussians count as visible.
         """
         self.join(now.count, observation.time_s)
-        self._looked_s = observation.time_s
+        self._checked_s = observation.time_s
         pixels, inside = pixels_of(now.means, observation.camera)
         seen = inside & (value_at(observation.mask, pixels) > 0)
         self.times().masked_fill_(seen, observation.time_s)
@@ -487,7 +487,7 @@ USUAL_DENSITY = 0.3
 """Mean number of Gaussians per cell, over a cell and its eight neighbours, below which the cell counts as empty. A new
 scene has about 1 per cell.
 """
-LOOKS_AFTER = 0.02
+MOVED_SHARE = 0.02
 """Motion of the picture, as a share of its width, after which the picture is searched again for new tissue; each search
 takes some milliseconds.
 """
@@ -498,7 +498,7 @@ leaves no gap.
 
 
 def has_moved(camera: Camera, before: Camera, distance: float) -> bool:
-    """Return True if a point at `distance` moves in the picture by the share `LOOKS_AFTER` of its width or more between two
+    """Return True if a point at `distance` moves in the picture by the share `MOVED_SHARE` of its width or more between two
     cameras, at the edges or the centre of the picture.
     """
     sides = np.array([0.0, 0.5, 1.0])
@@ -508,7 +508,7 @@ def has_moved(camera: Camera, before: Camera, distance: float) -> bool:
         earlier = np.stack([x, y], axis=1) / np.where(z > 0, z, np.inf)[:, None]
     else:
         earlier = pixels_of(_points_of(pixels, camera, distance), before)[0].numpy()
-    return bool(np.abs(earlier - pixels).max() >= LOOKS_AFTER * camera.width_px)
+    return bool(np.abs(earlier - pixels).max() >= MOVED_SHARE * camera.width_px)
 
 
 def _points_of(pixels: NDArray[np.float64], camera: Camera, distance: float) -> Tensor:

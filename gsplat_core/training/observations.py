@@ -309,9 +309,9 @@ def for_eyes(gaussians: Gaussians, observation: Observation) -> Gaussians:
     return gaussians.with_right(observation.right_eye is not None)
 
 
-LOOKED_AT_PX = 80
+COMPARED_PX = 80
 """Width in pixels of the reduced left and right pictures whose colours are compared."""
-LOOK_EVERY = 10
+COMPARE_EVERY = 10
 """Number of frames between two comparisons of the eyes' colours."""
 FOLLOWS = 0.2
 """Weight of a new comparison of the eyes' colours in the moving average."""
@@ -350,14 +350,14 @@ class EyeColours:
     def corrected(self, frame: Frame) -> NDArray[np.uint8]:
         """Return the right picture of a stereo frame in the colours of the left one."""
         assert frame.right_image is not None
-        if self._frames % LOOK_EVERY == 0:
-            self._look(frame.image, frame.right_image, frame.mask)
+        if self._frames % COMPARE_EVERY == 0:
+            self._compare(frame.image, frame.right_image, frame.mask)
         self._frames += 1
         if self._line is None:
             return frame.right_image
         return np.asarray(cv2.transform(frame.right_image, self._line), np.uint8)
 
-    def _look(self, left: NDArray[np.uint8], right: NDArray[np.uint8], mask: NDArray[np.uint8] | None) -> None:
+    def _compare(self, left: NDArray[np.uint8], right: NDArray[np.uint8], mask: NDArray[np.uint8] | None) -> None:
         first, second = _small(left), _small(right)
         size = first.shape[1], first.shape[0]
         tissue = (
@@ -387,7 +387,7 @@ def typical_shift(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> float:
 
 def _small(picture: NDArray[np.uint8]) -> NDArray[np.float32]:
     height, width = picture.shape[:2]
-    size = min(LOOKED_AT_PX, width), max(1, round(height * min(1.0, LOOKED_AT_PX / width)))
+    size = min(COMPARED_PX, width), max(1, round(height * min(1.0, COMPARED_PX / width)))
     return cv2.resize(picture, size, interpolation=cv2.INTER_AREA).astype(np.float32)
 
 

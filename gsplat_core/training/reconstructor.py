@@ -263,7 +263,7 @@ class Reconstructor:
         if self._growth is not None:
             self._growth.finish(self._step, frame, self._window.newest, self._motion)
 
-    def look_after_once(self) -> None:
+    def grow_once(self) -> None:
         """Run every periodic growth step of `grow` immediately, forcing eviction. For warm-up, since the first
         execution of each step is slow.
         """

@@ -167,12 +167,12 @@ class Spending:
         self.made += 1
         self._in_flight = in_flight
         self._has_queued = self._has_queued or in_flight > 0
-        self._look()
+        self._note_first()
 
     def all_finished(self) -> None:
         """Record that all queued steps are finished."""
         self._in_flight = 0
-        self._look()
+        self._note_first()
 
     def planned(self) -> int:
         """Return the number of optimiser steps still to be made, at least 1; estimated if the budget is a deadline."""
@@ -201,7 +201,7 @@ class Spending:
             return self._expected_s
         return max(0.0, self._budget.clock() - self._started_s) / finished
 
-    def _look(self) -> None:
+    def _note_first(self) -> None:
         finished = self.made - self._in_flight
         if self._first is None and finished >= 1 and self._has_queued and self._budget.is_timed:
             self._first = finished, self._budget.clock()
@@ -332,8 +332,8 @@ class LiveTraining:
         """Return the colour relaxation of a rehearsal step. `or_depth` is True if its frame has
         depth and a step cannot correct colours and compare depth at once.
         """
-        looks_at_depth = or_depth and number % DEPTH_EVERY == 0
-        return 0.0 if looks_at_depth else REHEARSED_CORRECTION * self.colour_relaxation
+        compares_depth = or_depth and number % DEPTH_EVERY == 0
+        return 0.0 if compares_depth else REHEARSED_CORRECTION * self.colour_relaxation
 
 
 class Schedule(ABC):

@@ -96,7 +96,7 @@ class Upkeep:
         if step.steps - self._relaxed_at < RELAX_EVERY:
             return
         with torch.no_grad():
-            seen = self._look(step, observation)
+            seen = self._examine(step, observation)
             self._relax(step, seen, observation.camera)
             if step.steps - self._renewed_at >= RENEW_EVERY:
                 self._renew(step, seen, observation, last_seen, self._useless(step, seen))
@@ -104,7 +104,7 @@ class Upkeep:
     def once(self, step: TrainingStep, observation: Observation, last_seen: LastSeen | None = None) -> None:
         """Run all maintenance immediately, as if the first Gaussian were useless. For warm-up."""
         with torch.no_grad():
-            seen = self._look(step, observation)
+            seen = self._examine(step, observation)
             self._relax(step, seen, observation.camera)
             self._useless(step, seen)
             first = torch.arange(step.gaussians.count, device=seen.shown.device) == 0
@@ -115,7 +115,7 @@ class Upkeep:
             if last_seen is not None:
                 last_seen.join(step.gaussians.count, observation.time_s)
 
-    def _look(self, step: TrainingStep, observation: Observation) -> Seen:
+    def _examine(self, step: TrainingStep, observation: Observation) -> Seen:
         now = step.at(observation.time_s)
         pixels, inside = pixels_of(now.means, observation.camera)
         return Seen(now, pixels, inside, inside & (value_at(observation.mask, pixels) > 0))

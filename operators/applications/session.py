@@ -22,7 +22,7 @@ from gsplat_core.scene.frames import Frame
 from operators.errors import DeviceMissing, OperatorsError, RunFailed
 from operators.graph import Application, DurationSummary, GreedyScheduler, ManualClock, MultiThreadScheduler, run
 from operators.graph.application import Engine
-from operators.ingest import LOOK_S, SourceResult
+from operators.ingest import POLL_S, SourceResult
 from operators.outcome import Contributor, OutcomeBuilder
 from operators.output_folder import OutputFolder
 from operators.reconstruct import ModelResult
@@ -314,7 +314,7 @@ class FirstFrames:
         try:
             given = 0
             while given < self.count:
-                frame = self.source.read(LOOK_S)
+                frame = self.source.read(POLL_S)
                 if frame is not None:
                     given += 1
                     yield frame

@@ -11,7 +11,7 @@ from operators.errors import GraphInvalid, OperatorStuck
 from operators.graph.graph import Graph, OperatorTask
 from operators.graph.ports import Clock, Edge, LockedEdge, ManualClock, QueuePolicy, RealtimeClock, SchedulingStatus
 
-_LOOK_S = 0.25
+_POLL_S = 0.25
 
 
 def interruptible_wait(event: threading.Event, timeout_s: float | None = None) -> bool:
@@ -22,10 +22,10 @@ def interruptible_wait(event: threading.Event, timeout_s: float | None = None) -
     """
     due_s = None if timeout_s is None else time.monotonic() + timeout_s
     while True:
-        left_s = _LOOK_S if due_s is None else min(_LOOK_S, due_s - time.monotonic())
+        left_s = _POLL_S if due_s is None else min(_POLL_S, due_s - time.monotonic())
         if event.wait(max(0.0, left_s)):
             return True
-        if left_s < _LOOK_S:
+        if left_s < _POLL_S:
             return False
 
 

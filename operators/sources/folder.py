@@ -91,7 +91,7 @@ def following_name(path: Path) -> Path | None:
     return path.with_name(path.stem[: found.start()] + following + path.stem[found.end() :] + path.suffix)
 
 
-LOOK_S = 0.01
+POLL_S = 0.01
 UNREADABLE_AFTER_S = 2.0
 """Time in seconds after which an unreadable file that no longer changes is skipped."""
 
@@ -129,7 +129,7 @@ class FolderSource(StreamSource):
                 raise SourceUnavailable(
                     f"no whole image came into {path} within {open_s:g} s. Start what writes there."
                 )
-            time.sleep(LOOK_S)
+            time.sleep(POLL_S)
         self._first: Picture | None = picture
         self._rate = fps
         self.describe(self._name, (picture.image.shape[1], picture.image.shape[0]), fps)
@@ -141,7 +141,7 @@ class FolderSource(StreamSource):
         if first is None:
             self._files = self._begin()
         seq = 0
-        while not self.wait(0 if first else LOOK_S):
+        while not self.wait(0 if first else POLL_S):
             try:
                 picture, first = first or self._next(), None
                 while picture is not None:
@@ -150,7 +150,7 @@ class FolderSource(StreamSource):
                     picture = self._next()
             except OSError as error:
                 self.lost(f"{self._name} cannot be read ({error.strerror}); reading is retried")
-                self.wait(10 * LOOK_S)
+                self.wait(10 * POLL_S)
             if self._files.late:
                 self.count("out_of_order", self._files.late)
                 self._files.late = 0

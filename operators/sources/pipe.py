@@ -132,7 +132,7 @@ class Y4mHeader:
         )
 
 
-LOOK_S = 0.05
+POLL_S = 0.05
 HEADER_TIMEOUT_S = 30.0
 """Timeout for the header line of a YUV4MPEG2 stream, in seconds."""
 PIPE_BYTES = 1 << 20
@@ -214,7 +214,7 @@ class PipeSource(StreamSource):
                 if seq > given:
                     self.lost(f"the writer of {self._name} has closed it; waiting for another writer")
                 given, self._pending = seq, b""
-                self.wait(LOOK_S)
+                self.wait(POLL_S)
                 if self._describes_itself:
                     self._raw = None
 
@@ -277,11 +277,11 @@ class PipeSource(StreamSource):
                     return data
                 # An empty read may mean that a named pipe has no writer yet. Try again if there is time to wait for
                 # one.
-                if until_s is None or not self._again or self._pending or self.wait(LOOK_S):
+                if until_s is None or not self._again or self._pending or self.wait(POLL_S):
                     raise Ended
 
     def _wait_for_data(self, until_s: float | None) -> None:
-        while not select.select([self._fd], [], [], LOOK_S)[0]:
+        while not select.select([self._fd], [], [], POLL_S)[0]:
             if self.wait(0) or (until_s is not None and time.monotonic() > until_s):
                 raise Ended
         if self.wait(0) or (until_s is not None and time.monotonic() > until_s):

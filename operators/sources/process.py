@@ -426,7 +426,7 @@ MOST_FAILURES = 10
 """Number of consecutive processes that end without a frame after which the source is given up. Failures to open a
 source that may return, such as a camera, do not count.
 """
-LOOK_S = 0.05
+POLL_S = 0.05
 
 
 class ProcessSource(LiveSource):
@@ -570,7 +570,7 @@ class ProcessSource(LiveSource):
         # The child sends nothing between its description and the receipt of `open`, so this pause does not count as a hang.
         last_s = child.message_s = time.monotonic()
         while not self.wait(0):
-            message = child.receive(LOOK_S)
+            message = child.receive(POLL_S)
             if message is None:
                 if time.monotonic() - child.message_s > self._hung_after_s:
                     raise ChildLost(f"it has sent nothing for {self._hung_after_s:g} s")
@@ -631,7 +631,7 @@ class ProcessSource(LiveSource):
     def _described(self, child: ChildProcess) -> SourceDescription:
         until_s = time.monotonic() + self._open_timeout_s
         while not self.wait(0):
-            message = child.receive(LOOK_S)
+            message = child.receive(POLL_S)
             if message is None:
                 if time.monotonic() > until_s:
                     raise ChildLost(f"it has not opened the source within {self._open_timeout_s:g} s")

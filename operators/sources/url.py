@@ -67,12 +67,12 @@ class Connection:
         except (av.FFmpegError, OSError, ValueError) as error:
             raise ConnectionFailed(_words(error)) from None  # the original error contains the address with its password
         try:
-            self._look()
+            self._poll()
         except ConnectionFailed:
             self.close()
             raise
 
-    def _look(self) -> None:
+    def _poll(self) -> None:
         assert self._container is not None
         if not self._container.streams.video:
             raise ConnectionFailed("there is no video in it")

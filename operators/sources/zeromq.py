@@ -158,7 +158,7 @@ class FramePublisher:
         self.close()
 
 
-LOOK_MS = 50
+POLL_MS = 50
 NEW_SOCKET_S = 2.0
 """Time without a connection, in seconds, after which the socket is replaced."""
 
@@ -233,7 +233,7 @@ class ZeroMqSource(StreamSource):
         what = f"{bad} messages came, and none is a frame" if bad else "no frame came"
         raise SourceUnavailable(f"{self._name} cannot be opened: {what}. Start what sends to it, and check the keys.")
 
-    def _next(self, look_ms: int = LOOK_MS) -> Frame | None:
+    def _next(self, look_ms: int = POLL_MS) -> Frame | None:
         """Receive the next frame; None after a malformed message, or if none arrived within `look_ms` milliseconds."""
         assert self._socket is not None and self._monitor is not None
         found = dict(self._poller.poll(look_ms))

@@ -26,7 +26,7 @@ from services.display import BOUNDARY, EncodedPicture, PictureKind
 from services.settings import ResourceName
 
 log = logging.getLogger(__name__)
-LOOK_S = 1.0
+POLL_S = 1.0
 """Interval in seconds at which an open display checks that its viewer's key is still valid."""
 REFUSED = 1008
 REFUSED_WHY = "the key was revoked or has expired"
@@ -103,7 +103,7 @@ async def until_ended(
     Args:
         connection: the viewer's connection.
         left: coroutine that returns when the viewer disconnects.
-        caller: checked every `LOOK_S`.
+        caller: checked every `POLL_S`.
 
     Yields:
         The reason, readable after the block.
@@ -149,7 +149,7 @@ async def _no_longer_admitted(control: ControlState, caller: Caller) -> None:
     pictures during a procedure. New callers are still refused.
     """
     while True:
-        await anyio.sleep(LOOK_S)
+        await anyio.sleep(POLL_S)
         try:
             if not await anyio.to_thread.run_sync(still_valid, control, caller):
                 return

@@ -126,7 +126,7 @@ async def delete_replay(request: Request, caller: CallerOf, job_id: JobId) -> No
         await asyncio.to_thread(jobs.delete, job_id)
 
 
-LOOK_S = 0.25
+POLL_S = 0.25
 NORMAL, GOING_AWAY = 1000, 1001
 CLOSE_S = 1.0
 REPORT_POLICY = "; ".join(
@@ -225,7 +225,7 @@ async def replay_progress(
                     said = view
                 ended = view.state not in ("queued", "running")
                 if not ended:
-                    await asyncio.sleep(LOOK_S)
+                    await asyncio.sleep(POLL_S)
                     view = await asyncio.to_thread(view_of, jobs, job_id)
         if socket.client_state is WebSocketState.CONNECTED and socket.application_state is WebSocketState.CONNECTED:
             with anyio.move_on_after(CLOSE_S):

@@ -468,7 +468,7 @@ def _done(number: int, frame: FrameType | None) -> None:
     """Signal handler that does nothing: uvicorn has already handled the signal by draining."""
 
 
-LOOK_S = 2.0
+POLL_S = 2.0
 """Interval in seconds at which the certificate and key files are checked for changes."""
 _CERTIFICATE = re.compile(r"-----BEGIN CERTIFICATE-----.+?-----END CERTIFICATE-----", re.DOTALL)
 _SEQUENCE, _VERSION, _UTC_TIME = 0x30, 0xA0, 0x17
@@ -507,7 +507,7 @@ class ServerCertificate(Collector):
         # OpenSSL calls this for each handshake, with or without a server name.
         context.sni_callback = choose
 
-    def look(self) -> bool:
+    def reload_if_changed(self) -> bool:
         """Reload chain and key if their files changed.
 
         Returns:
@@ -565,9 +565,9 @@ class ServerCertificate(Collector):
 
     async def _watch(self) -> None:
         while True:
-            await asyncio.sleep(LOOK_S)
+            await asyncio.sleep(POLL_S)
             failed_before = self._failure
-            changed = await asyncio.to_thread(self.look)
+            changed = await asyncio.to_thread(self.reload_if_changed)
             if changed:
                 self._events.tell("certificate.reload", "server", expires_at=self.expires_at.isoformat())
             elif self._failure is not None and self._failure != failed_before:

@@ -26,7 +26,7 @@ from services.audit.log import (
     read_head,
 )
 
-MOST_LOOKED_AT = 50_000
+MOST_EXAMINED = 50_000
 """Largest number of entries read per search, which bounds its time to about a second. The next page continues at that
 position.
 """
@@ -113,7 +113,7 @@ def _search(files: list[Path], wanted: Wanted, count: int, before: int | None) -
         looked_at += 1
         if fits:
             found.append(entry if wanted == Wanted() else parse_line(line)[0])
-        if len(found) >= count or (looked_at >= MOST_LOOKED_AT and wanted != Wanted()):
+        if len(found) >= count or (looked_at >= MOST_EXAMINED and wanted != Wanted()):
             return Page(found, number if number > 0 else None)
     return Page(found, None)
 

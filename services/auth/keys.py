@@ -547,22 +547,22 @@ def changed_outside(audit: AuditLog, event: str, key: ApiKey) -> None:
 async def keys_read_again(keys: KeyStore) -> AsyncIterator[None]:
     """Poll for key changes while the block runs and once at its end, independently of requests.
     Also saves the times of last use."""
-    looking = asyncio.create_task(_look(keys), name="changes of keys")
+    looking = asyncio.create_task(_refresh(keys), name="changes of keys")
     try:
         yield
     finally:
         looking.cancel()
         await asyncio.gather(looking, return_exceptions=True)
-        await asyncio.to_thread(_look_once, keys, ends=True)
+        await asyncio.to_thread(_refresh_once, keys, ends=True)
 
 
-async def _look(keys: KeyStore) -> None:
+async def _refresh(keys: KeyStore) -> None:
     while True:
         await asyncio.sleep(AGAIN_S)
-        await asyncio.to_thread(_look_once, keys)
+        await asyncio.to_thread(_refresh_once, keys)
 
 
-def _look_once(keys: KeyStore, *, ends: bool = False) -> None:
+def _refresh_once(keys: KeyStore, *, ends: bool = False) -> None:
     try:
         keys.all()
         keys.save_used(now=ends)

@@ -76,7 +76,7 @@ def _refuse(name: str) -> Any:
 
 
 log = logging.getLogger(__name__)
-LOOK_MS = 100
+POLL_MS = 100
 ANSWER_S = 2.0
 Handler = Callable[[Mapping[str, Any]], Mapping[str, Any] | None]
 """Command handler: takes the arguments, returns the answer."""
@@ -158,7 +158,7 @@ class CommandServer:
 
     def _serve(self) -> None:
         while not self._stop.is_set():
-            if not self._socket.poll(LOOK_MS):
+            if not self._socket.poll(POLL_MS):
                 continue
             parts = self._socket.recv_multipart()
             answer = self._answer(b"".join(parts))

@@ -588,12 +588,12 @@ def _deleted(
 ) -> int:
     """Delete an existing resource. The lookup comes first, so a mistyped name fails before the confirmation."""
 
-    def look_and_act(client: Client) -> None:
+    def show_and_act(client: Client) -> None:
         find(client)
         check_sure(what, yes)
         act(client)
 
-    service(look_and_act)
+    service(show_and_act)
     typer.echo(f"deleted {what}")
     return OK
 
@@ -828,7 +828,7 @@ def watch(
     """Show the streams periodically: state, rates, age, restarts and displays. Ends with Ctrl-C."""
     from services.client import ClientError
 
-    def look(client: Client) -> None:
+    def show(client: Client) -> None:
         done = 0
         while True:
             try:
@@ -836,14 +836,14 @@ def watch(
             except ClientError as error:
                 if done == 0:
                     raise
-                lines = [f"no answer since the last look: {error}"]
+                lines = [f"no answer since the last query: {error}"]
             typer.echo((CLEAR if sys.stdout.isatty() else "") + "\n".join(lines))
             done += 1
             if done == looks:
                 return
             time.sleep(every)
 
-    service(look)
+    service(show)
     return OK
 
 

@@ -131,7 +131,7 @@ def _cuda(ops: list[str]) -> list[Check]:
     """Check for a usable GPU, for compiled CUDA kernels, and that the kernels support the GPU."""
     from gsplat_core.ops.native import CUDA_MISSING, cuda_build, cuda_refusal
 
-    graphics = look()
+    graphics = find_graphics()
     gpu = Check("GPU", graphics.found, graphics.usable, graphics.advice, needed=False)
     if CUDA_MISSING is not None:
         advice = (
@@ -195,7 +195,7 @@ class Graphics:
     """Remedy; empty if the GPU is usable or there is no remedy."""
 
 
-def look() -> Graphics:
+def find_graphics() -> Graphics:
     """Query torch, and inspect the driver's files for the reason if torch sees no GPU."""
     import torch
 
@@ -246,7 +246,7 @@ def main() -> int:
     Returns:
         The exit code; 0 if a GPU is usable.
     """
-    graphics = look()
+    graphics = find_graphics()
     print("NVIDIA GPU:", graphics.found + (f"; {graphics.advice}" if graphics.advice else ""))  # noqa: T201 - its purpose
     return 0 if graphics.usable else 1
 

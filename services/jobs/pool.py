@@ -261,7 +261,7 @@ if __name__ == "__main__":
 RELAY_S = 1.0
 LEVELS = {"WARNING": logging.WARNING, "ERROR": logging.ERROR, "CRITICAL": logging.ERROR, "Traceback": logging.ERROR}
 """Log level of a line of the pool's output, by its first word."""
-LOOK_S = 0.5
+POLL_S = 0.5
 END_S = 10.0
 """Seconds that a stopped pool may take to requeue its jobs and end, before it is killed."""
 PASSED_ON = (
@@ -306,7 +306,7 @@ class PoolKeeper:
                     wait_s = restarts.ended(loop.time() - began_s)
                     log.error("the pool of jobs ended with code %d; it is started again in %.1f s", code, wait_s)
                     await asyncio.sleep(wait_s)
-            await asyncio.sleep(LOOK_S)
+            await asyncio.sleep(POLL_S)
 
     async def _is_wanted(self) -> bool:
         try:

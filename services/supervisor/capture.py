@@ -35,7 +35,7 @@ from services.private_files import keep_files_private
 from services.supervisor.launcher import FAILED, NO_USE
 from services.supervisor.worker import ProcessSpec, SourceSpec, Worker
 
-LOOK_MS = 50
+POLL_MS = 50
 ASK_AGAIN_S = 0.1
 SILENT_S = 1.0
 """Seconds without a heartbeat after which the engine treats the capture process as ended or hung."""
@@ -104,7 +104,7 @@ class CapturedSource(LiveSource):
         self._heard_s = time.monotonic()  # no heartbeat could arrive before the subscription
         try:
             while not self.wait(0):
-                found = dict(poller.poll(LOOK_MS))
+                found = dict(poller.poll(POLL_MS))
                 if ended in found:
                     recv_monitor_message(ended)
                     self.lost("the capture process has ended; it is being started again")
@@ -173,7 +173,7 @@ class CapturedSource(LiveSource):
 
 
 log = logging.getLogger(__name__)
-LOOK_S = 0.1
+POLL_S = 0.1
 """Read timeout in seconds; the source state is reported at this interval while no frame arrives."""
 
 
@@ -244,7 +244,7 @@ class Capture:
         stuck_after_s = STUCK_AFTER_S.get(split_address(self.spec.address)[0], math.inf)
         given_s = time.monotonic()
         while not worker.stop_requested():
-            frame = source.read(LOOK_S)
+            frame = source.read(POLL_S)
             if frame is not None:
                 given_s = time.monotonic()
                 self._send(frame, publisher)
@@ -254,7 +254,7 @@ class Capture:
                 state = source.state
                 worker.say(state.value, _sentence(source))
                 if state is SourceState.ENDED:
-                    worker.wait(LOOK_S)
+                    worker.wait(POLL_S)
                 elif time.monotonic() - given_s > stuck_after_s:
                     log.error(
                         "the camera's driver has delivered nothing for %g s; the process exits and is restarted",

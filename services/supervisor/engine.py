@@ -362,7 +362,7 @@ class FinishedModel:
             return displayed(image).copy()
 
 
-MODEL_LOOK_S = 0.1
+MODEL_POLL_S = 0.1
 REPEAT_NS = 200_000_000
 LATE_IN_A_ROW = 5
 """Consecutive late pictures that count as a missed time limit. A single late picture may be caused by other load on
@@ -493,7 +493,7 @@ class ModelShow:
         repeated_ns = 0
         try:
             while not stop():
-                came = source.read(MODEL_LOOK_S)
+                came = source.read(MODEL_POLL_S)
                 frame, now_ns = came or frame, time.monotonic_ns()
                 if frame is None or (came is None and now_ns - repeated_ns < REPEAT_NS):
                     continue
@@ -591,7 +591,7 @@ class ModelShow:
         self._file.unlink(missing_ok=True)
 
 
-LOOK_S = 0.05
+POLL_S = 0.05
 """Seconds between two checks for a switch back to the live reconstruction, while a finished model is displayed."""
 
 
@@ -614,7 +614,7 @@ def show(worker: Worker, spec: EngineSpec, screen: Screen, layers: Layers, again
                 again = True
             else:
                 worker.say("running", "shows a finished model")
-                worker.wait(LOOK_S)
+                worker.wait(POLL_S)
     finally:
         if not worker.stop_requested():
             worker.request_stop("the engine failed")

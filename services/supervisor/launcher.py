@@ -101,7 +101,7 @@ LOADS_LONG = ("services.supervisor.engine",)
 is no slower than a second import at the same time."""
 LOADING_S = 60.0
 ANSWER_S = 5.0
-LOOK_S = 0.05
+POLL_S = 0.05
 PING_S = 1.0
 
 
@@ -281,7 +281,7 @@ class ByLauncher:
                         self._folder.path / "launcher.log",
                         {},
                     )
-                await asyncio.sleep(LOOK_S)
+                await asyncio.sleep(POLL_S)
                 continue
             try:
                 await self._ask("ping", supervisor=self._own)
@@ -332,7 +332,7 @@ LOADED = (
     "operators.sources.zeromq",
 )
 """Modules of frame sources that the launcher imports in advance, because capture processes are likely to use them."""
-LAUNCHER_LOOK_S = 0.2
+LAUNCHER_POLL_S = 0.2
 REQUEST_S = 1.0
 """Timeout in seconds for reading a request and sending its answer."""
 MOST_REMEMBERED = 256
@@ -366,7 +366,7 @@ class Launcher:
                 break
             if not self._path.exists():
                 break
-            if not select.select([self._listener], [], [], LAUNCHER_LOOK_S)[0]:
+            if not select.select([self._listener], [], [], LAUNCHER_POLL_S)[0]:
                 continue
             connection, _ = self._listener.accept()
             with connection:
@@ -413,9 +413,9 @@ class Launcher:
 
     def _end_children(self) -> None:
         """Wait for the child processes, which end after the supervisor's death, and kill those that hang."""
-        until_s = time.monotonic() + ORPHAN_DRAIN_S + LAUNCHER_LOOK_S
+        until_s = time.monotonic() + ORPHAN_DRAIN_S + LAUNCHER_POLL_S
         while self._children and time.monotonic() < until_s:
-            time.sleep(LOOK_S)
+            time.sleep(POLL_S)
             self._reap()
         for pid in self._children:
             os.kill(pid, signal.SIGKILL)  # not reaped yet, so the process id is still that of the child

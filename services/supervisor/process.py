@@ -75,7 +75,7 @@ class Restarts:
 
 
 log = logging.getLogger(__name__)
-LOOK_S = 0.25
+POLL_S = 0.25
 PING_S = 1.0
 PAUSED_S = 1.0
 """Delay of a periodic check, in seconds, above which it is assumed that the supervisor itself was suspended."""
@@ -322,9 +322,9 @@ class ManagedProcess:
         looked_s = time.monotonic()
         try:
             while not ended.done():
-                await asyncio.wait({ended}, timeout=LOOK_S)
+                await asyncio.wait({ended}, timeout=POLL_S)
                 now_s = time.monotonic()
-                if now_s - looked_s > LOOK_S + PAUSED_S:
+                if now_s - looked_s > POLL_S + PAUSED_S:
                     self._heard_s = now_s  # while suspended, the supervisor could not receive heartbeats
                     self._shown = self._shown[0], now_s
                 looked_s = now_s
@@ -383,9 +383,9 @@ class ManagedProcess:
         if published != self._shown[0]:
             self._shown = published, now_s
         if self._role == "capture":
-            self._look_at_source(str(said.get("state")), str(said.get("reason")), now_s)
+            self._note_source_state(str(said.get("state")), str(said.get("reason")), now_s)
 
-    def _look_at_source(self, state: str, reason: str, now_s: float) -> None:
+    def _note_source_state(self, state: str, reason: str, now_s: float) -> None:
         """Report a loss of the source once it lasts `LOST_AFTER_S`, and then its recovery."""
         if state == "live":
             self._gone_s = None

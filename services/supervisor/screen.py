@@ -202,7 +202,7 @@ class LayerDrawing:
     def _draw_orbit(self, scene: LayerScene) -> Picture:
         orbit = self.orbit
         if self._depth.median is None or scene.planes is not None:
-            self._depth.look_at(*self._planes(scene))
+            self._depth.adapt_range(*self._planes(scene))
         distance = self._depth.median or 1.0
         gaussians, unseen_s = _at(scene)
         camera = orbit.camera(scene.camera, distance)
@@ -267,7 +267,7 @@ PERIOD_S = {"cpu": 0.1, "cuda": 1 / 30}
 """Minimum time between two pictures of a layer such as depth, in seconds, by device of the engine."""
 MOST_SHARE = {"cpu": 1 / 6, "cuda": 1 / 4}
 """Largest share of time spent on drawing layers, by device. A slow picture is followed by a longer pause."""
-LOOK_S = 0.2
+POLL_S = 0.2
 Scene = Callable[[], LayerScene | None]
 """Factory of a scene, called by the drawing thread. It returns None if the scene cannot be drawn."""
 
@@ -352,7 +352,7 @@ class Layers:
                 self._watched = frozenset(layer for layer, each in publishers.items() if each.watched)
                 if not self._watched:
                     self._scene = None
-                    wait_for_readers(publishers.values(), LOOK_S)
+                    wait_for_readers(publishers.values(), POLL_S)
                     continue
                 waiting = self._next()
                 if waiting is not None:
@@ -367,11 +367,11 @@ class Layers:
 
     def _next(self) -> tuple[Layer, Scene] | None:
         """Return the watched layer whose last drawing is oldest, and the newest scene. If every watched layer has drawn
-        this scene, wait up to `LOOK_S` for a new one and return None."""
+        this scene, wait up to `POLL_S` for a new one and return None."""
         with self._changed:
             waiting = [each for each in LAYERS if each in self._watched and self._drawn_of[each][0] < self._number]
             if not waiting or self._scene is None:
-                self._changed.wait(LOOK_S)
+                self._changed.wait(POLL_S)
                 return None
             layer = min(waiting, key=lambda each: self._drawn_of[each][1])
             self._drawn_of[layer] = self._number, time.monotonic()

@@ -410,7 +410,7 @@ class SupervisedStreams:
         return {**specs, "engine": specs["engine"].model_copy(update={"engine": placed})}
 
 
-LOOK_S = 0.25
+POLL_S = 0.25
 MOST_MS = 200.0
 """Time limit per picture in milliseconds. A model that repeatedly exceeds it is replaced by the previous model."""
 PREPARE_S = 60.0
@@ -455,18 +455,18 @@ class ShownModels:
         while True:
             for stream in self._streams.streams():
                 await self.follow(stream)
-            await asyncio.sleep(LOOK_S)
+            await asyncio.sleep(POLL_S)
 
     async def follow(self, stream: Stream) -> None:
-        """Call `look_at`, and note and log why it failed. The log has each reason once, not at every poll."""
+        """Call `show_active`, and note and log why it failed. The log has each reason once, not at every poll."""
         try:
-            await self.look_at(stream)
+            await self.show_active(stream)
         except (BusError, RegistryError) as error:
             if stream.model_fault != str(error):
                 log.warning("%s does not show its model: %s", stream.name, error)
             stream.model_fault = str(error)
 
-    async def look_at(self, stream: Stream) -> None:
+    async def show_active(self, stream: Stream) -> None:
         """Send `show_model` to a running engine if it does not display the active version of the stream's configured model.
         A version that it refused is sent again after `AGAIN_S` seconds.
 

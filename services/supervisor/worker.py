@@ -252,7 +252,7 @@ def remove_dead() -> list[Path]:
 
 log = logging.getLogger(__name__)
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-LOOK_S = 0.25
+POLL_S = 0.25
 MEASURED_EVERY_S = 1.0
 ORPHAN_DRAIN_S = 1.25
 """Largest time in seconds that a process without supervisor may take to finish before it is terminated."""
@@ -339,7 +339,7 @@ class Worker:
         self._heartbeats = Heartbeats(self.folder.status(self.role), self._report)
         self._commands = CommandServer(self.folder.commands(self.role), self._handlers)
         self.folder.write_record(self.role, self.spec.digest)
-        self._watch = threading.Thread(target=self._look_after, name="watch", daemon=True)
+        self._watch = threading.Thread(target=self._watch_loop, name="watch", daemon=True)
         self._watch.start()
         return self
 
@@ -420,10 +420,10 @@ class Worker:
             self._measured = {name: value for part in list(self._measures.values()) for name, value in part().items()}
         return self._measured
 
-    def _look_after(self) -> None:
+    def _watch_loop(self) -> None:
         drain_s = self.spec.limits.drain_s
         asked_s: float | None = None
-        while not self._over.wait(LOOK_S):
+        while not self._over.wait(POLL_S):
             now_s = time.monotonic()
             if self._parent.lost(now_s):
                 self.request_stop("its supervisor has died")

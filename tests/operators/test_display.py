@@ -10,7 +10,7 @@ from operators import display
 from operators.display import (
     COLOURS,
     LEAST_LABELLED_PX,
-    LOOK_NS,
+    POLL_NS,
     DisplayOp,
     LiveDisplayResult,
     _age_text,
@@ -276,7 +276,7 @@ def test_the_operator_looks_twenty_times_a_second_and_keeps_four_pictures(fake_t
     clock = FrameClock(ClockSettings(), 25, fake_time)
     operator = DisplayOp(None, clock=clock, source_state=lambda: SourceState.LIVE)
     (condition,) = operator.conditions
-    assert LOOK_NS == condition.timeout_ns == 50_000_000
+    assert POLL_NS == condition.timeout_ns == 50_000_000
     assert operator.spec.inputs["rendered"].capacity == 4
 
 

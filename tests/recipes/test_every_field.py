@@ -99,7 +99,7 @@ def test_everything_that_a_live_scene_goes_through_takes_the_field(recording, fi
     made._step._adam.steps += RENEW_EVERY
     made.grow(frame)
     made._step._adam.steps = counted
-    made.look_after_once()
+    made.grow_once()
     made.rehearse(8)
     image = made.publish().render(frame.time_s, camera.with_pose(frame.pose)).image.clamp(0, 1)
     assert psnr_tissue_db((image * 255).round().byte().numpy(), frame.image, frame.mask) > 18

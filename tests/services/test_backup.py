@@ -413,7 +413,7 @@ def test_a_service_without_its_files_says_so(service, tmp_path, caplog):
         shutil.move(tmp_path / folder, data / folder)
     assert archive.recordings.recover() == ["case-2"]
     assert archive.recordings.get("case-1").state is State.READY and archive.recordings.get("case-1").reason is None
-    archive.files._looked_s = None
+    archive.files._checked_s = None
     assert [str(each) for each in archive.files.missing()] == ["model liver/1"]
     archive.recordings.close()
     archive.replays._store.close()

@@ -250,7 +250,7 @@ class VideoFrames:
                 f"{_REENCODE}, or replay only its beginning (--max-frames {due})",
             )
 
-    def look_at_first(self) -> Picture | None:
+    def first_picture(self) -> Picture | None:
         """Decode the first frame, which determines the size of all frames; None if none decodes."""
         decoded = self._decoded(DamageSpread(self._index))
         position, first = next(decoded, (0, None))
@@ -524,7 +524,7 @@ def _with_first_frame(
 ) -> VideoFrames | None:
     """Return the video; None after a problem with its first frame, which must be intact to initialise the scene."""
     video = VideoFrames(path, container, index, timing, _orientation(path, container, findings))
-    first = video.look_at_first()
+    first = video.first_picture()
     if first is None:
         findings.problem(path, "no frame of the video can be decoded", _REENCODE)
         return None

@@ -161,7 +161,7 @@ class SegmentReader:
         self.fields = frozenset(FIELDS)
         """Names of the optional frame fields that all readable frames of the segment have."""
         self._indices: dict[str, TrackIndex | None] = {}
-        self._look(after_seq)
+        self._poll(after_seq)
 
     def lines(self) -> Iterator[Line]:
         """Yield the readable lines in order."""
@@ -187,7 +187,7 @@ class SegmentReader:
         """Return the paths of the segment's log and track files that are read."""
         return sorted([self.folder / LOG_FILE, *(index.path for index in self._indices.values() if index is not None)])
 
-    def _look(self, after_seq: int) -> None:
+    def _poll(self, after_seq: int) -> None:
         """Read the log once to find its last line, its track files, and the frames whose pictures are complete."""
         lines = self.lines()
         first = next(lines, None)

@@ -12,7 +12,7 @@ constexpr int kSegmentColumns = 64, kSegmentRows = 32;
 
 // Features of a pixel that are compared between the images: slope and brightness, and their range within half a pixel
 // to both sides.
-struct __align__(8) Look {
+struct __align__(8) Features {
   uint8_t slope, slope_low, slope_high, brightness, brightness_low, brightness_high, unused[2];
 };
 
@@ -37,8 +37,8 @@ __device__ inline Range range_of(int before, int here, int after) {
   return {uint8_t(min(here, min(one, other))), uint8_t(max(here, max(one, other)))};
 }
 
-// Compute slope, brightness and their ranges at both images' pixels. looks: [2, height, width], left image first.
-__global__ void __launch_bounds__(kThreads) look_at(Pair pair, Look* looks) {
+// Compute slope, brightness and their ranges at both images' pixels. features: [2, height, width], left image first.
+__global__ void __launch_bounds__(kThreads) compute_features(Pair pair, Features* features) {
   const int64_t pixels = int64_t(pair.height) * pair.width, i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i >= 2 * pixels) return;
   const Picture picture = {i < pixels ? pair.left : pair.right, pair.height, pair.width};
@@ -46,7 +46,7 @@ __global__ void __launch_bounds__(kThreads) look_at(Pair pair, Look* looks) {
   const int slope = picture.slope(y, x), brightness = picture.at(y, x);
   const Range s = range_of(picture.slope(y, x - 1), slope, picture.slope(y, x + 1));
   const Range b = range_of(picture.at(y, x - 1), brightness, picture.at(y, x + 1));
-  looks[i] = {uint8_t(slope), s.low, s.high, uint8_t(brightness), b.low, b.high, {}};
+  features[i] = {uint8_t(slope), s.low, s.high, uint8_t(brightness), b.low, b.high, {}};
 }
 
 // Return the Birchfield-Tomasi difference of two pixels: the smaller of the distances of each value from the other's
@@ -54,7 +54,7 @@ __global__ void __launch_bounds__(kThreads) look_at(Pair pair, Look* looks) {
 __device__ inline int difference(int a, int a_low, int a_high, int b, int b_low, int b_high) {
   return max(0, min(max(a - b_high, b_low - a), max(b - a_high, a_low - b)));
 }
-__device__ inline int pixel_cost(const Look& a, const Look& b) {
+__device__ inline int pixel_cost(const Features& a, const Features& b) {
   const int by_slope = difference(a.slope, a.slope_low, a.slope_high, b.slope, b.slope_low, b.slope_high);
   const int by_brightness =
       difference(a.brightness, a.brightness_low, a.brightness_high, b.brightness, b.brightness_low, b.brightness_high);
@@ -63,17 +63,17 @@ __device__ inline int pixel_cost(const Look& a, const Look& b) {
 
 // Sum the differences over the window's columns [height, width, count], with one warp per segment of a row.
 template <int kEach>
-__global__ void __launch_bounds__(kThreads) sum_along_rows(Pair pair, const Look* looks, uint16_t* sums) {
+__global__ void __launch_bounds__(kThreads) sum_along_rows(Pair pair, const Features* features, uint16_t* sums) {
   const int lane = threadIdx.x % 32, segments = (pair.width + kSegmentColumns - 1) / kSegmentColumns;
   const int64_t warp = int64_t(blockIdx.x) * (kThreads / 32) + threadIdx.x / 32;
   if (warp >= int64_t(segments) * pair.height || lane * kEach >= pair.count) return;
   const int y = int(warp / segments), begin = int(warp % segments) * kSegmentColumns;
-  const Look* const left = looks + int64_t(y) * pair.width;
-  const Look* const right = left + int64_t(pair.height) * pair.width;
+  const Features* const left = features + int64_t(y) * pair.width;
+  const Features* const right = left + int64_t(pair.height) * pair.width;
   int sum[kEach] = {};
   const auto add = [&](int x, int sign) {
     x = within(x, pair.width);
-    const Look here = left[x];
+    const Features here = left[x];
 #pragma unroll
     for (int k = 0; k < kEach; ++k)
       sum[k] += sign * pixel_cost(here, right[within(x - pair.lowest - lane * kEach - k, pair.width)]);
@@ -114,11 +114,11 @@ __global__ void __launch_bounds__(kThreads) sum_down_columns(Pair pair, const ui
 
 void sum_costs(const Pair& pair, uint8_t* costs, uint16_t* sums, CudaScratch& scratch, cudaStream_t stream) {
   const int64_t pixels = int64_t(pair.height) * pair.width;
-  Look* const looks = scratch.array<Look>(2 * pixels);
-  look_at<<<blocks_for(2 * pixels), kThreads, 0, stream>>>(pair, looks);
+  Features* const features = scratch.array<Features>(2 * pixels);
+  compute_features<<<blocks_for(2 * pixels), kThreads, 0, stream>>>(pair, features);
   const int64_t segments = (pair.width + kSegmentColumns - 1) / kSegmentColumns * int64_t(pair.height);
   with_each(pair.count, [&](auto each) {
-    sum_along_rows<each.value><<<blocks_for(segments, kThreads / 32), kThreads, 0, stream>>>(pair, looks, sums);
+    sum_along_rows<each.value><<<blocks_for(segments, kThreads / 32), kThreads, 0, stream>>>(pair, features, sums);
   });
   const dim3 blocks(blocks_for(int64_t(pair.width) * pair.count / 8), blocks_for(pair.height, kSegmentRows));
   sum_down_columns<<<blocks, kThreads, 0, stream>>>(pair, reinterpret_cast<const uint4*>(sums), reinterpret_cast<uint2*>(costs));

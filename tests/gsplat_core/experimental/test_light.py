@@ -40,7 +40,7 @@ def plane():
     return np.full((HEIGHT, WIDTH), 60.0)
 
 
-def look(image, **fields):
+def depth_of(image, **fields):
     return LightDepth().estimate(Frame(0, 0, image, **fields), CAMERA)
 
 
@@ -50,7 +50,7 @@ def noise(seed, cell_px):
 
 
 def test_a_lambertian_surface_is_found():
-    found, true = look(picture(bowl())), bowl()
+    found, true = depth_of(picture(bowl())), bowl()
     assert found.doubt is None
     assert (found.origin, found.metric) == (DEPTH_ORIGINS["light"], False)
     # Measured 0.19 of the level plane's error; the best tilted plane, which needs no light, has 0.75 of it.
@@ -59,21 +59,21 @@ def test_a_lambertian_surface_is_found():
 
 
 def test_twice_the_light_shows_the_same_relief():
-    dim, bright = look(picture(bowl(), light=0.15)), look(picture(bowl(), light=0.3))
+    dim, bright = depth_of(picture(bowl(), light=0.15)), depth_of(picture(bowl(), light=0.3))
     assert error(dim.depth, bright.depth) < 0.02
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_textured_plane_does_not_become_a_relief(seed):
     pigment = np.exp(-np.maximum(noise(seed, 12), 0)[..., None] * np.array([0.3, 0.9, 0.8]))
-    found = look(picture(plane(), PINK * pigment))
+    found = depth_of(picture(plane(), PINK * pigment))
     depth = plane() if found.doubt else found.depth
     assert error(depth, plane()) < 0.04
 
 
 def test_vessels_and_pale_tissue_do_not_hide_a_relief():
     pigment = np.exp(-np.maximum(noise(3, 8), 0)[..., None] * np.array([0.3, 0.9, 0.8]))
-    found, true = look(picture(bowl(), PINK * pigment)), bowl()
+    found, true = depth_of(picture(bowl(), PINK * pigment)), bowl()
     # Measured 0.22 to 0.26 over six pigments; the best tilted plane has 0.75.
     assert error(found.depth, true) < 0.35 * error(plane(), true)
 
@@ -87,23 +87,23 @@ def test_the_mixture_of_channels_leaves_the_light_and_not_the_pigment():
 
 @pytest.mark.parametrize("level", [0, 8, 252, 255])
 def test_dark_and_overexposed_frames_say_that_nothing_is_seen(level):
-    found = look(np.full((HEIGHT, WIDTH, 3), level, np.uint8))
+    found = depth_of(np.full((HEIGHT, WIDTH, 3), level, np.uint8))
     assert found.doubt == UNSEEN
     assert not found.confidence.any()
 
 
 def test_a_facing_plane_without_texture_says_that_there_is_no_relief():
-    assert look(picture(plane())).doubt == FLAT
+    assert depth_of(picture(plane())).doubt == FLAT
 
 
 def test_a_frame_full_of_tools_says_that_nothing_is_seen():
-    assert look(picture(bowl()), mask=np.zeros((HEIGHT, WIDTH), np.uint8)).doubt == UNSEEN
+    assert depth_of(picture(bowl()), mask=np.zeros((HEIGHT, WIDTH), np.uint8)).doubt == UNSEEN
 
 
 def test_what_a_tool_hides_is_believed_less():
     mask = np.ones((HEIGHT, WIDTH), np.uint8)
     mask[:, 100:] = 0
-    found = look(picture(bowl()), mask=mask)
+    found = depth_of(picture(bowl()), mask=mask)
     assert found.confidence[:, :60].min() > 0.5
     assert found.confidence[:, 150:].max() < 0.5
 
@@ -128,12 +128,12 @@ def test_another_scene_size_or_pose_begins_anew():
     estimator = LightDepth()
     estimator.estimate(Frame(0, 0, picture(bowl())), CAMERA)
     mirrored = picture(bowl()[:, ::-1])
-    alone = look(mirrored).depth
+    alone = depth_of(mirrored).depth
     assert np.array_equal(estimator.estimate(Frame(1, 1, mirrored, new_scene="cut"), CAMERA).depth, alone)
     moved = np.eye(4)
     moved[0, 3] = 1
     assert np.array_equal(
-        estimator.estimate(Frame(2, 2, picture(bowl())), CAMERA.with_pose(moved)).depth, look(picture(bowl())).depth
+        estimator.estimate(Frame(2, 2, picture(bowl())), CAMERA.with_pose(moved)).depth, depth_of(picture(bowl())).depth
     )
     small = cv2.resize(picture(bowl()), (80, 64), interpolation=cv2.INTER_AREA)
     assert estimator.estimate(Frame(3, 3, small), CAMERA.scaled(0.5)).depth.shape == (64, 80)
@@ -181,7 +181,7 @@ def test_depth_is_estimated_anew_every_three_tenths_of_a_second(elapsed_s, is_ne
 
 def test_a_moved_scope_gets_a_new_answer_and_one_at_rest_keeps_its_own(monkeypatch):
     answers = iter("abc")
-    monkeypatch.setattr(LightDepth, "_look", lambda self, frame, camera: next(answers))
+    monkeypatch.setattr(LightDepth, "_estimated", lambda self, frame, camera: next(answers))
     monkeypatch.setattr(LightDepth, "_resized", lambda self, frame: False)
     estimator, moved = LightDepth(), np.eye(4)
     moved[2, 3] = 1.0
@@ -193,53 +193,55 @@ def test_a_moved_scope_gets_a_new_answer_and_one_at_rest_keeps_its_own(monkeypat
 
 @pytest.fixture
 def averaged(monkeypatch):
-    """Return the reliefs that are shown, from those of the looks of each window: one list per window and look."""
+    """Return the reliefs that are shown, from those of the pictures of each window: one list per window and picture."""
     shown, windows = [], []
 
     class Window:
-        def __init__(self, grid, look, recent=()):
-            self.looks = [*recent, look]
+        def __init__(self, grid, newest, recent=()):
+            self.pictures = [*recent, newest]
             self.kept = recent
             windows.append(self)
 
-        def add(self, look):
-            if look is refused.get("look"):
+        def add(self, newest):
+            if newest is refused.get("newest"):
                 return False
-            self.looks.append(look)
+            self.pictures.append(newest)
             return True
 
-        def relief_of(self, look):
-            return next((np.array([look.value + 100.0 * len(windows)]) for each in self.looks if each is look), None)
+        def relief_of(self, newest):
+            return next(
+                (np.array([newest.value + 100.0 * len(windows)]) for each in self.pictures if each is newest), None
+            )
 
     refused = {}
     monkeypatch.setattr(light, "LightWindow", Window)
-    monkeypatch.setattr(light, "answer", lambda grid, relief, look, frame: shown.append(relief) or "depth")
+    monkeypatch.setattr(light, "answer", lambda grid, relief, newest, frame: shown.append(relief) or "depth")
     monkeypatch.setattr(light.Grid, "of", lambda camera, shape: None)
 
     def found(values, refuse=None):
         estimator = light.LightDepth()
         for number, value in enumerate(values):
-            look = SimpleNamespace(value=value, shading=SimpleNamespace(known=np.ones(1), brightness=np.ones(1)))
-            monkeypatch.setattr(light, "look_at", lambda frame, camera, look=look: look)
+            newest = SimpleNamespace(value=value, shading=SimpleNamespace(known=np.ones(1), brightness=np.ones(1)))
+            monkeypatch.setattr(light, "shaded_picture", lambda frame, camera, newest=newest: newest)
             if number == refuse:
-                refused["look"] = look
-            estimator._look(None, None)
+                refused["newest"] = newest
+            estimator._estimated(None, None)
         return [float(each[0]) for each in shown], windows
 
     return found
 
 
-def test_reliefs_are_followed_from_look_to_look_and_averaged_with_a_fifth_of_the_newest_or_more(averaged):
-    """All looks of a window show the same relief here, so the average follows their change at once."""
+def test_reliefs_are_followed_from_picture_to_picture_and_averaged_with_a_fifth_of_the_newest_or_more(averaged):
+    """All pictures of a window show the same relief here, so the average follows their change at once."""
     found, windows = averaged([1.0, 2.0, 5.0, 3.0, 3.0, 3.0, 9.0])
     np.testing.assert_allclose(found, [101.0, 102.0, 105.0, 103.0, 103.0, 103.0, 109.0])
     assert len(windows) == 1
 
 
-def test_another_window_takes_part_by_one_over_the_number_of_looks_and_a_fifth_at_least(averaged):
-    """The second window begins with another relief, and without the look before it."""
+def test_another_window_takes_part_by_one_over_the_number_of_pictures_and_a_fifth_at_least(averaged):
+    """The second window begins with another relief, and without the picture before it."""
     found, windows = averaged([1.0, 1.0, 4.0, 6.0], refuse=2)
-    # The third look has no relation to the second: a third of 204 and two of 101, and then its change by 2.
+    # The third picture has no relation to the second: a third of 204 and two of 101, and then its change by 2.
     expected = 101 + (204 - 101) / 3
     expected_next = expected + 2 + (206 - expected - 2) / 4
     np.testing.assert_allclose(found, [101.0, 101.0, expected, expected_next])
@@ -247,7 +249,7 @@ def test_another_window_takes_part_by_one_over_the_number_of_looks_and_a_fifth_a
     assert late[-1] - late[-2] == pytest.approx((100 * len(windows) + 4 - late[-2]) / 5)
 
 
-def test_a_window_of_thirteen_looks_is_followed_by_one_of_the_newest_six_and_this_one(averaged):
+def test_a_window_of_thirteen_pictures_is_followed_by_one_of_the_newest_six_and_this_one(averaged):
     _, windows = averaged([1.0] * 13)
-    assert len(windows) == 2 and len(windows[0].looks) == 13 and len(windows[1].looks) == 7
-    assert windows[1].looks[:6] == windows[0].looks[6:12]
+    assert len(windows) == 2 and len(windows[0].pictures) == 13 and len(windows[1].pictures) == 7
+    assert windows[1].pictures[:6] == windows[0].pictures[6:12]

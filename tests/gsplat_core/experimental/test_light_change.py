@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from gsplat_core.experimental.shading import Follower, look_at
+from gsplat_core.experimental.shading import Follower, shaded_picture
 from gsplat_core.scene.frames import Frame
 from tests.gsplat_core.geometry.lit_sheet import CAMERA, HEIGHT, WIDTH, facing_and_distance, frame, noise, pigment, rays
 
@@ -14,7 +14,7 @@ PLANE = np.full((HEIGHT, WIDTH), 60.0)
 
 
 def change(first, second):
-    return Follower(look_at(first, CAMERA)).change_to(look_at(second, CAMERA))
+    return Follower(shaded_picture(first, CAMERA)).change_to(shaded_picture(second, CAMERA))
 
 
 def test_tissue_that_tilts_changes_its_light_by_that_and_not_by_its_pigment():

@@ -1,4 +1,4 @@
-"""Looks by the same light: which are taken, and when the relief is found anew."""
+"""Pictures by the same light: which are taken, and when the relief is found anew."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from gsplat_core.experimental import light
 from gsplat_core.experimental.light import LightWindow
 
 
-def look(name, followed=True):
+def picture(name, followed=True):
     return SimpleNamespace(shading=name, followed=followed)
 
 
 @pytest.fixture
 def solved(monkeypatch):
-    """Numbers of looks of each full solution. It finds 10 for the key and adds the number of a look; a single change adds 0.5."""
+    """Numbers of pictures of each full solution. It finds 10 for the key and adds the number of a picture; a single change adds 0.5."""
     counts = []
 
     class Follower:
@@ -38,34 +38,34 @@ def solved(monkeypatch):
     return counts
 
 
-def test_the_relief_is_found_anew_at_1_2_4_8_and_12_looks(solved):
-    window = LightWindow(None, look("key"))
+def test_the_relief_is_found_anew_at_1_2_4_8_and_12_pictures(solved):
+    window = LightWindow(None, picture("key"))
     for number in range(13):
-        assert window.add(look(number))
+        assert window.add(picture(number))
     assert solved == [1, 2, 4, 8, 12]
 
 
-def test_between_solutions_a_look_gets_the_key_and_its_own_change(solved):
-    looks = [look(number) for number in range(3)]
-    window = LightWindow(None, looks[0])
-    assert window.relief_of(looks[0]) == [10.0]
-    window.add(looks[1])
-    assert window.relief_of(looks[1]) == [11.0]
-    window.add(looks[2])
-    assert window.relief_of(looks[2]) == [10.5]
+def test_between_solutions_a_picture_gets_the_key_and_its_own_change(solved):
+    pictures = [picture(number) for number in range(3)]
+    window = LightWindow(None, pictures[0])
+    assert window.relief_of(pictures[0]) == [10.0]
+    window.add(pictures[1])
+    assert window.relief_of(pictures[1]) == [11.0]
+    window.add(pictures[2])
+    assert window.relief_of(pictures[2]) == [10.5]
     window.solve()
-    assert window.relief_of(looks[2]) == [12.0]
-    assert window.relief_of(look("another")) is None
+    assert window.relief_of(pictures[2]) == [12.0]
+    assert window.relief_of(picture("another")) is None
 
 
-def test_a_look_that_is_not_followed_changes_nothing(solved):
-    window = LightWindow(None, look("key"))
-    assert not window.add(look("elsewhere", followed=False))
-    assert len(window.looks) == 1 and solved == [1]
+def test_a_picture_that_is_not_followed_changes_nothing(solved):
+    window = LightWindow(None, picture("key"))
+    assert not window.add(picture("elsewhere", followed=False))
+    assert len(window.pictures) == 1 and solved == [1]
 
 
-def test_earlier_looks_are_taken_back_to_the_first_that_is_not_followed(solved):
-    before = [look("a"), look("b", followed=False), look("c"), look("d")]
-    window = LightWindow(None, look("key"), before)
-    assert [each.shading for each in window.looks] == ["key", "d", "c"]
+def test_earlier_pictures_are_taken_back_to_the_first_that_is_not_followed(solved):
+    before = [picture("a"), picture("b", followed=False), picture("c"), picture("d")]
+    window = LightWindow(None, picture("key"), before)
+    assert [each.shading for each in window.pictures] == ["key", "d", "c"]
     assert solved == [3]

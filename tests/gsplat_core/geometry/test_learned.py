@@ -19,7 +19,7 @@ from tests.gsplat_core.endoscope.networks import conv, external_weights, write
 
 HEIGHT, WIDTH = 96, 128
 CAMERA = Camera.from_focal(100.0, WIDTH, HEIGHT)
-LOOK_NS = 300_000_000
+POLL_NS = 300_000_000
 RED = ([[1.0, 0.0, 0.0]], [0.0])
 PLAIN = {"mean": [0, 0, 0], "std": [1, 1, 1]}
 
@@ -51,7 +51,7 @@ def seen(values: np.ndarray, number: int = 0, **fields) -> Frame:
     """A frame whose red is `values`, from 0 to 1."""
     image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     image[..., 0] = np.rint(255 * values)
-    return Frame(number, number * LOOK_NS, image, **fields)
+    return Frame(number, number * POLL_NS, image, **fields)
 
 
 def inverse(depth: np.ndarray, factor: float = 20.0, summand: float = 0.0) -> np.ndarray:
@@ -135,9 +135,9 @@ def test_an_answer_holds_on_until_the_next_look_while_the_scope_stands_still(net
     first = estimator.estimate(frame, CAMERA)
     moved = np.eye(4)
     moved[0, 3] = 1
-    assert estimator.estimate(frame.with_fields(seq=1, pts_ns=LOOK_NS // 3), CAMERA) is first
-    assert estimator.estimate(frame.with_fields(seq=2, pts_ns=LOOK_NS // 2), CAMERA.with_pose(moved)) is None
-    assert estimator.estimate(frame.with_fields(seq=3, pts_ns=LOOK_NS), CAMERA.with_pose(moved)) is not None
+    assert estimator.estimate(frame.with_fields(seq=1, pts_ns=POLL_NS // 3), CAMERA) is first
+    assert estimator.estimate(frame.with_fields(seq=2, pts_ns=POLL_NS // 2), CAMERA.with_pose(moved)) is None
+    assert estimator.estimate(frame.with_fields(seq=3, pts_ns=POLL_NS), CAMERA.with_pose(moved)) is not None
 
 
 def test_depth_that_frames_came_with_says_the_factor_and_the_zero(network):

@@ -407,15 +407,15 @@ def test_points_of_both_eyes_keep_three_pixels_from_overexposed_rows():
 @pytest.mark.parametrize("calibrated", [True, False])
 def test_a_pair_with_a_right_camera_is_judged_as_a_calibrated_one(monkeypatch, calibrated):
     asked = []
-    look = stereo.PairLook(np.arange(10.0), np.zeros(3), np.zeros((10, 2), np.float32), 0.1)
-    monkeypatch.setattr(stereo, "look_at", lambda left, right, mask: look)
+    look = stereo.PairCheck(np.arange(10.0), np.zeros(3), np.zeros((10, 2), np.float32), 0.1)
+    monkeypatch.setattr(stereo, "check_pair", lambda left, right, mask: look)
     monkeypatch.setattr(
         stereo, "_why_implausible", lambda look, parallel_px, *, calibrated: asked.append(calibrated) or "it is"
     )
     image = np.zeros((6, 8, 3), np.uint8)
     camera = Camera.from_focal(100.0, 8, 6)
     frame = Frame(0, 0, image, right_image=image, right_camera=camera if calibrated else None)
-    found = StereoDepth()._look(image[..., 0], image[..., 0], frame, 0.0)
+    found = StereoDepth()._check(image[..., 0], image[..., 0], frame, 0.0)
     assert asked == [calibrated] and found.doubt == "it is"
 
 

@@ -151,8 +151,8 @@ def estimate(given: np.ndarray, metric: bool = True) -> tuple[StereoDepth, Any]:
     image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     frame = Frame(0, 0, image, right_image=image, right_camera=camera.with_pose(pose) if metric else None)
     depth = StereoDepth()
-    depth._rows, depth._look_in = [np.zeros(3)], 7
-    depth._span = depth._looked = 17.0, 18.0
+    depth._rows, depth._frames_to_check = [np.zeros(3)], 7
+    depth._span = depth._checked = 17.0, 18.0
     return depth, depth._as_depth(given, frame, camera, 3.0)
 
 
@@ -160,7 +160,7 @@ def estimate(given: np.ndarray, metric: bool = True) -> tuple[StereoDepth, Any]:
 def test_a_twentieth_of_the_picture_must_be_matched(share: float, is_doubted: bool) -> None:
     depth, found = estimate(planes(share))
     assert (found.doubt is not None) == is_doubted
-    assert depth._look_in == (0 if is_doubted else 7), "the next frame is looked at again"
+    assert depth._frames_to_check == (0 if is_doubted else 7), "the next frame is looked at again"
 
 
 @pytest.mark.parametrize(
@@ -192,7 +192,7 @@ def seen_pair(monkeypatch: pytest.MonkeyPatch, corners: int, found: int, rows: A
     there = here + np.stack([np.full(found, -20.0), lower], 1).astype(np.float32)
     monkeypatch.setattr(stereo, "_points_in_both", lambda *_: (here, there, corners))
     picture = np.full((HEIGHT, WIDTH), 255 if bright else 90, np.uint8)
-    return stereo.look_at(picture, picture)
+    return stereo.check_pair(picture, picture)
 
 
 @pytest.mark.parametrize(
@@ -251,6 +251,6 @@ def test_the_error_of_disparities_is_that_of_the_rows(monkeypatch: pytest.Monkey
 def test_a_range_only_grows_and_by_one_margin_at_most(seen: tuple[float, float], span: tuple[float, float]) -> None:
     """A look from 14 to 16 px may be widened by a margin of 4.4 px."""
     depth = StereoDepth()
-    depth._looked, depth._span = (14.0, 16.0), (14.0, 18.0)
+    depth._checked, depth._span = (14.0, 16.0), (14.0, 18.0)
     depth._widen_to(seen)
     assert depth._span == pytest.approx(span)

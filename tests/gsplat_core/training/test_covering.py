@@ -46,18 +46,18 @@ def covering(config=CONFIG, *, beside):
 def test_they_join_at_once_or_with_the_next_look_and_are_the_same(step, seen, frame, camera):
     first = step.gaussians.count
     late = covering(beside=True)
-    late.look(step, seen, lambda: frame)
+    late.check(step, seen, lambda: frame)
     assert step.gaussians.count == first, "training goes on without them"
     late.join(step)
     joined = step.gaussians
     assert joined.count > first + 50
     late.join(step)
     assert step.gaussians.count == joined.count, "each joins once"
-    late.look(step, seen, lambda: frame)
+    late.check(step, seen, lambda: frame)
     late.join(step)
     assert step.gaussians.count == joined.count, "nothing is left uncovered"
     step.remove(torch.arange(joined.count) >= first)
-    covering(beside=False).look(step, seen, lambda: frame)
+    covering(beside=False).check(step, seen, lambda: frame)
     assert all(torch.equal(a, b) for a, b in zip(step.gaussians.left_tensors, joined.left_tensors, strict=True))
 
 
@@ -69,7 +69,7 @@ def test_what_is_under_way_for_a_scene_that_is_left_joins_no_other(step, seen, f
         assert gate.wait(300)
         return frame
 
-    late.look(step, seen, pictures)
+    late.check(step, seen, pictures)
     late.begin(None, torch.device("cpu"), 0)
     gate.set()
     late.join(step)
@@ -82,10 +82,10 @@ def test_two_that_were_under_way_at_once_do_not_take_more_room_than_there_is(ste
     config = ReconstructorConfig(gaussians=first, max_gaussians=first + room)
     late = covering(config, beside=True)
     for _ in range(2):
-        late.look(step, seen, lambda: frame)
+        late.check(step, seen, lambda: frame)
     late.join(step)
     assert step.gaussians.count <= config.max_gaussians
-    late.look(step, seen, lambda: frame)
+    late.check(step, seen, lambda: frame)
     late.join(step)
     assert step.gaussians.count <= config.max_gaussians
 
@@ -96,7 +96,7 @@ def test_what_goes_wrong_in_the_thread_is_raised_with_the_next_look(step, seen):
     def pictures():
         raise InvalidInput("no picture")
 
-    late.look(step, seen, pictures)
+    late.check(step, seen, pictures)
     with pytest.raises(InvalidInput, match="no picture"):
         late.join(step)
     late.join(step)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gsplat_core.scene.frames import Frame
-from gsplat_core.training.observations import LOOK_EVERY, NOISE_LEVELS, EyeColours, best_shift, line_between
+from gsplat_core.training.observations import COMPARE_EVERY, NOISE_LEVELS, EyeColours, best_shift, line_between
 from tests.gsplat_core.training.two_eyes import LEFT, RIGHT, seen, stereo_frame
 
 GAIN, OFFSET = np.array([0.8, 1.1, 1.25]), np.array([12.0, -6.0, 4.0])
@@ -51,9 +51,9 @@ def test_the_line_follows_slowly():
     right = seen(RIGHT)[0]
     colours.corrected(stereo_frame())
     changed = stereo_frame(right_image=other_colours(right))
-    errors = [np.abs(colours.corrected(changed).astype(float) - right).mean() for _ in range(12 * LOOK_EVERY)]
-    assert errors[0] == errors[LOOK_EVERY - 2], "between two looks nothing moves"
-    assert errors[LOOK_EVERY] < errors[0] and errors[-1] < 0.4 * errors[0]
+    errors = [np.abs(colours.corrected(changed).astype(float) - right).mean() for _ in range(12 * COMPARE_EVERY)]
+    assert errors[0] == errors[COMPARE_EVERY - 2], "between two looks nothing moves"
+    assert errors[COMPARE_EVERY] < errors[0] and errors[-1] < 0.4 * errors[0]
     assert max(before - after for before, after in pairwise(errors)) < 0.35 * errors[0]
 
 

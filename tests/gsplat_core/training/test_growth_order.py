@@ -149,7 +149,7 @@ def test_a_scene_is_relaxed_and_renewed_when_so_many_steps_have_passed(monkeypat
         calls.append(("renew", step.steps, last_seen, useless))
         made._renewed_at = step.steps
 
-    monkeypatch.setattr(made, "_look", lambda step, observation: "seen")
+    monkeypatch.setattr(made, "_examine", lambda step, observation: "seen")
     monkeypatch.setattr(made, "_relax", relax)
     monkeypatch.setattr(made, "_renew", renew)
     monkeypatch.setattr(made, "_useless", lambda step, seen: "useless")

@@ -97,7 +97,7 @@ def test_what_is_not_held_by_training_falls_to_a_third_within_3600_steps(make_fr
     upkeep = Upkeep(camera, with_room(scene.count))
     for passed in range(every, 3601, every):
         step._adam.steps = passed
-        seen = upkeep._look(step, observation)
+        seen = upkeep._examine(step, observation)
         upkeep._relax(step, seen, camera)
     shown = seen.shown & (pixels_of(step.at(observation.time_s).means, camera)[1])
     kept = math.exp(-passed / 3600)
@@ -257,7 +257,7 @@ def test_depths_come_back_to_a_surface_that_keeps_its_slope_and_its_picture(make
     before, hidden = step.at(observation.time_s).means.clone(), step.gaussians.means[~shown].clone()
     for _ in range(round(3 * SURFACE_STEPS / RENEW_EVERY)):
         step.scale_about(
-            camera, upkeep._towards_surface(step, upkeep._look(step, observation), RENEW_EVERY, observation)
+            camera, upkeep._towards_surface(step, upkeep._examine(step, observation), RENEW_EVERY, observation)
         )
     after = step.at(observation.time_s).means
     torch.testing.assert_close(pixels_of(after, camera)[0], pixels, atol=1e-3, rtol=0)
@@ -275,12 +275,14 @@ def test_where_nothing_tells_distances_what_is_shown_keeps_its_own(make_frame, c
     upkeep._has_moved = told_by == "moved"
     if told_by == "depth":
         observation = dataclasses.replace(observation, depth=torch.full((40, 48), 50.0))
-    seen = upkeep._look(step, observation)
+    seen = upkeep._examine(step, observation)
     was = float(seen.now.means[seen.shown, 2].median())
     step.scale_about(camera, torch.full((step.gaussians.count,), 0.6))
     before = render(step.at(observation.time_s), camera).image
-    step.scale_about(camera, upkeep._towards_surface(step, upkeep._look(step, observation), RENEW_EVERY, observation))
-    seen = upkeep._look(step, observation)
+    step.scale_about(
+        camera, upkeep._towards_surface(step, upkeep._examine(step, observation), RENEW_EVERY, observation)
+    )
+    seen = upkeep._examine(step, observation)
     median = float(seen.now.means[seen.shown, 2].median())
     assert median == pytest.approx(distance if told_by == "nothing" else 0.6 * was, rel=0.01)
     # What reaches in from beyond the edge stays where it was.
@@ -320,7 +322,7 @@ def test_a_gaussian_is_no_thinner_than_a_fifth_of_a_pixel_and_no_wider_than_eigh
     step.gaussians.log_scales[:, 0], step.gaussians.log_scales[:, 1] = -20.0, 20.0
     step._adam.second_moments["logit_opacities"].fill_(1.0)  # none leaves
     upkeep = Upkeep(camera, with_room(step.gaussians.count))
-    upkeep._relax(step, upkeep._look(step, observation), camera)
+    upkeep._relax(step, upkeep._examine(step, observation), camera)
     across, along = (step.gaussians.log_scales[:, axis].exp() / pixel for axis in (0, 1))
     assert across == pytest.approx(0.2, rel=1e-3)
     assert along == pytest.approx(8 * SIGMA_IN_SPACINGS * SPACING_PX, rel=1e-3)
@@ -335,14 +337,14 @@ def test_idle_is_what_no_picture_showed_for_7000_steps(make_frame, camera, part,
     moments[: step.gaussians.count] = 1.0
     moments[:20] = part
     upkeep = Upkeep(camera, CONFIG)
-    assert bool(upkeep._useless(step, upkeep._look(step, observation))[:20].any()) == are_idle
+    assert bool(upkeep._useless(step, upkeep._examine(step, observation))[:20].any()) == are_idle
 
 
 def test_depths_come_two_thirds_of_the_way_back_within_100000_steps(make_frame, camera):
     step, observation = trained(make_frame, camera)
     upkeep = Upkeep(camera, CONFIG)
     upkeep._has_moved = True  # distances are left to training
-    seen = upkeep._look(step, observation)
+    seen = upkeep._examine(step, observation)
     whole, some = (
         upkeep._towards_surface(step, seen, since, observation)[seen.shown] - 1 for since in (10**9, 100_000)
     )

@@ -64,7 +64,7 @@ def test_times_have_a_zone_and_bound_a_search(kept):
 
 
 def test_pages_of_a_search_have_every_entry_once(kept, monkeypatch):
-    monkeypatch.setattr(reading, "MOST_LOOKED_AT", 7)
+    monkeypatch.setattr(reading, "MOST_EXAMINED", 7)
     seen, before, asked = [], None, 0
     while asked == 0 or before is not None:
         page = found(kept, count=5, actor="1f1", **({} if before is None else {"before": before}))

@@ -124,11 +124,11 @@ def test_new_connections_get_a_renewed_certificate(tmp_path, name):
     pair = put(tmp_path, pem(old), key_pem(old_key))
     certificate = ServerCertificate(*pair)
     with listening(certificate, pair) as port:
-        assert not certificate.look()
+        assert not certificate.reload_if_changed()
         assert shown(port, name) == der(old)
         put(tmp_path, pem(new), key_pem(new_key))
         assert shown(port, name) == der(old)
-        assert certificate.look() and not certificate.look()
+        assert certificate.reload_if_changed() and not certificate.reload_if_changed()
         assert shown(port, name) == der(new)
         assert certificate.expires_at == new.not_valid_after_utc
 
@@ -178,18 +178,18 @@ def test_files_that_cannot_be_used_leave_the_certificate_before(tmp_path, caplog
     with listening(certificate, pair) as port:
         assert asyncio.run(certificate.check()).ok
         spoil(tmp_path, new, new_key)
-        assert not certificate.look()
+        assert not certificate.reload_if_changed()
         assert shown(port, "room-1.example") == der(old)
         assert certificate.expires_at == old.not_valid_after_utc
         checked = asyncio.run(certificate.check())
         assert not checked.ok and not checked.needed and "cannot be used" in checked.detail
         assert "2030-05-17 12:30 UTC" in checked.detail
         assert [record.levelname for record in caplog.records] == ["ERROR"]
-        assert not certificate.look() and len(caplog.records) == 1, "said once for each change"
+        assert not certificate.reload_if_changed() and len(caplog.records) == 1, "said once for each change"
         if spoil is a_folder:
             (tmp_path / "key.pem").rmdir()
         put(tmp_path, pem(new), key_pem(new_key))
-        assert certificate.look()
+        assert certificate.reload_if_changed()
         assert shown(port, "room-1.example") == der(new)
         assert asyncio.run(certificate.check()).ok
 
@@ -220,7 +220,7 @@ def test_what_prometheus_gets(tmp_path):
     names = "intrasplat_certificate_expiry_timestamp_seconds", "intrasplat_certificate_reload_failed"
     assert values() == dict(zip(names, (SOON.timestamp(), 0.0), strict=True))
     gone(tmp_path, None, None)
-    certificate.look()
+    certificate.reload_if_changed()
     assert values() == dict(zip(names, (SOON.timestamp(), 1.0), strict=True))
 
 
@@ -228,7 +228,7 @@ def test_a_change_is_seen_by_itself_and_is_in_the_audit_log(tmp_path, monkeypatc
     from services.api import server as module
     from services.audit import AuditLog, Wanted, search
 
-    monkeypatch.setattr(module, "LOOK_S", 0.01)
+    monkeypatch.setattr(module, "POLL_S", 0.01)
     audit, events = AuditLog(tmp_path / "audit.jsonl"), SystemEvents()
     old, key = made()
     certificate = ServerCertificate(*put(tmp_path, pem(old), key_pem(key)), events)

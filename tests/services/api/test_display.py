@@ -200,7 +200,7 @@ def revoke(plane, how: str) -> None:
 @pytest.fixture
 def endless(new_plane, monkeypatch):
     """A display without an end, whose viewers' keys are looked at often."""
-    monkeypatch.setattr(display_module, "LOOK_S", 0.02)
+    monkeypatch.setattr(display_module, "POLL_S", 0.02)
     plane = new_plane(fake_parts(display=FakeDisplay()))
     plane.ask("POST", "/v1/streams", json={"name": "endoscope", "source": "synthetic:"})
     return plane

@@ -16,7 +16,7 @@ def said(monkeypatch):
     """Doctor's lines by name for a machine, what is missing of the kernels, and what the GPU says of them."""
 
     def look(machine: doctor.Graphics, missing: str | None, refusal: str | None = None) -> dict[str, doctor.Check]:
-        monkeypatch.setattr(doctor, "look", lambda: machine)
+        monkeypatch.setattr(doctor, "find_graphics", lambda: machine)
         monkeypatch.setattr(native, "CUDA_MISSING", missing)
         monkeypatch.setattr(native, "cuda_build", lambda: "nvcc 13.0 for 8.0, 9.0")
         monkeypatch.setattr(native, "cuda_refusal", lambda: refusal)

@@ -29,15 +29,17 @@ def machine(monkeypatch, tmp_path):
 
 def test_a_gpu_that_torch_sees_is_used(machine, capsys):
     machine("DRIVER DEVICE", ((9, 0), (8, 6)))
-    assert doctor.look() == doctor.Graphics(True, "GPU 0 (compute capability 9.0), GPU 1 (compute capability 8.6)")
+    assert doctor.find_graphics() == doctor.Graphics(
+        True, "GPU 0 (compute capability 9.0), GPU 1 (compute capability 8.6)"
+    )
     assert doctor.main() == 0
     assert "GPU 0" in capsys.readouterr().out
 
 
 def test_a_gpu_that_is_too_old_is_named(machine):
     machine("DRIVER DEVICE", ((7, 5),))
-    assert not doctor.look().usable
-    assert "7.5" in doctor.look().found and "8.0" in doctor.look().advice
+    assert not doctor.find_graphics().usable
+    assert "7.5" in doctor.find_graphics().found and "8.0" in doctor.find_graphics().advice
 
 
 @pytest.mark.parametrize(
@@ -50,7 +52,7 @@ def test_a_gpu_that_is_too_old_is_named(machine):
 )
 def test_without_a_gpu_the_reason_is_given(machine, capsys, files, cuda, found, advice):
     machine(files, cuda=cuda)
-    seen = doctor.look()
+    seen = doctor.find_graphics()
     assert not seen.usable and found in seen.found and advice in seen.advice
     assert doctor.main() == 1
     assert found in capsys.readouterr().out
@@ -64,6 +66,6 @@ def test_a_gpu_that_torch_cannot_start_is_told_with_what_torch_says(machine, mon
         raise RuntimeError("The NVIDIA driver on your system is too old (found version 12040). Please update.\nMore")
 
     monkeypatch.setattr(torch.cuda, "init", refuse)
-    seen = doctor.look()
+    seen = doctor.find_graphics()
     assert not seen.usable and "too old (found version 12040)" in seen.found and "More" not in seen.found
     assert "CUDA 13.0 or later" in seen.advice

@@ -55,13 +55,13 @@ def kept(monkeypatch):
 
 
 def test_the_pool_runs_while_there_are_jobs_and_restarts_with_a_delay_after_a_failure(kept):
-    assert kept([0, 0], []) == (0, [keepers.LOOK_S] * 2)
-    assert kept([1, 2], [0, 0]) == (2, [keepers.LOOK_S] * 2)
-    assert kept([1], [3]) == (1, [7.5, keepers.LOOK_S])
+    assert kept([0, 0], []) == (0, [keepers.POLL_S] * 2)
+    assert kept([1, 2], [0, 0]) == (2, [keepers.POLL_S] * 2)
+    assert kept([1], [3]) == (1, [7.5, keepers.POLL_S])
 
 
 def test_a_store_that_cannot_be_read_is_asked_again(kept):
-    assert kept([StoreUnavailable("locked"), 1], [0]) == (1, [keepers.LOOK_S] * 2)
+    assert kept([StoreUnavailable("locked"), 1], [0]) == (1, [keepers.POLL_S] * 2)
 
 
 @pytest.fixture

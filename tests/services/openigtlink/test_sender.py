@@ -127,7 +127,7 @@ def test_a_stream_that_says_nothing_is_said(runtime):
 def test_silence_is_said_once_in_a_second_of_it(runtime, monkeypatch):
     """Each look at the stream takes a tenth of a second of the test's clock."""
     looks = itertools.count()
-    monkeypatch.setattr("services.openigtlink.LOOK_MS", 1)
+    monkeypatch.setattr("services.openigtlink.POLL_MS", 1)
     monkeypatch.setattr(
         "services.openigtlink.time", SimpleNamespace(monotonic=lambda: next(looks) / 10, time=time.time)
     )

@@ -245,7 +245,7 @@ def test_a_source_without_frames_reports_its_state_and_waits_only_at_its_end(mon
     source = Scripted(SourceState.STALLED, SourceState.RECONNECTING, SourceState.ENDED, FRAME)
     worker, _, _, _ = published(monkeypatch, source, most=1)
     assert [state for state, _ in worker.said] == ["stalled", "reconnecting", "ended", "live"]
-    assert worker.said[0][1] == "the source is stalled" and worker.waits == [capture_module.LOOK_S]
+    assert worker.said[0][1] == "the source is stalled" and worker.waits == [capture_module.POLL_S]
 
 
 def test_an_open_source_is_described_and_counts_for_itself(monkeypatch):

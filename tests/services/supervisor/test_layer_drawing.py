@@ -66,7 +66,7 @@ def test_a_virtual_camera_looks_round_the_post():
     model = wall_and_post()
     orbit, depths = Orbit(-40, 10, 1.2), DepthColours()
     plain = model.render(1.0)
-    depths.look_at(plain.depth.numpy(), plain.alpha.numpy())
+    depths.adapt_range(plain.depth.numpy(), plain.alpha.numpy())
     expected = model.render(1.0, orbit.camera(model.camera, depths.median))
     image, said = drawn("orbit", model, orbit)
     assert said["virtual"] == {"azimuth_deg": -40, "elevation_deg": 10, "zoom": 1.2}

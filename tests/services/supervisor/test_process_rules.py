@@ -227,7 +227,7 @@ def test_the_end_of_a_watched_process_has_its_best_reason(runtime, how, heartbea
 def test_a_hung_process_is_killed_once_and_a_pause_of_the_supervisor_is_not_held_against_it(
     runtime, clock, monkeypatch
 ):
-    monkeypatch.setattr(processes, "LOOK_S", 0.001)
+    monkeypatch.setattr(processes, "POLL_S", 0.001)
 
     async def watched() -> tuple[str, list[int]]:
         process, identity = managed(runtime, start=Starter("signal 9")), Identity(signal.SIGKILL)

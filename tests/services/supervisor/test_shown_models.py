@@ -74,7 +74,7 @@ def parts():
 def looks(parts, times=1):
     async def look():
         for _ in range(times):
-            await parts.models.look_at(parts.stream)
+            await parts.models.show_active(parts.stream)
 
     asyncio.run(look())
 
@@ -133,8 +133,8 @@ def test_an_engine_that_refuses_is_not_asked_all_the_time(parts):
 
     async def look_twice():
         with pytest.raises(CommandRefused):
-            await parts.models.look_at(parts.stream)
-        await parts.models.look_at(parts.stream)
+            await parts.models.show_active(parts.stream)
+        await parts.models.show_active(parts.stream)
 
     parts.models._refused.clear()
     asyncio.run(look_twice())

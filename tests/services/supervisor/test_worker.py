@@ -144,7 +144,7 @@ def watch(monkeypatch):
         monkeypatch.setattr(workers, "time", SimpleNamespace(monotonic=lambda: now.s))
         monkeypatch.setattr(workers.os, "_exit", leave)
         try:
-            worker._look_after()
+            worker._watch_loop()
         except Exited:
             return now.s
         return None

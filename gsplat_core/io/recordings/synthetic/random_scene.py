@@ -20,10 +20,10 @@ from gsplat_core.io.recordings.synthetic.tissue import (
     TISSUE_DISTANCE_MM,
     Breathing,
     Colour,
-    TissueLook,
+    TissueAppearance,
     TissueShape,
 )
-from gsplat_core.io.recordings.synthetic.tool import Kind, ToolLook, ToolPlan
+from gsplat_core.io.recordings.synthetic.tool import Kind, ToolAppearance, ToolPlan
 
 PathKind = Literal["hand-held", "translation", "rotation", "insertion"]
 PATH_KINDS: tuple[PathKind, ...] = get_args(PathKind)
@@ -187,7 +187,7 @@ class RandomScene:
     """Displacements of the picture's corners by the distortion terms k1 and k2, as shares of their distance from the centre."""
     baseline_mm: float
     shape: TissueShape
-    look: TissueLook
+    appearance: TissueAppearance
     breathing: Breathing
     path: ScopePath | None
     """Path of a moving scope; None for the paths of `Extras.scope_path`."""
@@ -248,14 +248,14 @@ def draw_scene(
     baseline_mm = float(camera.uniform(3.8, 5.6))
     distance_mm = float(np.exp(form.uniform(np.log(32), np.log(110)))) if scene == "open" else TISSUE_DISTANCE_MM
     organ = str(colours.choice(list(ORGANS)))
-    look = _look(colours, organ, distance_mm)
+    appearance = _appearance(colours, organ, distance_mm)
     path = None
     kinds = PATH_KINDS if scene == "open" else tuple(kind for kind in PATH_KINDS if kind != "translation")
     kind = kinds[int(way.integers(len(kinds)))] if scope_path in (None, "usual", "seeded") else scope_path
     if moves and scope_path not in ("usual", "seeded"):
         path = ScopePath.drawn(way, kind, distance_mm if scene == "open" else 40.0)  # type: ignore[arg-type]
     sensor, bright = _sensor(chip, moves, exposure)
-    grey = float(np.mean(np.array(look.base) * [0.35, 0.5, 0.15]) * 3)
+    grey = float(np.mean(np.array(appearance.base) * [0.35, 0.5, 0.15]) * 3)
     exposed_mm = (1.0 if scene == "open" else 42.0 / TISSUE_DISTANCE_MM) * distance_mm * float(
         np.sqrt(bright * (0.30 / grey) ** 0.75)
     ) * 0.9  # fmt: skip
@@ -275,7 +275,7 @@ def draw_scene(
         lens=lens if bent else (0.0, 0.0),
         baseline_mm=baseline_mm,
         shape=_shape(form, distance_mm, focal),
-        look=look,
+        appearance=appearance,
         breathing=_breathing(breath, breathing_ratio, rate_wander),
         path=path,
         tools=_tools(tool, distance_mm) if scene == "open" else (),
@@ -293,13 +293,13 @@ def _colour(values: NDArray[np.float64]) -> Colour:
     return red, green, blue
 
 
-def _look(rng: Random, organ: str, distance_mm: float) -> TissueLook:
+def _appearance(rng: Random, organ: str, distance_mm: float) -> TissueAppearance:
     """Draw colours near those of an organ, texture, roughness and highlight lobes."""
     tint = np.exp(rng.normal(0, 0.10, 3) + rng.normal(0, 0.12))
     coloured = lambda colour: _colour(np.clip(np.array(colour) * tint, 0.008, 0.93))
     base, pale, deep, fat, fat_from, vessels = ORGANS[organ]
     gloss = float(np.sqrt(np.mean(base) / 0.30))  # pictures of dark tissue are exposed longer
-    return TissueLook(
+    return TissueAppearance(
         base=coloured(base),
         pale=coloured(pale),
         deep=coloured(deep),
@@ -376,7 +376,7 @@ def _tools(rng: Random, distance_mm: float) -> tuple[ToolPlan, ...]:
         kind: Kind = ("grasper", "scissors", "hook", "suction")[int(rng.choice(4, p=[0.5, 0.2, 0.15, 0.15]))]
         shaft, metal = SHAFTS[int(rng.integers(len(SHAFTS)))]
         grey = float(rng.uniform(0.14, 0.38))
-        look = ToolLook(
+        appearance = ToolAppearance(
             shaft=shaft,
             ring=_colour(0.3 * np.array(shaft) + 0.06),
             steel=(grey, 1.01 * grey, 1.06 * grey),
@@ -397,7 +397,7 @@ def _tools(rng: Random, distance_mm: float) -> tuple[ToolPlan, ...]:
                 centre_mm=(float(9 * size * np.cos(angle)), float(9 * size * np.sin(angle))),
                 pull=float(rng.uniform(0.3, 1.0)) * radius_mm / 12.0 if touches else 0.0,
                 tug_radius_mm=radius_mm,
-                look=look,
+                appearance=appearance,
             )
         )
     return tuple(plans)

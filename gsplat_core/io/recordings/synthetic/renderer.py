@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from gsplat_core.io.recordings.synthetic.optics import Air, Lamp, RadialLens, develop
 from gsplat_core.io.recordings.synthetic.tissue import SurfacePoints, Tissue, Tug
-from gsplat_core.io.recordings.synthetic.tool import RING, SHAFT, USUAL_PLAN, Part, ToolLook, distance, trace
+from gsplat_core.io.recordings.synthetic.tool import RING, SHAFT, USUAL_PLAN, Part, ToolAppearance, distance, trace
 from gsplat_core.scene.cameras import Camera
 
 Array = NDArray[np.floating]
@@ -35,7 +35,7 @@ def shade_tissue(
 
     Combines scattering that bleeds red with a wet film over a fine relief.
     """
-    look = tissue.look
+    appearance = tissue.appearance
     reflectance, slope = tissue.texture.sample(u, v)
     turn = camera.world_to_camera[:3, :3].T.astype(np.float32)
     along_u = np.stack(points.along_u, axis=-1) @ turn
@@ -51,13 +51,13 @@ def shade_tissue(
         shine = np.clip(np.einsum("hwi,hwi->hw", bumpy, half), 0, 1)
         light_diffuse += power * np.clip((facing + np.float32(0.12)) / np.float32(1.12), 0, 1)
         light_wet += power * (
-            np.float32(look.glint) * shine ** np.float32(look.glint_power)
-            + np.float32(look.sheen) * shine ** np.float32(look.sheen_power)
+            np.float32(appearance.glint) * shine ** np.float32(appearance.glint_power)
+            + np.float32(appearance.sheen) * shine ** np.float32(appearance.sheen_power)
         )
     shade = _tool_shade(parts, camera, local, lamp)
     diffuse = (light_diffuse * shade)[..., None]
     # Light scattered inside tissue emerges red. Add red where little direct light arrives.
-    bleed = np.array(look.bleed, np.float32) * np.sqrt(np.maximum(diffuse, 0))
+    bleed = np.array(appearance.bleed, np.float32) * np.sqrt(np.maximum(diffuse, 0))
     wet = (light_wet * shade * reflectance[..., 3])[..., None] * np.array([1.0, 0.97, 0.93], np.float32)
     return np.asarray(reflectance[..., :3] * diffuse + bleed + wet, np.float32)
 
@@ -92,17 +92,24 @@ def _upsample(coarse: Array, rows: int, columns: int, step: int) -> Array:
 
 
 def shade_tool(
-    at: Array, normal: Array, rays: Array, material: NDArray[np.int8], lamp: Lamp, look: ToolLook = USUAL_PLAN.look
+    at: Array,
+    normal: Array,
+    rays: Array,
+    material: NDArray[np.int8],
+    lamp: Lamp,
+    appearance: ToolAppearance = USUAL_PLAN.appearance,
 ) -> Array:
     """Return the linear radiance [N, 3] of the tool.
 
     The shaft is usually polymer, the jaws are brushed steel reflecting pink surroundings.
     """
-    metal = ((material != SHAFT) | look.metal_shaft)[:, None]
-    base = np.where((material != SHAFT)[:, None], np.array(look.steel, np.float32), np.array(look.shaft, np.float32))
-    base = np.where((material == RING)[:, None], np.array(look.ring, np.float32), base)
-    gloss = np.where(metal[:, 0], np.float32(look.gloss), np.float32(14))
-    glint = np.where(metal[:, 0], np.float32(look.glint), np.float32(0.16))
+    metal = ((material != SHAFT) | appearance.metal_shaft)[:, None]
+    base = np.where(
+        (material != SHAFT)[:, None], np.array(appearance.steel, np.float32), np.array(appearance.shaft, np.float32)
+    )
+    base = np.where((material == RING)[:, None], np.array(appearance.ring, np.float32), base)
+    gloss = np.where(metal[:, 0], np.float32(appearance.gloss), np.float32(14))
+    glint = np.where(metal[:, 0], np.float32(appearance.glint), np.float32(0.16))
     total = np.zeros((len(at), 3), np.float32)
     for to_light, power in lamp.rays_to(at, nearest_mm2=400):
         facing = np.clip(np.einsum("ni,ni->n", normal, to_light), 0, 1)
@@ -142,7 +149,7 @@ class Eye:
 def render_eye(
     tissue: Tissue,
     tug: Tug,
-    tools: Sequence[tuple[list[Part], ToolLook]],
+    tools: Sequence[tuple[list[Part], ToolAppearance]],
     camera: Camera,
     time_s: float,
     lamp: Lamp,
@@ -157,7 +164,7 @@ def render_eye(
     Args:
         tissue: deforming tissue.
         tug: pull of the tool on the tissue.
-        tools: capsules and look of each tool.
+        tools: capsules and appearance of each tool.
         camera: camera with its pose.
         time_s: time in seconds.
         lamp: light source in the camera's coordinates; the same light serves all cameras.
@@ -180,7 +187,7 @@ def render_eye(
     every_part = [part for parts, _ in tools for part in parts]
     radiance = shade_tissue(tissue, u, v, points, local, rays, every_part, camera, lamp)
     depth, tool = tissue_depth, np.zeros(shape, np.bool_)
-    for parts, look in [] if transparent else tools:
+    for parts, appearance in [] if transparent else tools:
         hits = trace(parts, camera.position, world_rays, (depth * length).ravel(), 1 / float(camera.K[0, 0]))
         tool_depth = hits.distance_mm.reshape(shape) / length
         cover = hits.cover.reshape(shape)
@@ -189,7 +196,7 @@ def render_eye(
             normal = hits.normal.reshape(*shape, 3)[touched] @ rotation.T.astype(np.float32)
             reach = np.where(np.isfinite(tool_depth), tool_depth, depth * np.float32(0.9))[touched]
             at = rays[touched] * (reach * length[touched])[:, None]
-            steel = shade_tool(at, normal, rays[touched], hits.material.reshape(shape)[touched], lamp, look)
+            steel = shade_tool(at, normal, rays[touched], hits.material.reshape(shape)[touched], lamp, appearance)
             share = cover[touched][:, None]
             radiance[touched] = (1 - share) * radiance[touched] + share * steel
         depth, tool = np.minimum(depth, tool_depth).astype(np.float32), tool | touched

@@ -17,7 +17,7 @@ from gsplat_core.io.recordings.synthetic.optics import USUAL_LAMP, Air, Lamp, Pa
 from gsplat_core.io.recordings.synthetic.random_scene import USUAL_SWAY, RandomScene, Sway, looking, rigid
 from gsplat_core.io.recordings.synthetic.renderer import Eye, render_eye
 from gsplat_core.io.recordings.synthetic.tissue import NO_TUG, TISSUE_DISTANCE_MM, Colon, Tissue, Tug
-from gsplat_core.io.recordings.synthetic.tool import CYCLE_S, USUAL_PLAN, Part, ToolLook, ToolMotion
+from gsplat_core.io.recordings.synthetic.tool import CYCLE_S, USUAL_PLAN, Part, ToolAppearance, ToolMotion
 from gsplat_core.scene.cameras import Camera
 
 MOST_SMOKE = 5.0
@@ -163,7 +163,7 @@ class SyntheticScene:
         seeds = np.random.SeedSequence((drawn.seed, 27)).spawn(6)
         rngs = [np.random.default_rng(child) for child in seeds]
         texel_mm = min(0.6 * TISSUE_DISTANCE_MM / (SCENES[drawn.scene].focal_factor * side), 0.3)
-        tissue = SCENES[drawn.scene](rngs[0], texel_mm, drawn.look, drawn.shape)
+        tissue = SCENES[drawn.scene](rngs[0], texel_mm, drawn.appearance, drawn.shape)
         tissue.breathing, tissue.exposed_mm, tissue.tools = drawn.breathing, drawn.exposed_mm, bool(drawn.tools)
         if drawn.scene == "open":
             tissue.looked_at_mm = drawn.shape.distance_mm
@@ -281,12 +281,14 @@ class SyntheticScene:
         """Return the tool's pull on the tissue at a time; `NO_TUG` without tools."""
         return self.motion.tug(time_s) if self.tissue.tools else NO_TUG
 
-    def tools(self, time_s: float) -> list[tuple[list[Part], ToolLook]]:
-        """Return the capsules and the look of each tool at a time; empty in scenes without a tool."""
+    def tools(self, time_s: float) -> list[tuple[list[Part], ToolAppearance]]:
+        """Return the capsules and the appearance of each tool at a time; empty in scenes without a tool."""
         if not self.tissue.tools:
             return []
         tug = self.tug(time_s)
-        return [(motion.parts(self.tissue, time_s, tug), motion.plan.look) for motion in (self.motion, *self.others)]
+        return [
+            (motion.parts(self.tissue, time_s, tug), motion.plan.appearance) for motion in (self.motion, *self.others)
+        ]
 
     def track(self, time_s: float) -> NDArray[np.float32]:
         """Return the positions in the world, [63, 3] in mm, of a grid of tissue points at a time."""

@@ -94,7 +94,7 @@ Colour = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
-class TissueLook:
+class TissueAppearance:
     """Colours, texture and gloss of a tissue. Colours are linear RGB reflectances."""
 
     base: Colour = (0.62, 0.175, 0.115)
@@ -132,18 +132,27 @@ class TissueLook:
     """Size of the tissue's texture relative to its usual size."""
 
 
-USUAL_LOOK = TissueLook()
+USUAL_APPEARANCE = TissueAppearance()
 
 
 class TissueTexture:
     """Texture maps of reflectance, wetness and the slopes of the fine relief over the undeformed sheet."""
 
-    def __init__(self, rng: np.random.Generator, texel_mm: float, look: TissueLook = USUAL_LOOK) -> None:
+    def __init__(
+        self, rng: np.random.Generator, texel_mm: float, appearance: TissueAppearance = USUAL_APPEARANCE
+    ) -> None:
         base, pale, deep, fat_colour, vein, artery = (
             np.array(colour, np.float32)
-            for colour in (look.base, look.pale, look.deep, look.fat, look.vein, look.artery)
+            for colour in (
+                appearance.base,
+                appearance.pale,
+                appearance.deep,
+                appearance.fat,
+                appearance.vein,
+                appearance.artery,
+            )
         )
-        self._per_mm = np.float32(1 / look.zoom)
+        self._per_mm = np.float32(1 / appearance.zoom)
         self.size = 2 * int(np.ceil(HALF_EXTENT_MM / texel_mm))
         self.texel_mm = 2 * HALF_EXTENT_MM / self.size
         cloud = self._noise(rng, (46.0, 21.0, 9.0, 4.2, 2.0, 0.9), 0.62)
@@ -152,26 +161,28 @@ class TissueTexture:
         folds = 1 - np.abs(self._noise(rng, (23.0, 11.0), 0.45))  # ridged: long soft creases
         lobules = np.abs(self._noise(rng, (4.6, 2.3), 0.5))
 
-        mottled = np.float32(look.mottling) * cloud
+        mottled = np.float32(appearance.mottling) * cloud
         colour = _mix(base, pale, _smoothstep(0.1, 1.3, mottled))
         colour = _mix(colour, deep, _smoothstep(0.0, 1.5, -mottled))
-        fat = _smoothstep(look.fat_from, look.fat_from + 0.5, fat_cloud)
+        fat = _smoothstep(appearance.fat_from, appearance.fat_from + 0.5, fat_cloud)
         colour = _mix(colour, fat_colour * (0.86 + 0.14 * _smoothstep(0.0, 0.5, lobules))[..., None], 0.85 * fat)
         crease = _smoothstep(0.72, 1.0, folds) * (1 - fat)
-        colour *= (1 - look.creases * crease)[..., None]
-        veins, vein_relief = self._vessels(rng, count=look.veins, width_mm=2.1, blur_mm=0.42)
-        arteries, artery_relief = self._vessels(rng, count=look.arteries, width_mm=0.85, blur_mm=0.12)
-        colour = _mix(colour, vein, look.vessel_strength * 0.66 * veins * (1 - 0.5 * fat))
-        colour = _mix(colour, artery, look.vessel_strength * 0.80 * arteries)
-        colour *= (1 + look.grain * grain)[..., None]
+        colour *= (1 - appearance.creases * crease)[..., None]
+        veins, vein_relief = self._vessels(rng, count=appearance.veins, width_mm=2.1, blur_mm=0.42)
+        arteries, artery_relief = self._vessels(rng, count=appearance.arteries, width_mm=0.85, blur_mm=0.12)
+        colour = _mix(colour, vein, appearance.vessel_strength * 0.66 * veins * (1 - 0.5 * fat))
+        colour = _mix(colour, artery, appearance.vessel_strength * 0.80 * arteries)
+        colour *= (1 + appearance.grain * grain)[..., None]
 
         relief_mm = 0.040 * grain + 0.22 * cloud - 0.20 * crease + 0.34 * fat * lobules + 0.25 * fat
         relief_mm += 0.30 * vein_relief + 0.14 * artery_relief
         relief_mm = cv2.GaussianBlur(relief_mm.astype(np.float32), (0, 0), 0.22 / self.texel_mm)
-        wetness = look.wetness + (1 - look.wetness) * _smoothstep(-0.3, 1.2, self._noise(rng, (16.0, 6.0, 2.5), 0.6))
+        wetness = appearance.wetness + (1 - appearance.wetness) * _smoothstep(
+            -0.3, 1.2, self._noise(rng, (16.0, 6.0, 2.5), 0.6)
+        )
         self.reflectance = np.ascontiguousarray(np.clip(np.dstack([colour, wetness]), 0.004, 0.95), np.float32)
         """Linear RGB reflectance and wetness of each texel, [S, S, 4]."""
-        relief_mm *= np.float32(look.roughness)
+        relief_mm *= np.float32(appearance.roughness)
         slope_v, slope_u = np.gradient(relief_mm, np.float32(self.texel_mm))
         self.slope = np.ascontiguousarray(np.dstack([slope_u, slope_v]), np.float32)
         """Derivatives of the fine relief by u and v at each texel, [S, S, 2]."""
@@ -315,10 +326,10 @@ class Tissue:
         self,
         rng: np.random.Generator,
         texel_mm: float,
-        look: TissueLook = USUAL_LOOK,
+        appearance: TissueAppearance = USUAL_APPEARANCE,
         shape: TissueShape = USUAL_SHAPE,
     ) -> None:
-        self.look, self.shape = look, shape
+        self.appearance, self.shape = appearance, shape
         wavelengths = shape.width * np.array([74.0, 58.0, 43.0, 33.0, 26.0, 21.0])
         slopes = shape.relief * np.array([0.16, 0.17, 0.15, 0.14, 0.10, 0.07])
         angles = rng.uniform(0, 2 * np.pi) + np.arange(6) * 2.4 + rng.uniform(-0.4, 0.4, 6)
@@ -331,7 +342,7 @@ class Tissue:
         self.breathing = Breathing(float(rng.uniform(0, 2 * np.pi)))
         """Phase of breathing over time, regular by default; replaced if a recording requests other breathing."""
         self._breath_angle = float(rng.uniform(0, 2 * np.pi))
-        self.texture = TissueTexture(rng, texel_mm, look)
+        self.texture = TissueTexture(rng, texel_mm, appearance)
 
     def first_guess(self, origin: Array, directions: Array) -> tuple[Array, Array]:
         """Return u and v [H, W] in mm at which Newton's method for the ray intersections starts.

@@ -57,7 +57,7 @@ SHAFT, STEEL, RING = 0, 1, 2
 
 
 @dataclass(frozen=True)
-class ToolLook:
+class ToolAppearance:
     """Colours and gloss of a tool. Colours are linear RGB reflectances."""
 
     shaft: Colour = (0.085, 0.093, 0.108)
@@ -92,7 +92,7 @@ class ToolPlan:
     pull: float = 1.0
     """Factor on the displacement of the grasped tissue; 0 if the tool does not touch it."""
     tug_radius_mm: float = TUG_RADIUS_MM
-    look: ToolLook = ToolLook()
+    appearance: ToolAppearance = ToolAppearance()
 
 
 USUAL_PLAN = ToolPlan()

@@ -24,7 +24,12 @@ def test_a_fixed_property_leaves_the_others() -> None:
     free = draw_scene(3)
     fixed = draw_scene(3, moving=not free.moving, smoke=0.7, breathing_ratio=2.5)
     assert (fixed.moving, fixed.smoke, fixed.breathing.ratio) == (not free.moving, 0.7, 2.5)
-    assert (fixed.look, fixed.shape, fixed.tools, fixed.lamp) == (free.look, free.shape, free.tools, free.lamp)
+    assert (fixed.appearance, fixed.shape, fixed.tools, fixed.lamp) == (
+        free.appearance,
+        free.shape,
+        free.tools,
+        free.lamp,
+    )
     assert draw_scene(3) == free
 
 
