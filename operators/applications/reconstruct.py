@@ -247,20 +247,25 @@ class _PathAhead:
 
     def __init__(self, inputs: _Inputs) -> None:
         self._is_given_up = False
+        self._done, self._total = 0, len(inputs.given.frames)
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="path ahead")
         self._path = self._pool.submit(
-            camera_path_of, inputs.given.frames, inputs.source.description.camera, after_frame=self._check
+            camera_path_of, inputs.given.frames, inputs.source.description.camera, after_frame=self._count
         )
 
-    def _check(self) -> None:
+    def _count(self) -> None:
+        self._done += 1
         if self._is_given_up:
             raise _StopFitting
 
-    def awaited(self, is_late: IsLate) -> CameraPath | None:
+    def awaited(self, is_late: IsLate, progress: ProgressCallback | None) -> CameraPath | None:
         """Wait for the path and return it; None if `is_late` returns True before. Raises InvalidInput as `camera_path_of`."""
         while not self._path.done():
             if is_late():
                 return None
+            if progress is not None:
+                # After the last frame is tracked, its pose and those of the others are still refined.
+                progress(Progress("poses", min(self._done, self._total - 1), self._total))
             wait([self._path], POLL_S)
         return self._path.result()
 
@@ -379,7 +384,7 @@ class _Fitting:
         if self._path is None:
             return None
         try:
-            path = self._path.awaited(is_late)
+            path = self._path.awaited(is_late, self._progress)
         except InvalidInput as error:
             self._notes.append(f"no poses of the scope were estimated: {error}")
             return None

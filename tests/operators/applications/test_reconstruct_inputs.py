@@ -126,8 +126,10 @@ def test_the_path_is_estimated_while_the_first_trial_trains_and_given_up_when_it
     monkeypatch.setattr(module, "camera_path_of", endless)
     monkeypatch.setattr(module, "validation_psnr_db", score)
     settings = module.ReconstructSettings(recording=moving, out=tmp_path / "out", sinks=(), minutes=1.0)
-    outcome = module.reconstruct(settings, clock=clock)
+    stages = set()
+    outcome = module.reconstruct(settings, progress=lambda each: stages.add(each.stage), clock=clock)
     assert ended.wait(10.0), "it was not given up"
+    assert stages == {"validate", "poses", "train", "evaluate"}
     assert any("no time to try estimated poses; --minutes raises it" in note for note in outcome.notes)
     assert "poses" not in outcome.outputs
 
