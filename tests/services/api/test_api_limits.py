@@ -42,7 +42,7 @@ def limits_in(node: Any, name: str = "") -> Iterator[tuple[str, tuple[float | No
             yield from limits_in(value, name)
 
 
-def test_the_api_document_states_the_limits_of_all_values(plane):
+def test_openapi_states_limits_of_all_values(plane):
     found: dict[str, set[tuple[float | None, float | None]]] = {}
     for name, limits in limits_in(plane.client.get("/openapi.json").json()):
         found.setdefault(name, set()).add(limits)
@@ -101,7 +101,7 @@ STATUSES = {
 ALWAYS = {"400", "401", "403", "413", "421", "422", "429", "431", "500", "503"}
 
 
-def test_the_api_document_states_the_statuses_of_all_operations(plane):
+def test_openapi_states_statuses_of_all_operations(plane):
     paths = plane.client.get("/openapi.json").json()["paths"]
     found = {
         f"{method} {path}": set(each["responses"]) for path, item in paths.items() for method, each in item.items()

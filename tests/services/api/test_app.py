@@ -24,7 +24,7 @@ PUBLIC = {"/livez", "/readyz", "/openapi.json", "/docs", "/docs/{file}"}
 
 
 @pytest.mark.slow
-def test_the_control_plane_loads_neither_torch_nor_opencv(tmp_path):
+def test_new_app_does_not_import_torch_or_opencv(tmp_path):
     code = (
         "import sys, services.api, services.settings, services.audit, services.cli.serve\n"
         "from services.settings import ServiceSettings\n"
@@ -39,7 +39,7 @@ def routes(app):
     return [each for each in iter_route_contexts(app.routes) if getattr(each, "endpoint", None) is not None]
 
 
-def test_every_route_declares_its_role_and_refuses_who_has_none(plane):
+def test_every_route_returns_401_without_key_and_403_for_lower_roles(plane):
     found = routes(plane.app)
     assert len(found) > 25
     assert {each.path for each in found if rule_of(each.endpoint).role is Role.PUBLIC} == PUBLIC
@@ -59,7 +59,7 @@ def test_every_route_declares_its_role_and_refuses_who_has_none(plane):
                 assert plane.ask(method, path, role).status_code == 403, (method, path, role)
 
 
-def test_a_route_without_a_role_cannot_be_made():
+def test_router_raises_for_endpoint_without_role():
     from services.api.guard import new_router
 
     async def open_to_all() -> None: ...
@@ -68,19 +68,19 @@ def test_a_route_without_a_role_cannot_be_made():
         new_router("x").get("/open")(open_to_all)
 
 
-def test_a_wrong_method_says_which_are_right(plane):
+def test_wrong_method_returns_405_with_allow_header(plane):
     for path, methods in (("/v1/streams", "GET, POST"), ("/v1/models/a/versions", "GET, PUT"), ("/livez", "GET, HEAD")):
         answer = plane.ask("TRACE", path)
         assert (answer.status_code, answer.headers["allow"], answer.json()["status"]) == (405, methods, 405)
 
 
-def test_probes_answer_head(plane):
+def test_livez_and_readyz_answer_head_requests(plane):
     for path in ("/livez", "/readyz", "/readyz?verbose=1"):
         seen, asked = (plane.client.request(method, path) for method in ("HEAD", "GET"))
         assert (seen.status_code, seen.content) == (200, b"") and asked.status_code == 200
 
 
-def test_absent_parts_answer_503(new_plane):
+def test_routes_of_absent_parts_return_503(new_plane):
     plane = new_plane(Parts())
     for path in ("/v1/streams", "/v1/models", "/v1/replays", "/v1/recordings"):
         answer = plane.ask("GET", path)
@@ -88,7 +88,7 @@ def test_absent_parts_answer_503(new_plane):
         assert answer.headers["content-type"] == PROBLEM_JSON
 
 
-def test_every_operation_is_described(plane):
+def test_openapi_describes_every_operation_with_role_and_responses(plane):
     document = plane.client.get("/openapi.json").json()
     operations = [(path, operation) for path, item in document["paths"].items() for operation in item.values()]
     assert {"/v1/streams", "/v1/models/{name}/versions", "/livez", "/metrics"} <= set(document["paths"])
@@ -108,7 +108,7 @@ def test_every_operation_is_described(plane):
     assert document["components"]["schemas"]["Activation"]["properties"]["version"]["examples"] == [3]
 
 
-def test_an_operation_names_the_problems_that_it_may_answer_with(plane):
+def test_openapi_operations_list_their_problem_statuses(plane):
     paths = plane.client.get("/openapi.json").json()["paths"]
     for method, path, more in (
         ("get", "/livez", set()),
@@ -124,7 +124,7 @@ def test_an_operation_names_the_problems_that_it_may_answer_with(plane):
         assert ("422" in responses) == (more != set()), (method, path)
 
 
-def test_the_page_of_the_api_loads_nothing_from_elsewhere(plane):
+def test_docs_page_loads_only_local_files(plane):
     page = plane.client.get("/docs")
     loaded = re.findall(r'(?:src|href)="([^"]+)"', page.text)
     assert len(loaded) == 5
@@ -139,7 +139,7 @@ def test_the_page_of_the_api_loads_nothing_from_elsewhere(plane):
     assert re.findall(r"url\((?!['\"]?data:)", (SWAGGER_UI / "swagger-ui.css").read_text()) == []
 
 
-def test_swagger_ui_is_the_one_that_the_notice_names():
+def test_swagger_ui_files_match_version_in_notice():
     digests = {name: hashlib.sha256((SWAGGER_UI / name).read_bytes()).hexdigest() for name in SWAGGER_FILES}
     assert "5.33.1" in (SWAGGER_UI / "NOTICE").read_text()
     assert digests["swagger-ui-bundle.js"] == "050bc415ee7048dcd881682678f720264e7da5e373f7461d7c58c755305255f7"
@@ -147,16 +147,16 @@ def test_swagger_ui_is_the_one_that_the_notice_names():
 
 
 @pytest.mark.parametrize("name", ["../app.py", "%2e%2e/app.py", "nope.js", "start.js%00"])
-def test_only_the_files_of_the_page_are_served(plane, name):
+def test_docs_route_returns_404_for_other_files(plane, name):
     assert plane.client.get(f"/docs/{name}").status_code == 404
 
 
-def test_every_problem_has_a_status_of_its_own_kind():
+def test_problem_classes_have_error_status_and_title():
     for kind in Problem.__subclasses__():
         assert 400 <= kind.status < 600 and kind.title
 
 
-def test_readyz_reports_the_state_of_each_check(new_plane):
+def test_readyz_reports_state_of_each_check(new_plane):
     async def well():
         return CheckResult(True, "one model is active")
 
@@ -182,7 +182,7 @@ def test_readyz_reports_the_state_of_each_check(new_plane):
     assert plane.client.get("/readyz").status_code == 503
 
 
-def test_background_is_entered_and_left_in_reverse(tmp_path):
+def test_background_parts_are_exited_in_reverse_order(tmp_path):
     from contextlib import asynccontextmanager
 
     from starlette.testclient import TestClient

@@ -25,7 +25,7 @@ from services.supervisor.stream import SupervisedStreams
         ("rtsp://user:pass@10.0.0.5/x does not answer", False),
     ],
 )  # fmt: skip
-def test_reasons_that_could_name_a_file_are_not_in_the_audit_log(reason, kept):
+def test_audit_log_omits_stream_end_reasons_that_may_name_a_file(reason, kept):
     events, heard = SystemEvents(), []
     events.tell = lambda *values, **detail: heard.append((values, detail))  # type: ignore[method-assign]
     event_receiver(StreamMeasures(), events)(StreamEvent("theatre", "engine", "ended", reason, 7))
@@ -36,7 +36,7 @@ def test_reasons_that_could_name_a_file_are_not_in_the_audit_log(reason, kept):
 @pytest.mark.parametrize(
     ("state", "ready"), [("live", "ready"), ("stopped", "ready"), ("source lost", "degraded"), ("failed", "degraded")]
 )
-def test_a_lost_camera_is_degraded(tmp_path, monkeypatch, state, ready):
+def test_streams_check_is_degraded_when_stream_lost_source_or_failed(tmp_path, monkeypatch, state, ready):
     """The reason is left out: /readyz needs no key, and a reason may name a source."""
     source = "rtsp://10.0.0.5/x"
     view = StreamView(

@@ -44,7 +44,7 @@ def found(plane, **query):
         ({"subject": "spleen"}, set()),
     ],
 )
-def test_a_search_finds_what_fits_and_nothing_else(kept, query, events):
+def test_audit_search_returns_only_matching_entries(kept, query, events):
     entries = [entry for entry in found(kept, count=500, **query)["entries"] if not entry["event"].startswith("audit.")]
     assert {entry["event"] for entry in entries} == events
     everything = found(kept, count=500)["entries"]
@@ -52,7 +52,7 @@ def test_a_search_finds_what_fits_and_nothing_else(kept, query, events):
     assert all(entry in everything for entry in entries)
 
 
-def test_times_have_a_zone_and_bound_a_search(kept):
+def test_audit_search_is_bounded_by_since_and_until_with_zone(kept):
     entries = found(kept, count=500, event="model.activate")["entries"]
     assert all(datetime.fromisoformat(entry["at"]).tzinfo is not None for entry in entries)
     at = datetime.fromisoformat(entries[20]["at"])
@@ -63,7 +63,7 @@ def test_times_have_a_zone_and_bound_a_search(kept):
     assert found(kept, count=500, event="model.activate", since=zone)["entries"] == later
 
 
-def test_pages_of_a_search_have_every_entry_once(kept, monkeypatch):
+def test_audit_search_pages_contain_every_entry_once(kept, monkeypatch):
     monkeypatch.setattr(reading, "MOST_EXAMINED", 7)
     seen, before, asked = [], None, 0
     while asked == 0 or before is not None:
@@ -78,7 +78,7 @@ def test_pages_of_a_search_have_every_entry_once(kept, monkeypatch):
     "query",
     [{"outcome": "well"}, {"since": "yesterday"}, {"until": "0.5"}, {"since": "1700000000"}, {"since": "2026-01-01T00:00:00"}, {"actor": ""}, {"actor": "a\nb"}, {"subject": 101 * "a"}, {"event": "<b>"}],
 )  # fmt: skip
-def test_a_filter_that_makes_no_sense_is_refused(kept, query):
+def test_audit_routes_return_422_for_invalid_filter(kept, query):
     for path in ("/v1/audit", "/v1/audit/export"):
         assert kept.ask("GET", path, params=query).status_code == 422
 
@@ -90,11 +90,11 @@ def test_a_filter_that_makes_no_sense_is_refused(kept, query):
         ({"before": 0}, 200), ({"before": 2**63 - 1}, 200), ({"before": -1}, 422), ({"before": 2**63}, 422),
     ],
 )  # fmt: skip
-def test_pages_have_1_to_500_entries_before_a_number_of_64_bits(plane, query, status):
+def test_audit_route_limits_count_to_500_and_before_to_64_bits(plane, query, status):
     assert plane.ask("GET", "/v1/audit", params=query).status_code == status
 
 
-def test_the_download_of_everything_can_be_verified(kept, tmp_path):
+def test_full_audit_export_passes_verification(kept, tmp_path):
     answer = kept.ask("GET", "/v1/audit/export")
     assert 'filename="audit-' in answer.headers["content-disposition"]
     assert answer.headers["content-type"].startswith("application/jsonl")
@@ -108,7 +108,7 @@ def test_the_download_of_everything_can_be_verified(kept, tmp_path):
     assert json.loads(answer.content.splitlines()[-1])["event"] == "audit.export"
 
 
-def test_a_table_for_spreadsheets_has_no_formulas(kept):
+def test_audit_csv_export_escapes_spreadsheet_formulas(kept):
     answer = kept.ask("GET", "/v1/audit/export", params={"format": "csv"})
     assert answer.headers["content-type"] == "text/csv; charset=utf-8"
     rows = list(csv.DictReader(io.StringIO(answer.text)))
@@ -122,7 +122,7 @@ def test_a_table_for_spreadsheets_has_no_formulas(kept):
     assert len(list(csv.DictReader(io.StringIO(one.text)))) == 1
 
 
-def test_a_download_reads_closed_files_and_those_that_are_removed_meanwhile(tmp_path):
+def test_audit_export_reads_all_segments_of_rotated_log(tmp_path):
 
     log = AuditLog(tmp_path / "audit.jsonl", Keeping(segment_bytes=2000))
     for number in range(30):
@@ -136,7 +136,7 @@ def test_a_download_reads_closed_files_and_those_that_are_removed_meanwhile(tmp_
     log.close()
 
 
-def test_reading_is_an_entry_once_a_minute_and_each_download_is_one(plane):
+def test_audit_logs_reads_once_per_minute_and_every_export(plane):
     for _ in range(5):
         found(plane)
     found(plane, outcome="refused")
@@ -154,7 +154,7 @@ def test_reading_is_an_entry_once_a_minute_and_each_download_is_one(plane):
 
 
 @pytest.mark.parametrize("form", ["jsonl", "csv"])
-def test_a_download_is_sent_in_pieces_of_bounded_size(tmp_path, monkeypatch, form):
+def test_audit_export_yields_pieces_of_bounded_size(tmp_path, monkeypatch, form):
     log = AuditLog(tmp_path / "audit.jsonl")
     for number in range(40):
         log.append("model.activate", actor="console", subject=str(number))

@@ -98,19 +98,19 @@ def der(certificate) -> bytes:
     "until",
     [SOON, datetime(2049, 12, 31, 23, 59, 59, tzinfo=UTC), datetime(2050, 1, 1, tzinfo=UTC), datetime(9999, 12, 31, 23, 59, 59, tzinfo=UTC)],
 )  # fmt: skip
-def test_the_expiry_is_the_certificates_own(until, kind):
+def test_expiry_of_returns_not_after_of_certificate(until, kind):
     certificate, _ = made(until, kind=kind)
     assert datetime.fromtimestamp(expiry_of(der(certificate)), UTC) == certificate.not_valid_after_utc == until
 
 
-def test_what_is_no_certificate_has_no_expiry():
+def test_expiry_of_raises_for_malformed_certificate():
     good = der(made()[0])
     for bad in (b"", b"\x30", b"hello", good[:40], good[1:], bytes(len(good)), b"\x30\x84\xff\xff\xff\xff" + good):
         with pytest.raises((ValueError, IndexError)):
             expiry_of(bad)
 
 
-def test_the_first_of_a_chain_to_expire_counts(tmp_path):
+def test_expires_at_is_earliest_expiry_in_chain(tmp_path):
     leaf, key = made(SOON)
     authority, _ = made(SOON - timedelta(days=400), "authority.example")
     certificate = ServerCertificate(*put(tmp_path, b"a comment\n" + pem(leaf) + pem(authority), key_pem(key)))
@@ -118,7 +118,7 @@ def test_the_first_of_a_chain_to_expire_counts(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["room-1.example", None])
-def test_new_connections_get_a_renewed_certificate(tmp_path, name):
+def test_new_connections_get_renewed_certificate_after_reload(tmp_path, name):
     old, old_key = made()
     new, new_key = made(SOON + timedelta(days=90), kind="rsa")
     pair = put(tmp_path, pem(old), key_pem(old_key))
@@ -170,7 +170,7 @@ def only_half_renewed(folder, new, key):
 @pytest.mark.parametrize(
     "spoil", [of_another_key, cut_off, empty, with_a_passphrase, gone, a_folder, a_pipe, only_half_renewed]
 )
-def test_files_that_cannot_be_used_leave_the_certificate_before(tmp_path, caplog, spoil):
+def test_reload_keeps_old_certificate_if_new_files_are_unusable(tmp_path, caplog, spoil):
     old, old_key = made()
     new, new_key = made(SOON + timedelta(days=90))
     pair = put(tmp_path, pem(old), key_pem(old_key))
@@ -195,7 +195,7 @@ def test_files_that_cannot_be_used_leave_the_certificate_before(tmp_path, caplog
 
 
 @pytest.mark.parametrize("spoil", [of_another_key, cut_off, empty, with_a_passphrase, gone, a_folder, a_pipe])
-def test_such_files_are_refused_at_the_start(tmp_path, spoil):
+def test_server_certificate_raises_for_unusable_files(tmp_path, spoil):
     new, key = made()
     pair = put(tmp_path, pem(new), key_pem(key))
     spoil(tmp_path, new, key)
@@ -203,14 +203,14 @@ def test_such_files_are_refused_at_the_start(tmp_path, spoil):
         ServerCertificate(*pair)
 
 
-def test_an_expired_certificate_makes_the_service_degraded(tmp_path):
+def test_certificate_check_is_degraded_after_expiry(tmp_path):
     old, key = made(datetime(2021, 1, 1, tzinfo=UTC))
     checked = asyncio.run(ServerCertificate(*put(tmp_path, pem(old), key_pem(key))).check())
     assert (checked.ok, checked.needed) == (False, False)
     assert "has expired at 2021-01-01 00:00 UTC; renew it" in checked.detail
 
 
-def test_what_prometheus_gets(tmp_path):
+def test_certificate_metrics_report_expiry_and_failed_reload(tmp_path):
     old, key = made()
     certificate = ServerCertificate(*put(tmp_path, pem(old), key_pem(key)))
 
@@ -224,7 +224,7 @@ def test_what_prometheus_gets(tmp_path):
     assert values() == dict(zip(names, (SOON.timestamp(), 1.0), strict=True))
 
 
-def test_a_change_is_seen_by_itself_and_is_in_the_audit_log(tmp_path, monkeypatch):
+def test_watched_certificate_reloads_and_writes_audit_entries(tmp_path, monkeypatch):
     from services.api import server as module
     from services.audit import AuditLog, Wanted, search
 

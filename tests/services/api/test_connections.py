@@ -35,11 +35,11 @@ from tests.services.api.conftest import fakes
         ("unknown", "unknown"),
     ],
 )
-def test_what_one_host_can_use_is_one_address(address, counted_as):
+def test_network_of_address_groups_ipv6_by_64_prefix(address, counted_as):
     assert network_of_address(address) == counted_as
 
 
-def test_an_address_has_a_bound_and_others_go_on():
+def test_address_bound_limits_each_address_separately():
     refused = []
     bound = AddressBound(2, on_refused=lambda: refused.append(1))
     keys = [bound.enter("10.0.0.1"), bound.enter("10.0.0.1")]
@@ -50,13 +50,13 @@ def test_an_address_has_a_bound_and_others_go_on():
 
 
 @pytest.mark.parametrize(("most", "exempt"), [(0, ()), (1, ("10.0.0.0/8",)), (1, ("10.0.0.1/32", "192.168.0.0/16"))])
-def test_without_a_bound_and_for_trusted_proxies_nothing_is_refused(most, exempt):
+def test_address_bound_admits_all_if_zero_or_address_exempt(most, exempt):
     bound = AddressBound(most, exempt)
     assert all(bound.enter("10.0.0.1") is not None for _ in range(50))
     assert all(bound.enter("::ffff:10.0.0.1") is not None for _ in range(50))
 
 
-def test_a_refused_address_is_logged_now_and_then(caplog):
+def test_address_bound_logs_refusals_once_per_minute(caplog):
     now_s = 100.0
     bound = AddressBound(1, clock=lambda: now_s)
     bound.enter("10.0.0.1")
@@ -129,7 +129,7 @@ def tcp(port: int):
 LIVE = b"GET /livez HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n"
 
 
-def test_half_sent_heads_of_one_address_leave_room_for_others(served):
+def test_half_sent_heads_of_one_address_do_not_block_others(served):
     settings, bound, port, probe = served(connections_per_address=8, head_s=60)
     with contextlib.ExitStack() as open_:
         for _ in range(40):
@@ -152,7 +152,7 @@ def test_half_sent_heads_of_one_address_leave_room_for_others(served):
     assert answer(tcp(port), LIVE).startswith(b"HTTP/1.1 200")
 
 
-def test_a_head_has_a_time_whatever_trickles_in(served):
+def test_server_closes_trickled_request_head_after_head_s(served):
     _, _, port, _ = served(head_s=0.3)
     with socket.create_connection(("127.0.0.1", port)) as slow:
         slow.settimeout(300)
@@ -171,7 +171,7 @@ def test_a_head_has_a_time_whatever_trickles_in(served):
         thread.join()
 
 
-def test_the_probe_says_what_the_service_says(served):
+def test_probe_listener_serves_livez_and_readyz_only(served):
     from services.schemas import CheckResult
 
     async def broken():
@@ -204,7 +204,7 @@ def test_the_probe_says_what_the_service_says(served):
     ],
     ids=["post", "head", "empty", "no url", "long", "bytes"],
 )
-def test_what_the_probe_cannot_read_does_no_harm(served, data, begins):
+def test_probe_listener_survives_malformed_requests(served, data, begins):
     _, _, _, probe = served()
     found = answer(tcp(probe), data)
     assert found.startswith(begins) and (begins or found == b"")
@@ -212,7 +212,7 @@ def test_what_the_probe_cannot_read_does_no_harm(served, data, begins):
     assert answer(tcp(probe), LIVE).startswith(b"HTTP/1.1 200")
 
 
-def test_the_probe_answers_while_others_hold_it(served):
+def test_probe_listener_answers_while_idle_connections_are_open(served):
     _, _, _, probe = served()
     with contextlib.ExitStack() as open_:
         for _ in range(3 * MOST_CONNECTIONS):
@@ -220,7 +220,7 @@ def test_the_probe_answers_while_others_hold_it(served):
         assert answer(tcp(probe), LIVE).startswith(b"HTTP/1.1 200")
 
 
-def test_where_the_probe_cannot_listen(tmp_path):
+def test_bind_probe_raises_if_port_or_socket_is_taken_or_folder_missing(tmp_path):
     with tempfile.TemporaryDirectory(prefix="isp-") as folder, socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         settings = ServiceSettings(paths={"runtime": folder}, server={"probe_port": port})
@@ -238,7 +238,7 @@ def test_where_the_probe_cannot_listen(tmp_path):
         bind_probe(ServiceSettings(paths={"runtime": tmp_path / "nope"}))
 
 
-def test_a_head_in_one_piece_is_bounded(served):
+def test_request_head_over_size_limit_returns_431(served):
     _, _, port, _ = served()
     for size, status in ((30_000, b"200"), (33_000, b"431"), (70_000, b"431"), (200_000, b"431")):
         fields = b"X-Long: " + size * b"a" + b"\r\n"
@@ -263,13 +263,13 @@ def test_a_head_in_one_piece_is_bounded(served):
         (b"no colon\r\n", b"illegal header line"),
     ],
 )
-def test_a_malformed_head_is_400_whatever_follows_it(served, fields, text):
+def test_malformed_head_returns_400_despite_following_bytes(served, fields, text):
     _, _, port, _ = served()
     found = answer(tcp(port), LIVE.replace(b"Host", fields + b"Host", 1) + bytes(100_000))
     assert found.startswith(b"HTTP/1.1 400 ") and text in found, found
 
 
-def test_a_malformed_chunk_after_the_answer_closes_the_connection_without_a_traceback(served, caplog):
+def test_malformed_chunk_after_response_closes_without_traceback(served, caplog):
     _, _, port, _ = served()
     head = b"PUT /v1/models/a/versions HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n"
     with socket.create_connection(("127.0.0.1", port)) as client:
@@ -289,7 +289,7 @@ HANDSHAKE = (
 )
 
 
-def test_a_handshake_that_cannot_be_taken_is_answered_and_closed(served):
+def test_refused_websocket_handshake_gets_status_and_is_closed(served):
     """Refusal by the HTTP parser, WebSocket parser or application leaves no connection open without an answer."""
     _, bound, port, _ = served()
     line = b"X-Long: " + 20_000 * b"a" + b"\r\n"
@@ -317,7 +317,7 @@ def test_a_handshake_that_cannot_be_taken_is_answered_and_closed(served):
     assert bound.open("127.0.0.1") == 0
 
 
-def test_a_refused_upload_gets_its_answer_though_it_sends_everything_first(served):
+def test_refused_upload_gets_response_after_sending_whole_body(served):
     _, _, port, _ = served(model_bytes=2**20)
     size = 24 * 2**20
     head = f"PUT /v1/models/a/versions HTTP/1.1\r\nHost: localhost\r\nContent-Length: {size}\r\n\r\n".encode()
@@ -328,7 +328,7 @@ def test_a_refused_upload_gets_its_answer_though_it_sends_everything_first(serve
     assert answer(tcp(port), chunked + chunks).startswith(b"HTTP/1.1 401 ")
 
 
-def test_a_refused_upload_that_goes_on_for_ever_is_cut_off(served):
+def test_refused_endless_upload_is_cut_off(served):
     _, _, port, _ = served(stall_s=0.3)
     with socket.create_connection(("127.0.0.1", port)) as client:
         client.settimeout(300)
@@ -339,7 +339,7 @@ def test_a_refused_upload_that_goes_on_for_ever_is_cut_off(served):
                 client.sendall(bytes(65536))
 
 
-def test_the_end_of_a_server_leaves_no_probe():
+def test_probe_listener_close_ends_connections_and_removes_socket():
     async def run() -> None:
         with tempfile.TemporaryDirectory(prefix="isp-") as folder:
             settings = ServiceSettings(paths={"data": Path(folder) / "d", "runtime": folder}, server={"probe_port": 0})
@@ -367,7 +367,7 @@ def test_the_end_of_a_server_leaves_no_probe():
     ],
 )
 @pytest.mark.parametrize("sent", [b"", b'{"path', 2_000_000 * b"a"], ids=["nothing", "a part", "much"])
-def test_a_client_that_leaves_while_it_sends_is_no_bug(served, caplog, method, path, more, sent):
+def test_client_disconnect_during_upload_is_not_logged_as_error(served, caplog, method, path, more, sent):
     caplog.set_level(logging.INFO)
     settings, bound, port, _ = served()
     key = settings.admin_key_file.read_text().strip()
@@ -385,7 +385,7 @@ def test_a_client_that_leaves_while_it_sends_is_no_bug(served, caplog, method, p
     assert "failed" not in outcomes
 
 
-def test_addresses_without_connections_are_forgotten_and_those_with_some_are_not():
+def test_address_bound_forgets_address_after_last_connection():
     from services.api.server import AddressBound
 
     bound = AddressBound(3)

@@ -73,7 +73,7 @@ def ctl(service, capsys):
     return call
 
 
-def test_tables_have_headings_and_aligned_columns(ctl):
+def test_ctl_tables_have_headings_and_aligned_columns(ctl):
     code, out, _ = ctl("streams")
     headings, line = out.splitlines()
     assert code == OK
@@ -85,7 +85,7 @@ def test_tables_have_headings_and_aligned_columns(ctl):
     assert ctl("whoami")[1].splitlines()[1].split()[0] == "admin"
 
 
-def test_the_key_is_found_where_the_flag_the_file_or_the_variable_says(ctl, service, tmp_path, monkeypatch):
+def test_ctl_reads_key_from_flag_then_key_file_then_variable(ctl, service, tmp_path, monkeypatch):
     made = service.make_key("other", "viewer")
     (tmp_path / "other.key").write_text(f"{made.key}\n")
     assert "other" in ctl("whoami", "--key-file", str(tmp_path / "other.key"))[1]
@@ -114,7 +114,7 @@ DELETIONS = [
 
 
 @pytest.mark.parametrize(("what", "named", "left"), DELETIONS, ids=[what[0] for what, _, _ in DELETIONS])
-def test_nothing_is_deleted_unasked(ctl, service, tmp_path, monkeypatch, what, named, left):
+def test_ctl_delete_asks_for_confirmation(ctl, service, tmp_path, monkeypatch, what, named, left):
     uploaded(service, tmp_path)
     code, out, err = ctl("delete", *what)  # no terminal to ask on
     assert code == BAD_INPUT and "--yes" in err and named in err and left(service)
@@ -136,7 +136,7 @@ class Terminal(io.StringIO):
 
 
 @pytest.mark.slow
-def test_yes_asks_nobody(ctl, service):
+def test_ctl_delete_with_yes_does_not_ask(ctl, service):
     assert ctl("delete", "stream", "theatre-1", "--yes")[0] == OK
     assert service.streams() == []
     for missing in (("replay", 16 * "0"), ("snapshot", "theatre-1", 16 * "0"), ("version", "liver", "7")):
@@ -144,7 +144,7 @@ def test_yes_asks_nobody(ctl, service):
 
 
 @pytest.mark.slow
-def test_keys_from_a_shell(ctl, service):
+def test_ctl_keys_add_list_and_revoke(ctl, service):
     code, token, _ = ctl("keys", "add", "wall", "--expires-days", "3", "--stream", "theatre-1")
     assert code == OK
     with Client(service.url, token) as wall:
@@ -161,7 +161,7 @@ def test_keys_from_a_shell(ctl, service):
     assert ctl("keys", "add", "wall", "--expires-days", "nan")[0] == BAD_INPUT
 
 
-def test_the_audit_log_from_a_shell(ctl, service):
+def test_ctl_audit_filters_and_formats_entries(ctl, service):
     for number in range(3):
         service.revoke_key(service.make_key(f"key-{number}", "viewer").id)
     code, out, _ = ctl("audit", "--event", "key.create", "--count", "2")
@@ -182,7 +182,7 @@ def test_the_audit_log_from_a_shell(ctl, service):
     assert ctl("audit", "--since", "soon")[0] == BAD_INPUT
 
 
-def test_the_audit_log_is_followed(ctl, service, monkeypatch, capsys):
+def test_ctl_audit_follow_prints_new_entries_once(ctl, service, monkeypatch, capsys):
     class Enough(Exception):
         """The test has seen what it waits for."""
 
@@ -203,7 +203,7 @@ def test_the_audit_log_is_followed(ctl, service, monkeypatch, capsys):
     assert [next(name for name in ("old", "new-1", "new-2", "new-3") if name in line) for line in lines] == ["old", "new-1", "new-2", "new-3"]  # fmt: skip
 
 
-def test_watch_and_health(ctl):
+def test_ctl_watch_and_health_show_failing_check_and_streams(ctl):
     code, out, _ = ctl("watch", "--looks", "2", "--every", "0.2")
     assert code == OK and out.count("theatre-1") == 4, (
         "a line for the check that is not well, and one for the stream, twice"
@@ -216,7 +216,7 @@ def test_watch_and_health(ctl):
     assert json.loads(ctl("health", "--json")[1])["checks"]["camera"]["ok"] is False
 
 
-def test_watch_survives_a_server_that_does_not_answer_for_a_while(service, monkeypatch, capsys):
+def test_ctl_watch_continues_after_failed_poll(service, monkeypatch, capsys):
     real, looks = ctl_module._status, 0
 
     def sometimes(client, stream):
@@ -232,16 +232,16 @@ def test_watch_survives_a_server_that_does_not_answer_for_a_while(service, monke
     assert out.count("STREAM ") == 2 and out.count("no answer since the last look") == 1
 
 
-def test_the_client_says_when_a_server_is_not_ready(service, monkeypatch):
+def test_client_ready_returns_degraded_status(service, monkeypatch):
     assert service.ready().status == "degraded"
 
 
 @pytest.mark.parametrize(("text", "ago"), [("90s", 90), ("30m", 1800), ("2h", 7200), ("7d", 604800)])
-def test_a_span_is_that_long_ago(text, ago):
+def test_moment_parses_span_as_time_ago(text, ago):
     assert abs((datetime.now(UTC) - timedelta(seconds=ago)) - moment(text)) < timedelta(seconds=5)
 
 
-def test_a_time_without_a_zone_is_this_machines():
+def test_moment_reads_time_without_zone_as_local():
     assert moment("2026-11-23T20:30:00+01:00") == datetime(2026, 11, 23, 19, 30, tzinfo=UTC)
     assert moment("2026-11-23T20:30:00") == datetime(2026, 11, 23, 20, 30).astimezone(UTC)
     assert moment(None) is None
@@ -254,13 +254,13 @@ def test_a_time_without_a_zone_is_this_machines():
     "processes",
     [{}, {"engine": {}}, {"engine": {"figures": None}}, {"engine": {"figures": {"picture": 3}, "restarts": "many"}}, {"capture": {"rate_hz": "fast"}}],
 )  # fmt: skip
-def test_a_stream_that_tells_little_is_a_row(processes):
+def test_stream_row_handles_missing_or_malformed_figures(processes):
     view = StreamView(name="a", source="b", show="live", device="cpu", options={}, state="stopped", processes=processes)
     row = stream_row(view)
     assert row["name"] == "a" and row["age_ms"] is None and row["capture_hz"] is None
 
 
-def test_cells_of_a_table_stay_on_one_line_and_steer_no_terminal():
+def test_table_cells_are_single_line_without_control_characters():
     lines = table(
         {"a": "A", "b.c": "B", "d": "D"}, [{"a": "x\x1b[2J\ny", "b": {"c": 70 * "z"}, "d": None}, {"a": 1, "b": 2}]
     )

@@ -45,7 +45,7 @@ def until(condition):
     raise AssertionError("it did not happen")
 
 
-def test_pictures_by_websocket(watched, display):
+def test_display_websocket_sends_header_and_jpeg_per_picture(watched, display):
     with watched.client.websocket_connect(f"{SOCKET}?kind=raw&quality=60&ticket={ticket(watched, SOCKET)}") as socket:
         message = socket.receive_bytes()
         length = struct.unpack(">I", message[:4])[0]
@@ -60,13 +60,13 @@ def test_pictures_by_websocket(watched, display):
     until(lambda: display.open == 0)
 
 
-def test_a_key_in_the_header_is_taken_too(watched):
+def test_display_websocket_accepts_key_in_header(watched):
     with watched.client.websocket_connect(SOCKET, headers=watched.headers("viewer")) as socket:
         assert socket.receive_bytes()
 
 
 @pytest.mark.parametrize("query", ["", "?ticket=", "?ticket=x", "?ticket=a&ticket=b"])
-def test_no_pictures_without_a_ticket(watched, display, query):
+def test_display_and_mjpeg_return_401_without_valid_ticket(watched, display, query):
     with pytest.raises(WebSocketDenialResponse) as refused, watched.client.websocket_connect(SOCKET + query):
         pass
     assert refused.value.status_code == 401
@@ -89,7 +89,7 @@ def test_no_pictures_without_a_ticket(watched, display, query):
         ("?kind=everything", "kind"),
     ],
 )
-def test_parameters_are_checked_on_both_ways_to_watch(watched, display, query, said):
+def test_display_and_mjpeg_return_422_for_bad_parameters(watched, display, query, said):
     over_http = watched.ask("GET", MJPEG + query)
     refused_socket = pytest.raises(WebSocketDenialResponse)
     with refused_socket as refused, watched.client.websocket_connect(SOCKET + query, headers=watched.headers()):
@@ -99,7 +99,7 @@ def test_parameters_are_checked_on_both_ways_to_watch(watched, display, query, s
     assert display.asked == []
 
 
-def test_a_ticket_is_for_one_use_and_one_path(watched):
+def test_ticket_is_valid_for_one_use_and_one_path(watched):
     used = ticket(watched, MJPEG)
     assert watched.client.get(f"{MJPEG}?ticket={used}").status_code == 200
     assert watched.client.get(f"{MJPEG}?ticket={used}").status_code == 401
@@ -108,7 +108,7 @@ def test_a_ticket_is_for_one_use_and_one_path(watched):
     assert watched.client.get(f"/v1/streams?ticket={other}").status_code == 401, "only displays take tickets"
 
 
-def test_pictures_as_mjpeg(watched, display):
+def test_mjpeg_sends_one_part_per_picture(watched, display):
     answer = watched.ask("GET", MJPEG, "viewer")
     assert answer.headers["content-type"] == "multipart/x-mixed-replace; boundary=picture"
     parts = answer.content.split(b"--picture\r\n")[1:]
@@ -117,7 +117,7 @@ def test_pictures_as_mjpeg(watched, display):
     assert display.open == 0
 
 
-def test_a_stream_that_is_not_there(watched):
+def test_display_and_mjpeg_return_404_for_unknown_stream(watched):
     assert watched.ask("GET", "/v1/streams/other/mjpeg").status_code == 404
     with (
         pytest.raises(WebSocketDenialResponse) as refused,
@@ -129,7 +129,7 @@ def test_a_stream_that_is_not_there(watched):
     assert watched.ask("GET", f"{MJPEG}?quality=100").status_code == 422
 
 
-def test_who_leaves_costs_nothing_more(new_plane):
+def test_display_subscription_ends_when_viewer_disconnects(new_plane):
     display = FakeDisplay()
     plane = new_plane(fake_parts(display=display))
     plane.ask("POST", "/v1/streams", json={"name": "endoscope", "source": "synthetic:"})
@@ -140,7 +140,7 @@ def test_who_leaves_costs_nothing_more(new_plane):
     until(lambda: 'intrasplat_viewers{transport="websocket"} 0.0' in plane.ask("GET", "/metrics").text)
 
 
-def test_as_many_viewers_as_may_be(new_plane):
+def test_mjpeg_returns_503_over_viewer_limit(new_plane):
     plane = new_plane(fake_parts(display=FakeDisplay()), limits={"viewers": 1})
     plane.ask("POST", "/v1/streams", json={"name": "endoscope", "source": "synthetic:"})
     with plane.client.websocket_connect(SOCKET, headers=plane.headers()) as socket:
@@ -148,7 +148,7 @@ def test_as_many_viewers_as_may_be(new_plane):
         assert plane.ask("GET", MJPEG).status_code == 503
 
 
-def test_displays_end_when_the_server_drains(new_plane):
+def test_display_websocket_closes_when_server_drains(new_plane):
     plane = new_plane(fake_parts(display=FakeDisplay()))
     plane.ask("POST", "/v1/streams", json={"name": "endoscope", "source": "synthetic:"})
     with plane.client.websocket_connect(SOCKET, headers=plane.headers()) as socket:
@@ -159,7 +159,7 @@ def test_displays_end_when_the_server_drains(new_plane):
                 socket.receive_bytes()
 
 
-def test_a_viewer_that_takes_nothing_is_dropped(new_plane):
+def test_stalled_mjpeg_viewer_is_dropped_and_counted(new_plane):
     display = FakeDisplay()
     plane = new_plane(fake_parts(display=display), limits={"viewer_stall_s": 0.05})
     plane.ask("POST", "/v1/streams", json={"name": "endoscope", "source": "synthetic:"})
@@ -218,7 +218,7 @@ def end_of(socket) -> int:
 
 @pytest.mark.parametrize("how", ["by the API", "by the command"])
 @pytest.mark.parametrize("by_ticket", [True, False])
-def test_a_revoked_key_ends_the_pictures_that_it_had_open(endless, how, by_ticket):
+def test_revoking_key_closes_its_open_display_websocket(endless, how, by_ticket):
     headers = {} if by_ticket else endless.headers("viewer")
     query = f"?ticket={ticket(endless, SOCKET)}" if by_ticket else ""
     with (
@@ -233,7 +233,7 @@ def test_a_revoked_key_ends_the_pictures_that_it_had_open(endless, how, by_ticke
     assert 'intrasplat_viewers_dropped_total{reason="not admitted"} 1.0' in endless.ask("GET", "/metrics").text
 
 
-def test_a_revoked_key_ends_mjpeg(endless):
+def test_revoking_key_ends_open_mjpeg(endless):
     by = threading.Timer(0.2, revoke, (endless, "by the command"))
     by.start()
     assert endless.ask("GET", MJPEG, "viewer").content.startswith(b"--picture")
@@ -241,7 +241,7 @@ def test_a_revoked_key_ends_mjpeg(endless):
     assert endless.parts.display.open == 0
 
 
-def test_the_token_of_a_person_that_expires_ends_the_pictures(endless):
+def test_expired_oidc_token_closes_open_display_websocket(endless):
     person = Caller("somebody", "oidc-1", Role.VIEWER, federated=True, expires_at=time.time() + 0.5)
     open_end = Caller("somebody", "oidc-2", Role.VIEWER, federated=True)
     tickets = [endless.control.tickets.give(each, SOCKET) for each in (person, open_end)]
@@ -256,7 +256,7 @@ def test_the_token_of_a_person_that_expires_ends_the_pictures(endless):
         pass
 
 
-def test_keys_that_cannot_be_read_end_no_pictures(endless):
+def test_damaged_key_file_does_not_close_open_display_websocket(endless):
     path = endless.control.settings.data_dir / KEYS_FILE
     kept = path.read_bytes()
     with endless.client.websocket_connect(SOCKET, headers=endless.headers("viewer")) as socket:
@@ -269,7 +269,7 @@ def test_keys_that_cannot_be_read_end_no_pictures(endless):
 @pytest.mark.parametrize(
     "change", [{"streams": ["another"]}, {"streams": ["endoscope", "another"]}, {"role": "viewer"}, {"expires_at": "2020-01-01T00:00:00+00:00"}]
 )  # fmt: skip
-def test_a_key_that_was_changed_admits_an_open_connection_no_more(plane, change):
+def test_still_valid_is_false_after_key_entry_changed(plane, change):
     """A key whose role, streams or expiry are changed in the file of the keys must be presented again."""
     keys = plane.control.keys
     key = next(key for key in keys.all() if key.role is Role.OPERATOR)

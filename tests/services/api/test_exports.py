@@ -69,7 +69,7 @@ def plane(new_plane):
     return plane
 
 
-def test_a_snapshot_is_kept_as_a_file(plane):
+def test_post_snapshot_creates_listed_snapshot_and_audit_entry(plane):
     answer = plane.ask("POST", f"{STREAM}/snapshots", "operator", json={})
     assert answer.status_code == 201 and answer.headers["Location"] == f"{STREAM}/snapshots/{ID}"
     assert (answer.json()["id"], answer.json()["version"], answer.json()["pause_ms"]) == (ID, None, 0.4)
@@ -79,13 +79,13 @@ def test_a_snapshot_is_kept_as_a_file(plane):
 
 
 @pytest.mark.slow
-def test_a_snapshot_becomes_a_version(plane):
+def test_post_snapshot_with_model_returns_model_version(plane):
     answer = plane.ask("POST", f"{STREAM}/snapshots", "operator", json={"model": "liver"})
     assert answer.status_code == 201 and answer.headers["Location"] == "/v1/models/liver/versions/4"
     assert answer.json()["id"] is None and answer.json()["version"]["version"] == 4
 
 
-def test_a_request_that_is_sent_again_is_done_once(plane):
+def test_post_snapshot_with_same_idempotency_key_is_done_once(plane):
     def ask(key, role="operator", **body):
         return plane.ask("POST", f"{STREAM}/snapshots", role, json=body, headers={"Idempotency-Key": key})
 
@@ -101,7 +101,7 @@ def test_a_request_that_is_sent_again_is_done_once(plane):
     assert ask("take 3").status_code == 201
 
 
-def test_what_makes_no_sense_is_refused(plane):
+def test_snapshot_routes_refuse_invalid_body_unknown_stream_and_id(plane):
     for body in ({"model": "No Name"}, {"name": "liver"}):
         assert plane.ask("POST", f"{STREAM}/snapshots", json=body).status_code == 422
     assert plane.ask("POST", "/v1/streams/nobody/snapshots", json={}).status_code == 404
@@ -112,7 +112,7 @@ def test_what_makes_no_sense_is_refused(plane):
     assert plane.events()[-1] == ("snapshot.take", "endoscope", "refused")
 
 
-def test_only_an_administrator_deletes(plane):
+def test_only_admin_deletes_snapshots(plane):
     assert plane.ask("DELETE", f"{STREAM}/snapshots/{ID}", "operator").status_code == 403
     assert plane.ask("DELETE", f"{STREAM}/snapshots/{ID}").status_code == 204
     assert plane.events()[-1] == ("snapshot.delete", f"endoscope/{ID}", "done")
@@ -125,7 +125,7 @@ def test_only_an_administrator_deletes(plane):
         (f"{STREAM}/snapshots/{ID}/exports/glb?time_s=0.5", f"endoscope-{ID}.glb"),
     ],
 )
-def test_an_export_is_a_file_with_its_digest(plane, path, name):
+def test_export_returns_file_with_content_digest(plane, path, name):
     answer = plane.ask("GET", path, "operator")
     assert answer.status_code == 200 and answer.content == DATA
     headers = answer.headers
@@ -137,7 +137,7 @@ def test_an_export_is_a_file_with_its_digest(plane, path, name):
     assert plane.events()[-1][0] in ("model.export", "snapshot.export") and plane.events()[-1][2] == "done"
 
 
-def test_a_model_is_rendered_with_the_options_of_the_command_line(plane):
+def test_render_route_passes_view_time_and_options(plane):
     options = {"renderer": "stochastic", "samples": 4, "order": "pixel", "seed": 3, "outputs": ["image", "depth"]}
     wanted = {"format": "png", "view": "orbit", "time_s": 0.5, "options": options}
     answer = plane.ask("POST", "/v1/models/liver/versions/3/render", "operator", json=wanted)
@@ -151,7 +151,7 @@ def test_a_model_is_rendered_with_the_options_of_the_command_line(plane):
 
 
 @pytest.mark.parametrize("output", [*STANDARD, *OUTPUTS])
-def test_every_output_can_be_asked_for(plane, output):
+def test_render_route_accepts_outputs_of_chosen_renderer_only(plane, output):
     path, options = "/v1/models/liver/versions/3/render", {"outputs": [output]}
     assert plane.ask("POST", path, json={"options": options}).status_code == 200
     assert plane.parts.exports.wishes[-1].options.outputs == (output,)
@@ -173,7 +173,7 @@ def test_every_output_can_be_asked_for(plane, output):
         ({"view": "/etc/passwd"}, "recorded"),
     ],
 )
-def test_a_rendering_that_makes_no_sense_is_refused(plane, wrong, message):
+def test_render_route_returns_422_for_invalid_options(plane, wrong, message):
     answer = plane.ask("POST", "/v1/models/liver/versions/3/render", json=wrong)
     assert answer.status_code == 422 and message in answer.text
     assert not plane.parts.exports.wishes
@@ -183,19 +183,19 @@ def test_a_rendering_that_makes_no_sense_is_refused(plane, wrong, message):
     "wrong",
     ["obj", "glb?time_s=nan", "ply?times=3", "ply-sequence?time_s=1", "ply-sequence?times=5000", "isplat?time_s=1"],
 )
-def test_an_export_that_makes_no_sense_is_refused(plane, wrong):
+def test_export_route_returns_422_for_invalid_format_or_time(plane, wrong):
     answer = plane.ask("GET", f"/v1/models/liver/versions/3/exports/{wrong}")
     assert answer.status_code == 422 and answer.headers["Content-Type"] == "application/problem+json"
     assert not plane.parts.exports.asked
 
 
-def test_what_leaves_the_service_is_not_for_viewers(plane):
+def test_viewers_get_403_for_exports_renders_and_snapshots(plane):
     assert plane.ask("GET", "/v1/models/liver/versions/3/exports/ply", "viewer").status_code == 403
     assert plane.ask("POST", "/v1/models/liver/versions/3/render", "viewer", json={}).status_code == 403
     assert plane.ask("POST", f"{STREAM}/snapshots", "viewer", json={}).status_code == 403
 
 
-def test_without_the_parts_it_is_said(new_plane):
+def test_snapshots_and_exports_return_503_without_their_parts(new_plane):
     plane = new_plane()
     assert plane.ask("GET", f"{STREAM}/snapshots").status_code == 503
     assert plane.ask("GET", "/v1/models/liver/versions/3/exports/ply").status_code == 503

@@ -19,7 +19,7 @@ def knows(host: str, /, **server: object) -> bool:
 
 
 @pytest.mark.parametrize("host", ["localhost", "localhost:8000", "127.0.0.1:8000", "[::1]:8000", "[::1]", "10.0.0.4"])
-def test_addresses_and_localhost_are_always_known(host):
+def test_known_hosts_accepts_ip_addresses_and_localhost(host):
     assert knows(host) and knows(host, allowed_hosts=["room-1.example"])
 
 
@@ -28,11 +28,11 @@ def test_addresses_and_localhost_are_always_known(host):
     ["evil.example", "localhost.evil.example", "127.0.0.1.evil.example", "room-1.example.evil", "", "a b", "evil.example:",
      "evil.example:80:80", "user@localhost", "localhost/x", "[evil]", "*", "127.0.0.1, evil.example", "lоcalhost"],
 )  # fmt: skip
-def test_other_names_are_not(host):
+def test_known_hosts_rejects_unlisted_names(host):
     assert not knows(host) and not knows(host, allowed_hosts=["room-1.example", "*.hospital.example"])
 
 
-def test_names_are_listed_whole_or_by_what_is_below_them():
+def test_allowed_hosts_match_exact_names_and_subdomain_wildcards():
     listed = ["Room-1.example", "*.hospital.example"]
     for host in (
         "room-1.example",
@@ -46,19 +46,19 @@ def test_names_are_listed_whole_or_by_what_is_below_them():
     assert knows("theatre-pc", host="theatre-pc")
 
 
-def test_with_tls_the_certificate_says_the_names_unless_there_is_a_list():
+def test_tls_without_allowed_hosts_accepts_any_valid_host():
     tls = {"certfile": "/x", "keyfile": "/x"}
     assert knows("room-1.example", **tls) and not knows("a b", **tls)
     assert not knows("evil.example", **tls, allowed_hosts=["room-1.example"])
 
 
 @pytest.mark.parametrize("name", ["http://x", "x:80", "*", "a*b", "", ".x", "x/y", "[::1]", "*.*.x"])
-def test_what_is_no_name_is_no_setting(name):
+def test_allowed_hosts_setting_rejects_invalid_names(name):
     with pytest.raises(ValidationError, match="is no name of a host"):
         ServerSettings(allowed_hosts=[name])
 
 
-def test_a_page_of_another_name_gets_nothing(new_plane):
+def test_unknown_host_header_returns_421_on_all_routes(new_plane):
     plane = new_plane(server={"allowed_hosts": []})
     answer = plane.ask("GET", "/v1/streams", headers={"Host": "evil.example"})
     assert answer.status_code == 421 and "server.allowed_hosts" in answer.json()["detail"]
@@ -84,7 +84,7 @@ def test_a_page_of_another_name_gets_nothing(new_plane):
         ([b"LOCALHOST", b"localhost", b"localhost"], False),
     ],
 )
-def test_a_request_has_one_host(plane, kind, hosts, taken):
+def test_known_hosts_refuses_multiple_host_headers(plane, kind, hosts, taken):
     """A server before this one may have looked at the other of the two."""
     reached, sent = [], []
 
@@ -104,7 +104,7 @@ def test_a_request_has_one_host(plane, kind, hosts, taken):
         assert sent[0]["status"] == 421
 
 
-def test_a_handshake_for_a_path_that_there_is_not_is_404(plane):
+def test_websocket_handshake_for_unknown_path_returns_404(plane):
     for path in ("/v1/streams", "/zork"):
         with pytest.raises(WebSocketDenialResponse) as refused, plane.client.websocket_connect(path):
             pass

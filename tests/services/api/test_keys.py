@@ -18,7 +18,7 @@ from services.auth import keys as keys_module
 from services.auth.keys import Caller, KeyConflict, KeyStore, Role, Tickets, first_admin_key
 
 
-def test_only_the_digest_of_a_key_is_kept(tmp_path):
+def test_key_store_keeps_only_digest_of_key(tmp_path):
     store = KeyStore(tmp_path / "keys.json")
     key, token = store.create("console", Role.VIEWER)
     text = (tmp_path / "keys.json").read_text()
@@ -28,13 +28,13 @@ def test_only_the_digest_of_a_key_is_kept(tmp_path):
 
 
 @pytest.mark.parametrize("change", [str.upper, lambda t: t[:-1], lambda t: t + "x", lambda t: "x" + t, lambda t: ""])
-def test_what_is_nearly_a_key_is_none(tmp_path, change):
+def test_find_returns_none_for_altered_token(tmp_path, change):
     store = KeyStore(tmp_path / "keys.json")
     _, token = store.create("console", Role.VIEWER)
     assert store.find(change(token)) is None
 
 
-def test_two_keys_of_a_name_for_rotation(tmp_path):
+def test_key_store_allows_two_keys_per_name_with_same_role(tmp_path):
     store = KeyStore(tmp_path / "keys.json")
     first, old = store.create("console", Role.VIEWER)
     _, new = store.create("console", Role.VIEWER)
@@ -47,7 +47,7 @@ def test_two_keys_of_a_name_for_rotation(tmp_path):
         store.create("console", Role.OPERATOR)
 
 
-def test_another_process_changes_the_keys(tmp_path):
+def test_key_store_sees_changes_by_another_process(tmp_path):
     here, there = KeyStore(tmp_path / "keys.json"), KeyStore(tmp_path / "keys.json")
     key, token = there.create("console", Role.VIEWER)
     assert here.find(token) == key
@@ -56,7 +56,7 @@ def test_another_process_changes_the_keys(tmp_path):
     assert here.find(token) is None
 
 
-def test_only_changes_by_another_process_are_told(tmp_path):
+def test_key_store_watch_reports_only_changes_by_other_processes(tmp_path):
     here, there = KeyStore(tmp_path / "keys.json"), KeyStore(tmp_path / "keys.json")
     there.create("earlier", Role.VIEWER)
     changes = []
@@ -72,14 +72,14 @@ def test_only_changes_by_another_process_are_told(tmp_path):
     assert changes[2:] == [("key.create", "again")] and len(there.all()) == 2
 
 
-def test_the_last_administrator_stays(tmp_path):
+def test_last_admin_key_cannot_be_revoked(tmp_path):
     store = KeyStore(tmp_path / "keys.json")
     key, _ = store.create("admin", Role.ADMIN)
     with pytest.raises(KeyConflict, match="only administrator"):
         store.revoke(key.id)
 
 
-def test_the_first_key_is_made_once_or_taken_from_a_secret(tmp_path):
+def test_first_admin_key_is_created_once_or_read_from_file(tmp_path):
     store, file = KeyStore(tmp_path / "keys.json"), tmp_path / "admin.key"
     assert first_admin_key(store, file) and not first_admin_key(store, file)
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
@@ -94,7 +94,7 @@ def test_the_first_key_is_made_once_or_taken_from_a_secret(tmp_path):
         first_admin_key(KeyStore(tmp_path / "weak.json"), tmp_path / "weak")
 
 
-def test_a_ticket_is_good_once_for_one_path_and_for_a_while():
+def test_tickets_are_valid_once_for_one_path_until_expiry():
     now_s = [0.0]
     tickets = Tickets(30.0, clock=lambda: now_s[0])
     caller = Caller("console", "1", Role.VIEWER)
@@ -107,7 +107,7 @@ def test_a_ticket_is_good_once_for_one_path_and_for_a_while():
     assert tickets.use(late, "/v1/a") is None
 
 
-def test_tickets_that_nobody_uses_are_forgotten():
+def test_expired_unused_tickets_are_removed():
     now_s = [0.0]
     tickets = Tickets(30.0, clock=lambda: now_s[0])
     for _ in range(100):
@@ -117,7 +117,7 @@ def test_tickets_that_nobody_uses_are_forgotten():
     assert len(tickets._waiting) == 1
 
 
-def test_keys_over_the_api(plane):
+def test_keys_api_creates_lists_and_revokes_keys_with_audit_entries(plane):
     made = plane.ask("POST", "/v1/keys", json={"name": "theatre-1", "role": "operator"})
     assert made.status_code == 201
     token = made.json()["key"]
@@ -140,7 +140,7 @@ def test_keys_over_the_api(plane):
     assert token not in plane.control.audit.path.read_text()
 
 
-def test_a_ticket_dies_with_the_key_that_asked_for_it(plane):
+def test_ticket_is_invalid_after_its_key_is_revoked(plane):
     path = "/v1/streams/endoscope/mjpeg"
     ticket = plane.ask("POST", "/v1/tickets", "viewer", json={"path": path}).json()["ticket"]
     viewer = next(key["id"] for key in plane.ask("GET", "/v1/keys").json() if key["name"] == "test-viewer")
@@ -149,7 +149,7 @@ def test_a_ticket_dies_with_the_key_that_asked_for_it(plane):
     assert answer.status_code == 401 and "ticket" in answer.json()["detail"]
 
 
-def test_how_long_a_refusal_takes_does_not_depend_on_the_key(tmp_path, monkeypatch):
+def test_find_compares_every_token_by_compare_digest(tmp_path, monkeypatch):
     """Both are compared, and by `compare_digest`."""
     from services.auth import keys
 
@@ -182,7 +182,7 @@ def in_days(days: float) -> datetime:
     return datetime.now(UTC) + timedelta(days=days)
 
 
-def test_a_key_is_refused_from_its_expiry_on(tmp_path, clock):
+def test_find_returns_none_after_key_expiry(tmp_path, clock):
     store = KeyStore(tmp_path / "keys.json")
     key, token = store.create("wall", Role.VIEWER, expires_at=in_days(2))
     assert store.find(token) == key and store.expired(token) is None and store.get(key.id) == key
@@ -195,7 +195,7 @@ def test_a_key_is_refused_from_its_expiry_on(tmp_path, clock):
     assert store.expired(token[:-1] + ("a" if token[-1] != "a" else "b")) is None, "only its owner learns of it"
 
 
-def test_expired_keys_block_no_new_ones_and_count_as_no_administrator(tmp_path, clock):
+def test_expired_keys_do_not_count_as_name_or_admin_keys(tmp_path, clock):
     store = KeyStore(tmp_path / "keys.json")
     admin, _ = store.create("admin", Role.ADMIN)
     for _ in range(2):
@@ -218,17 +218,17 @@ def test_expired_keys_block_no_new_ones_and_count_as_no_administrator(tmp_path, 
         ({"streams": [f"s{n}" for n in range(101)]}, "1 to 100"),
     ],
 )
-def test_keys_that_cannot_be(tmp_path, wish, said):
+def test_create_raises_for_invalid_expiry_or_streams(tmp_path, wish, said):
     with pytest.raises(KeyConflict, match=said):
         KeyStore(tmp_path / "keys.json").create("wall", Role.VIEWER, **wish)
 
 
-def test_an_administrator_is_not_limited_to_streams(tmp_path):
+def test_create_raises_for_admin_key_limited_to_streams(tmp_path):
     with pytest.raises(KeyConflict, match="not limited to streams"):
         KeyStore(tmp_path / "keys.json").create("admin", Role.ADMIN, streams=["theatre-1"])
 
 
-def test_files_of_older_versions_are_read_and_older_versions_read_ours(tmp_path):
+def test_key_file_omits_unset_expiry_and_streams(tmp_path):
     file = tmp_path / "keys.json"
     _, token = KeyStore(file).create("console", Role.VIEWER)
     (kept,) = json.loads(file.read_text())["keys"]
@@ -240,7 +240,7 @@ def test_files_of_older_versions_are_read_and_older_versions_read_ours(tmp_path)
 @pytest.mark.parametrize(
     "change", [{"only_on_mondays": True}, {"expires_at": "soon"}, {"expires_at": "2099-01-01T00:00:00"}]
 )
-def test_a_limit_that_is_not_understood_is_no_key_without_it(tmp_path, change):
+def test_find_raises_for_key_entry_with_unknown_limit(tmp_path, change):
     file = tmp_path / "keys.json"
     _, token = KeyStore(file).create("console", Role.VIEWER)
     kept = json.loads(file.read_text())
@@ -250,7 +250,7 @@ def test_a_limit_that_is_not_understood_is_no_key_without_it(tmp_path, change):
         KeyStore(file).find(token)
 
 
-def test_the_last_use_is_kept_and_written_once_a_minute(tmp_path, monkeypatch):
+def test_last_use_of_keys_is_written_once_per_minute(tmp_path, monkeypatch):
     passed_s = [1000.0]
     monkeypatch.setattr(keys_module.time, "monotonic", lambda: passed_s[0])
     file, used = tmp_path / "keys.json", tmp_path / "keys.used.json"
@@ -278,7 +278,7 @@ def test_the_last_use_is_kept_and_written_once_a_minute(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("damage", ["", "{", "[]", "null"])
-def test_a_damaged_file_of_last_uses_costs_no_key(tmp_path, damage):
+def test_damaged_last_use_file_does_not_invalidate_keys(tmp_path, damage):
     file = tmp_path / "keys.json"
     key, token = KeyStore(file).create("console", Role.VIEWER)
     (tmp_path / "keys.used.json").write_text(damage)
@@ -290,7 +290,7 @@ def test_a_damaged_file_of_last_uses_costs_no_key(tmp_path, damage):
 
 
 @pytest.mark.parametrize("damage", ["", "{", "[]", "null", "[" * 5000, None])
-def test_while_the_file_of_the_keys_is_damaged_every_key_is_503_and_the_service_not_ready(plane, damage):
+def test_damaged_key_file_returns_503_and_service_is_not_ready(plane, damage):
     file = plane.control.settings.data_dir / "keys.json"
     whole = file.read_text()
     file.unlink()
@@ -310,7 +310,7 @@ def test_while_the_file_of_the_keys_is_damaged_every_key_is_503_and_the_service_
     assert plane.client.get("/readyz").status_code == 200
 
 
-def test_a_full_disk_refuses_no_request(tmp_path, monkeypatch, caplog):
+def test_save_used_logs_full_disk_and_keeps_keys_valid(tmp_path, monkeypatch, caplog):
     store = KeyStore(tmp_path / "keys.json")
     key, token = store.create("console", Role.VIEWER)
 
@@ -324,7 +324,7 @@ def test_a_full_disk_refuses_no_request(tmp_path, monkeypatch, caplog):
     assert "No space left" in caplog.text
 
 
-def test_expiry_and_last_use_over_the_api(plane, clock):
+def test_keys_api_reports_expiry_and_last_use(plane, clock):
     made = plane.ask("POST", "/v1/keys", json={"name": "wall", "role": "viewer", "expires_at": in_days(3).isoformat()})
     assert made.status_code == 201
     assert made.json()["expires_at"].endswith("+00:00") and not made.json()["expired"]
@@ -360,11 +360,11 @@ def test_expiry_and_last_use_over_the_api(plane, clock):
         {"last_used_at": "2999-01-01T00:00:00Z"},
     ],
 )
-def test_what_no_key_can_have_is_refused(plane, wish):
+def test_post_keys_returns_422_for_invalid_expiry_or_streams(plane, wish):
     assert plane.ask("POST", "/v1/keys", json={"name": "wall", "role": "viewer", **wish}).status_code == 422
 
 
-def test_a_ticket_does_not_outlast_its_key(plane, clock):
+def test_ticket_is_invalid_after_its_key_expires(plane, clock):
     made = plane.ask("POST", "/v1/keys", json={"name": "wall", "role": "viewer", "expires_at": in_days(1).isoformat()})
     path = "/v1/streams/endoscope/mjpeg"
     headers = {"Authorization": f"Bearer {made.json()['key']}"}
@@ -373,7 +373,7 @@ def test_a_ticket_does_not_outlast_its_key(plane, clock):
     assert plane.client.get(path, params={"ticket": ticket}).status_code == 401
 
 
-def test_open_connections_can_ask_whether_their_key_is_still_valid(plane, clock):
+def test_still_valid_is_false_after_key_expiry_or_revocation(plane, clock):
     made = plane.ask("POST", "/v1/keys", json={"name": "wall", "role": "viewer", "expires_at": in_days(1).isoformat()})
     caller = Caller("wall", made.json()["id"], Role.VIEWER)
     person = Caller("someone", "oidc-1", Role.VIEWER, federated=True)
@@ -405,7 +405,7 @@ def limited(new_plane):
 OPEN_TO_LIMITED_KEYS = {("GET", "/v1/streams"), ("POST", "/v1/streams"), ("POST", "/v1/tickets"), ("GET", "/v1/version"), ("GET", "/v1/me")}  # fmt: skip
 
 
-def test_a_limited_key_gets_nothing_but_its_streams(limited):
+def test_limited_key_gets_403_on_routes_beyond_its_streams(limited):
     """Every route there is: a new one is closed to limited keys unless it says otherwise."""
     plane, headers = limited
     looked_at = 0
@@ -425,7 +425,7 @@ def test_a_limited_key_gets_nothing_but_its_streams(limited):
     assert looked_at > 35
 
 
-def test_the_streams_of_a_limited_key(limited):
+def test_limited_key_lists_starts_and_creates_only_its_streams(limited):
     plane, headers = limited
 
     def ask(method, path, role="operator", **options):
@@ -447,7 +447,7 @@ def test_the_streams_of_a_limited_key(limited):
 
 
 @pytest.mark.parametrize("by_ticket", [True, False])
-def test_pictures_of_other_streams_are_kept_from_a_limited_key(limited, by_ticket):
+def test_limited_key_gets_403_for_pictures_of_other_streams(limited, by_ticket):
     plane, headers = limited
 
     def access(path):

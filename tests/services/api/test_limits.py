@@ -13,7 +13,7 @@ from services.api.state import MOST_BUCKETS, TokenBuckets
 from services.settings import LimitSettings
 
 
-def test_a_bucket_fills_with_its_rate():
+def test_token_bucket_refills_at_rate_up_to_its_size():
     now_s = [0.0]
     buckets = TokenBuckets(2.0, 4.0, clock=lambda: now_s[0])
     assert [buckets.wait_s("a") for _ in range(5)] == [0, 0, 0, 0, 0.5]
@@ -25,7 +25,7 @@ def test_a_bucket_fills_with_its_rate():
     assert [buckets.wait_s("a") for _ in range(5)] == [0, 0, 0, 0, 0.5], "it never holds more than its size"
 
 
-def test_a_caller_is_forgotten_after_twenty_thousand_others():
+def test_token_buckets_keep_20000_most_recent_callers():
     buckets = TokenBuckets(1.0, 1.0, clock=lambda: 0.0)
     for number in range(20_010):
         assert buckets.wait_s(str(number)) == 0
@@ -33,7 +33,7 @@ def test_a_caller_is_forgotten_after_twenty_thousand_others():
     assert buckets.wait_s("9") == 0
 
 
-def test_the_bucket_that_leaves_is_of_whom_nothing_was_heard_for_longest():
+def test_token_buckets_evict_least_recently_used_caller():
     buckets = TokenBuckets(1.0, 1.0, clock=lambda: 0.0)
     for number in range(MOST_BUCKETS):
         assert buckets.wait_s(f"{number}") == 0
@@ -54,11 +54,11 @@ def test_the_bucket_that_leaves_is_of_whom_nothing_was_heard_for_longest():
         (("testclient", 1), "testclient"),
     ],
 )
-def test_who_an_address_stands_for(client, network):
+def test_network_of_groups_ipv6_clients_by_64_prefix(client, network):
     assert network_of({"client": client}) == network
 
 
-def test_a_key_that_asks_too_often_waits(new_plane):
+def test_key_over_request_rate_gets_429(new_plane):
     plane = new_plane(limits={"requests_per_s": 0.05, "burst_s": 60})
     assert [plane.ask("GET", "/v1/version", "viewer").status_code for _ in range(4)] == [200, 200, 200, 429]
     refused = plane.ask("GET", "/v1/version", "viewer")
@@ -67,7 +67,7 @@ def test_a_key_that_asks_too_often_waits(new_plane):
     assert 'intrasplat_http_refused_total{reason="key rate"} 2.0' in plane.ask("GET", "/metrics").text
 
 
-def test_an_address_that_asks_too_often_waits(new_plane):
+def test_address_over_request_rate_gets_429(new_plane):
     plane = new_plane(limits={"address_requests_per_s": 0.05, "burst_s": 40})
     answers = [plane.client.get("/livez") for _ in range(3)]
     assert [answer.status_code for answer in answers] == [200, 200, 429]
@@ -75,7 +75,7 @@ def test_an_address_that_asks_too_often_waits(new_plane):
     assert "content-security-policy" in answers[2].headers
 
 
-def test_a_body_that_is_announced_too_long_is_not_read(plane):
+def test_body_over_size_limit_returns_413(plane):
     read = []
 
     def body():
@@ -93,12 +93,12 @@ def test_a_body_that_is_announced_too_long_is_not_read(plane):
 
 
 @pytest.mark.parametrize("content_type", ["text/plain", "application/xml", "", "multipart/form-data; boundary=x"])
-def test_another_content_type_is_415(plane, content_type):
+def test_wrong_content_type_returns_415(plane, content_type):
     answer = plane.ask("POST", "/v1/tickets", content=b'{"path": "/v1/x"}', headers={"Content-Type": content_type})
     assert (answer.status_code, answer.headers["content-type"]) == (415, PROBLEM_JSON)
 
 
-def test_a_compressed_body_is_415(plane):
+def test_compressed_body_returns_415(plane):
     headers = {"Content-Type": "application/json", "Content-Encoding": "gzip"}
     answer = plane.ask("POST", "/v1/tickets", content=gzip.compress(b'{"path": "/v1/x"}'), headers=headers)
     assert answer.status_code == 415 and "Content-Encoding is 'gzip'" in answer.json()["detail"]
@@ -117,14 +117,14 @@ def test_a_compressed_body_is_415(plane):
         (b"[" * 100_000, "too many lists and objects inside each other"),
     ],
 )
-def test_a_body_that_cannot_be_parsed_says_where_and_why(plane, body, detail):
+def test_unparseable_json_body_returns_400_with_position_and_cause(plane, body, detail):
     answer = plane.ask("POST", "/v1/tickets", content=body, headers={"Content-Type": "application/json"})
     assert (answer.status_code, answer.headers["content-type"]) == (400, PROBLEM_JSON)
     assert detail in answer.json()["detail"]
 
 
 @pytest.mark.parametrize("body", [b"{", b"[]", b"null", b'{"path": "\xff"}', b'{"path": 1e999}', b"[" * 100_000])
-def test_what_is_no_json_is_422_or_400(plane, body):
+def test_invalid_json_body_returns_400_or_422(plane, body):
     answer = plane.ask("POST", "/v1/tickets", content=body, headers={"Content-Type": "application/json"})
     assert answer.status_code in (400, 422) and answer.headers["content-type"] == PROBLEM_JSON
 
@@ -150,7 +150,7 @@ def bounded(messages, most_bytes=100, **limits):
     return asyncio.run(read())
 
 
-def test_bounded_bodies(monkeypatch):
+def test_bounded_body_raises_if_too_large_stalled_or_too_slow(monkeypatch):
     assert bounded([b"a" * 50, b"b" * 50]) == b"a" * 50 + b"b" * 50
     with pytest.raises(TooLarge):
         bounded([b"a" * 50, b"b" * 51])

@@ -22,7 +22,7 @@ def accepted(tmp_path):
             yield server, client
 
 
-def test_little_is_taken_for_a_peer_that_reads_nothing(accepted):
+def test_listener_send_buffer_is_small_if_peer_reads_nothing(accepted):
     server, _ = accepted
     server.setblocking(False)
     taken = 0
@@ -32,6 +32,6 @@ def test_little_is_taken_for_a_peer_that_reads_nothing(accepted):
     assert taken < 16 * MOST_UNSENT_BYTES, "the usual buffers take 4 MB"
 
 
-def test_nothing_waits_for_an_acknowledgement(accepted):
+def test_accepted_connections_have_tcp_nodelay(accepted):
     server, _ = accepted
     assert server.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY) == 1

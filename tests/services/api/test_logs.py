@@ -34,7 +34,7 @@ def loggers_as_they_were() -> Iterator[None]:
     ("stream", "form", "json"),
     [(Terminal, "auto", False), (io.StringIO, "auto", True), (Terminal, "json", True), (io.StringIO, "text", False)],
 )
-def test_a_terminal_gets_text_and_everything_else_json_unless_the_settings_say_which(
+def test_log_format_auto_is_text_on_terminal_and_json_elsewhere(
     monkeypatch: pytest.MonkeyPatch, stream: type[io.StringIO], form: str, json: bool
 ) -> None:
     monkeypatch.setattr(sys, "stderr", written := stream())
@@ -46,7 +46,7 @@ def test_a_terminal_gets_text_and_everything_else_json_unless_the_settings_say_w
     assert "a stream stopped" in written.getvalue() and "room-1" in written.getvalue()
 
 
-def test_text_hides_passwords_and_cannot_be_made_to_hold_a_second_line() -> None:
+def test_text_formatter_hides_passwords_and_newlines() -> None:
     record = logging.makeLogRecord(
         {"msg": "rtsp://user:secret@camera/\n12:00:00 info forged", "levelname": "INFO", FACTS: {"source": "a\nb"}}
     )
@@ -60,7 +60,7 @@ def test_text_hides_passwords_and_cannot_be_made_to_hold_a_second_line() -> None
     ("kind", "error", "is_logged"),
     [(ValueError, ValueError("broken"), True), (KeyboardInterrupt, KeyboardInterrupt(), True), (SystemExit, SystemExit(2), False), (ValueError, None, False)],
 )  # fmt: skip
-def test_errors_that_nothing_catches_are_logged_except_an_ordinary_end(
+def test_log_uncaught_logs_errors_except_system_exit(
     caplog: pytest.LogCaptureFixture, kind: type[BaseException], error: BaseException | None, is_logged: bool
 ) -> None:
     _log_uncaught(kind, error, None)
@@ -69,7 +69,7 @@ def test_errors_that_nothing_catches_are_logged_except_an_ordinary_end(
         assert caplog.records[0].exc_info is not None and caplog.records[0].exc_info[1] is error
 
 
-def test_threads_and_the_main_thread_log_what_nothing_catches(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_log_to_stderr_installs_exception_hooks_and_levels(monkeypatch: pytest.MonkeyPatch) -> None:
     logged: list[object] = []
     monkeypatch.setattr(sys, "excepthook", None)
     monkeypatch.setattr(threading, "excepthook", None)

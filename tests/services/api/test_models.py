@@ -32,14 +32,14 @@ def put(plane, body: bytes, role: str = "operator", **headers: str):
         (bytes(32), "?format=splat", "splat"),
     ],
 )
-def test_a_splat_file_is_converted_to_a_model(plane, start, query, kind):
+def test_uploaded_splat_file_is_converted_to_model(plane, start, query, kind):
     body = start + bytes(64)
     answer = plane.ask("PUT", VERSIONS + query, "operator", content=body, headers=digest_header(body))
     assert answer.status_code == 201 and answer.json()["name"] == f"liver-{kind}"
     assert ("model.upload", "liver", "done") in plane.events()
 
 
-def test_a_format_that_there_is_not_is_refused(plane):
+def test_model_upload_with_unknown_format_returns_422(plane):
     answer = plane.ask("PUT", f"{VERSIONS}?format=obj", "operator", content=b"v 0", headers=digest_header(b"v 0"))
     assert answer.status_code == 422 and not plane.parts.models.kept
 
@@ -53,7 +53,7 @@ def settled(plane, number: int) -> dict:
     raise AssertionError("the check did not end")
 
 
-def test_the_life_of_a_model(plane):
+def test_model_upload_activate_rollback_and_delete(plane):
     bodies = [b"GOOD" + bytes([n]) * 3_000_000 for n in range(2)]
     for number, body in enumerate(bodies, start=1):
         answer = put(plane, body)
@@ -94,7 +94,7 @@ def test_the_life_of_a_model(plane):
     ]
 
 
-def test_a_bad_model_is_rejected_with_a_reason(plane):
+def test_bad_model_is_rejected_with_reason(plane):
     assert put(plane, b"BAD").json()["state"] == "uploaded"
     version = settled(plane, 1)
     assert (version["state"], version["reason"]) == ("rejected", "it is not good")
@@ -114,14 +114,14 @@ def test_a_bad_model_is_rejected_with_a_reason(plane):
         ("sha-256=:47DEQpj8HBSa+/TImW+5JCeuQeRkm5NMpJWZG3hSuFU=:", 422),
     ],
 )
-def test_another_digest_is_refused_and_nothing_is_kept(plane, header, status):
+def test_model_upload_with_wrong_digest_is_refused_and_not_kept(plane, header, status):
     answer = put(plane, b"GOOD", **{"Content-Digest": header})
     assert (answer.status_code, answer.headers["content-type"]) == (status, PROBLEM_JSON)
     assert plane.parts.models.kept == {} and list(plane.control.uploads_dir.iterdir()) == []
 
 
 @pytest.mark.slow
-def test_refused_uploads(new_plane):
+def test_model_upload_refuses_wrong_body_size_type_role_and_name(new_plane):
     plane = new_plane(limits={"model_bytes": 2**20})
     assert put(plane, b"").status_code == 422
     assert put(plane, b"GOOD", **{"Content-Type": "text/html"}).status_code == 415
@@ -140,7 +140,7 @@ def test_refused_uploads(new_plane):
     assert plane.parts.models.kept == {} and list(plane.control.uploads_dir.iterdir()) == []
 
 
-def test_too_many_uploads_and_a_full_disk(plane, monkeypatch):
+def test_model_upload_returns_507_if_disk_full_and_429_if_busy(plane, monkeypatch):
     monkeypatch.setattr("services.api.uploads.SPARE_BYTES", 2**60)
     full = put(plane, b"GOOD")
     assert (full.status_code, full.json()["title"]) == (507, "Insufficient storage")
@@ -150,14 +150,14 @@ def test_too_many_uploads_and_a_full_disk(plane, monkeypatch):
     assert busy.status_code == 429 and int(busy.headers["retry-after"]) >= 1
 
 
-def test_what_is_not_there(plane):
+def test_version_routes_return_404_if_missing_and_422_for_bad_number(plane):
     for path in (VERSIONS, f"{VERSIONS}/1"):
         assert plane.ask("GET", path).status_code == 404
     assert plane.ask("GET", f"{VERSIONS}/0").status_code == 422
     assert plane.ask("GET", f"{VERSIONS}/{2**70}").status_code == 422
 
 
-def test_a_bug_in_the_registry_is_500_without_its_text(plane, monkeypatch, caplog):
+def test_registry_exception_returns_500_without_its_text(plane, monkeypatch, caplog):
     def broken():
         raise RuntimeError("secret of the registry")
 
@@ -170,7 +170,7 @@ def test_a_bug_in_the_registry_is_500_without_its_text(plane, monkeypatch, caplo
     assert "secret of the registry" in caplog.text
 
 
-def test_what_a_killed_server_had_taken_in_is_removed(new_plane, tmp_path):
+def test_startup_removes_uploads_of_killed_server(new_plane, tmp_path):
     (tmp_path / "data0" / "uploads").mkdir(parents=True)
     (tmp_path / "data0" / "uploads" / "upload-x").write_bytes(b"half")
     plane = new_plane()

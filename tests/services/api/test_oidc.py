@@ -118,7 +118,7 @@ def ask(plane: Any, token: str, path: str = "/v1/version", method: str = "GET", 
     return plane.client.request(method, path, headers={"Authorization": f"Bearer {token}"}, **options)
 
 
-def test_a_person_is_let_in_with_the_role_of_the_claim(plane, issuer):
+def test_token_grants_highest_role_of_its_claim(plane, issuer):
     assert ask(plane, issuer.token()).status_code == 200
     assert ask(plane, issuer.token(), "/v1/audit").status_code == 403
     assert ask(plane, issuer.token(roles=["x", "theatre", "it"]), "/v1/audit").status_code == 200, "the highest counts"
@@ -127,7 +127,7 @@ def test_a_person_is_let_in_with_the_role_of_the_claim(plane, issuer):
     assert len(issuer.asked) == 2, "the keys are kept"
 
 
-def test_who_it_was_is_in_the_audit_log(plane, issuer):
+def test_audit_log_names_oidc_subject(plane, issuer):
     ask(plane, issuer.token(roles="it"), "/v1/keys", "POST", json={"name": "room", "role": "viewer"})
     ask(plane, issuer.token(roles="it", sub='a "name"\n'), "/v1/keys", "POST", json={"name": "room", "role": "viewer"})
     two, one = search(plane.control.audit.path, Wanted(), 2).entries
@@ -135,7 +135,7 @@ def test_who_it_was_is_in_the_audit_log(plane, issuer):
     assert two.actor.startswith("subject-") and two.actor != one.actor
 
 
-def test_a_person_gets_tickets(plane, issuer):
+def test_token_holder_gets_single_use_ticket(plane, issuer):
     path = "/v1/streams/theatre/mjpeg"
     given = ask(plane, issuer.token(), "/v1/tickets", "POST", json={"path": path})
     assert plane.client.get(f"{path}?ticket={given.json()['ticket']}").status_code == 404, (
@@ -152,13 +152,13 @@ def test_a_person_gets_tickets(plane, issuer):
     ],
     ids=str,
 )  # fmt: skip
-def test_a_token_for_others_or_of_another_time_is_refused(plane, issuer, claims):
+def test_token_with_wrong_claims_or_times_returns_401(plane, issuer, claims):
     answer = ask(plane, issuer.token(**claims))
     assert (answer.status_code, answer.headers["content-type"]) == (401, PROBLEM_JSON)
     assert "WWW-Authenticate" in answer.headers
 
 
-def test_clocks_may_differ_a_little(plane, issuer):
+def test_token_expiry_allows_clock_skew(plane, issuer):
     assert ask(plane, issuer.token(exp=int(time.time()) - 10)).status_code == 200
     assert ask(plane, issuer.token(exp=int(time.time()) - 60)).status_code == 401
 
@@ -169,7 +169,7 @@ def forged(head: dict[str, Any], claims: dict[str, Any], secret: bytes | None) -
     return b".".join([*parts, base64.urlsafe_b64encode(signature).rstrip(b"=")]).decode()
 
 
-def test_forged_signatures_are_refused(plane, issuer):
+def test_tokens_with_forged_signature_return_401(plane, issuer):
     public = issuer.keys["one"].public_key()
     pem = public.public_bytes(serialization.Encoding.PEM, serialization.PublicFormat.SubjectPublicKeyInfo)
     other = rsa.generate_private_key(public_exponent=65537, key_size=2048)
@@ -196,12 +196,12 @@ def test_forged_signatures_are_refused(plane, issuer):
 
 
 @pytest.mark.parametrize("roles", [None, [], ["guest"], "guest", 7, {"it": True}, [["it"]], [None]])
-def test_without_a_role_here_it_is_forbidden(plane, issuer, roles):
+def test_token_without_known_role_returns_403(plane, issuer, roles):
     answer = ask(plane, issuer.token(roles=roles))
     assert answer.status_code == 403 and "auth.oidc.roles" in answer.json()["detail"]
 
 
-def test_claims_may_be_nested_and_names_readable(new_plane, issuer):
+def test_role_claim_may_be_nested_and_name_claim_is_actor(new_plane, issuer):
     oidc = {"issuer": issuer.url, "audience": "intrasplat", "roles": ROLES, "role_claim": "realm_access.roles"}
     plane = new_plane(auth={"oidc": {**oidc, "name_claim": "preferred_username"}})
     token = issuer.token(roles=None, realm_access={"roles": ["it"]}, preferred_username="jane.doe")
@@ -209,7 +209,7 @@ def test_claims_may_be_nested_and_names_readable(new_plane, issuer):
     assert search(plane.control.audit.path, Wanted(), 1).entries[0].actor.startswith("jane.doe (oidc-")
 
 
-def test_a_new_key_is_fetched_and_one_that_is_gone_is_not_taken(plane, issuer, monkeypatch):
+def test_issuer_key_rotation_adds_new_and_drops_old_key(plane, issuer, monkeypatch):
     old = issuer.token()
     assert ask(plane, old).status_code == 200
     issuer.keys = {"two": ec.generate_private_key(ec.SECP256R1())}
@@ -220,7 +220,7 @@ def test_a_new_key_is_fetched_and_one_that_is_gone_is_not_taken(plane, issuer, m
     assert ask(plane, issuer.token(None, "ES256", issuer.keys["two"])).status_code == 200, "the only one needs no id"
 
 
-def test_keys_that_name_no_algorithm_are_taken_for_what_the_settings_allow(new_plane, issuer):
+def test_issuer_keys_without_alg_accept_algorithms_of_settings(new_plane, issuer):
     key = {
         name: value for name, value in issuer.documents()["/realms/hospital/certs"]["keys"][0].items() if name != "alg"
     }
@@ -232,7 +232,7 @@ def test_keys_that_name_no_algorithm_are_taken_for_what_the_settings_allow(new_p
     assert ask(plane, issuer.token(algorithm="ES256", key=ec.generate_private_key(ec.SECP256R1()))).status_code == 401
 
 
-def test_unknown_keys_do_not_make_the_server_ask_again_and_again(plane, issuer):
+def test_unknown_key_ids_do_not_refetch_issuer_keys(plane, issuer):
     other = rsa.generate_private_key(public_exponent=65537, key_size=2048)
     for number in range(20):
         assert ask(plane, issuer.token(f"k{number}", key=other)).status_code == 401
@@ -243,7 +243,7 @@ def test_unknown_keys_do_not_make_the_server_ask_again_and_again(plane, issuer):
     "answer", [{"keys": []}, {"keys": "x"}, [1], "x", {"issuer": "http://other"}, {"keys": [{"kty": "RSA"}]}]
 )
 @pytest.mark.parametrize("direct", [False, True])
-def test_an_issuer_that_answers_nonsense_makes_503_and_keys_go_on(new_plane, issuer, answer, direct, caplog):
+def test_invalid_issuer_response_returns_503_and_api_keys_still_work(new_plane, issuer, answer, direct, caplog):
     issuer.answer = answer
     oidc = {"issuer": issuer.url, "audience": "intrasplat", "roles": ROLES}
     plane = new_plane(auth={"oidc": {**oidc, "keys_url": f"{issuer.url}/certs" if direct else None}})
@@ -252,7 +252,7 @@ def test_an_issuer_that_answers_nonsense_makes_503_and_keys_go_on(new_plane, iss
     assert plane.ask("GET", "/v1/version").status_code == 200
 
 
-def test_kept_keys_are_used_while_the_issuer_is_away(plane, issuer, monkeypatch):
+def test_cached_issuer_keys_are_used_while_issuer_is_unavailable(plane, issuer, monkeypatch):
     keys = plane.control.persons._keys
     assert ask(plane, issuer.token()).status_code == 200
     issuer.answer = "nonsense"
@@ -263,7 +263,7 @@ def test_kept_keys_are_used_while_the_issuer_is_away(plane, issuer, monkeypatch)
     assert ask(plane, issuer.token()).status_code == 503
 
 
-def test_without_the_setting_tokens_are_nothing(new_plane, issuer):
+def test_tokens_return_401_without_oidc_setting(new_plane, issuer):
     plane = new_plane()
     assert ask(plane, issuer.token()).status_code == 401
     assert issuer.asked == []
@@ -274,12 +274,12 @@ def test_without_the_setting_tokens_are_nothing(new_plane, issuer):
     [{"issuer": "http://login.example"}, {"issuer": "file:///x"}, {"algorithms": ["HS256"]}, {"algorithms": ["none"]}, {"algorithms": []},
      {"roles": {}}, {"roles": {"x": "public"}}, {"audience": ""}, {"keys_url": "http://login.example/keys"}, {"rolls": {}}],
 )  # fmt: skip
-def test_settings_that_would_let_anybody_in_are_refused(wrong):
+def test_oidc_settings_reject_insecure_values(wrong):
     with pytest.raises(ValidationError):
         OidcSettings(**{"issuer": "https://login.example", "audience": "x", "roles": ROLES, **wrong})
 
 
-def test_without_the_extra_it_is_a_sentence(new_plane, issuer, monkeypatch):
+def test_oidc_setting_without_extra_raises_settings_invalid(new_plane, issuer, monkeypatch):
     monkeypatch.setitem(sys.modules, "jwt", None)
     for name in ("oidc", "issuer_keys"):
         monkeypatch.delitem(sys.modules, f"services.auth.{name}", raising=False)

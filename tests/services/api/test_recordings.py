@@ -28,7 +28,7 @@ def settled(plane) -> dict:
     raise AssertionError("the check did not end")
 
 
-def test_the_life_of_a_recording(plane):
+def test_recording_upload_list_and_delete(plane):
     answer = put(plane, b"GOOD" * 500_000)
     assert (answer.status_code, answer.headers["location"]) == (201, CASE)
     assert answer.json()["digest"] == hashlib.sha256(b"GOOD" * 500_000).hexdigest()
@@ -49,13 +49,13 @@ def test_the_life_of_a_recording(plane):
     ]  # fmt: skip
 
 
-def test_what_cannot_be_used_is_rejected_afterwards(plane):
+def test_unusable_recording_is_rejected_by_its_check(plane):
     assert put(plane, b"BAD").status_code == 201
     assert settled(plane)["state"] == "rejected"
 
 
 @pytest.mark.slow
-def test_uploads_are_bounded_and_whole(new_plane):
+def test_recording_upload_refuses_wrong_size_digest_and_type(new_plane):
     plane = new_plane(limits={"recording_bytes": 2**20})
     long = put(plane, bytes(2**20 + 1))
     assert (long.status_code, long.headers["content-type"]) == (413, PROBLEM_JSON)
@@ -67,11 +67,11 @@ def test_uploads_are_bounded_and_whole(new_plane):
     assert plane.ask("GET", "/v1/recordings").json() == []
 
 
-def test_names_are_those_of_the_service(plane):
+def test_recording_upload_refuses_invalid_names(plane):
     for name in ("Case", "a_b", "-a", 41 * "a", "..", "%2e%2e", "a%2fb"):
         assert put(plane, b"GOOD", path=f"/v1/recordings/{name}").status_code in (404, 405, 422)
 
 
-def test_viewers_only_look(plane):
+def test_viewers_cannot_upload_or_delete_recordings(plane):
     assert put(plane, b"GOOD", "viewer").status_code == 403
     assert plane.ask("DELETE", CASE, "viewer").status_code == 403

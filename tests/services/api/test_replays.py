@@ -71,7 +71,7 @@ def start(plane, role="operator", key=None, **wanted):
     return plane.ask("POST", REPLAYS, role, json=wanted or {"recording": "case-7"}, headers=headers)
 
 
-def test_the_life_of_a_replay(plane, worker):
+def test_replay_start_finish_keep_and_delete(plane, worker):
     answer = start(plane, recording="case-7", options={"steps_per_frame": 2, "seed": 0})
     job_id = answer.json()["id"]
     assert (answer.status_code, answer.headers["location"]) == (202, f"{REPLAYS}/{job_id}")
@@ -96,7 +96,7 @@ def test_the_life_of_a_replay(plane, worker):
     ]  # fmt: skip
 
 
-def test_a_list_is_one_batch(plane, worker):
+def test_replays_of_recording_list_form_one_batch(plane, worker):
     answer = start(plane, recordings=["a", "b", "c"])
     made = answer.json()
     assert (answer.status_code, made["id"], len(made["ids"])) == (202, None, 3)
@@ -113,7 +113,7 @@ def test_a_list_is_one_batch(plane, worker):
     assert plane.ask("GET", "/v1/batches/0123456789abcdef").status_code == 404
 
 
-def test_a_request_that_is_sent_twice_starts_one_replay(plane):
+def test_post_replay_with_same_idempotency_key_starts_one_replay(plane):
     first, again = start(plane, key="k1"), start(plane, key="k1")
     assert first.status_code == again.status_code == 202 and first.json() == again.json()
     assert start(plane, key="k1", recording="other").status_code == 422
@@ -130,17 +130,17 @@ def test_a_request_that_is_sent_twice_starts_one_replay(plane):
         {"recording": "a", "options": {"device": "cuda:0; rm"}}, {"recording": "a", "out": "x"}, {"recordings": ["a"] * 2001},
     ],
 )  # fmt: skip
-def test_what_cannot_be_a_replay_is_refused(plane, wanted):
+def test_post_replay_returns_422_for_invalid_request(plane, wanted):
     assert start(plane, **wanted).status_code == 422
     assert plane.ask("GET", REPLAYS).json() == []
 
 
-def test_a_recording_that_is_not_there_is_refused(plane):
+def test_post_replay_returns_404_for_unknown_recording(plane):
     assert start(plane, recordings=["a", "unknown"]).status_code == 404
     assert plane.ask("GET", REPLAYS).json() == []
 
 
-def test_viewers_only_look(plane):
+def test_viewers_cannot_start_or_cancel_replays(plane):
     job_id = start(plane).json()["id"]
     assert start(plane, "viewer").status_code == 403
     assert plane.ask("POST", f"{REPLAYS}/{job_id}/cancel", "viewer").status_code == 403
@@ -148,7 +148,7 @@ def test_viewers_only_look(plane):
     assert plane.ask("POST", f"{REPLAYS}/{job_id}/cancel", "operator").json()["state"] == "cancelled"
 
 
-def test_a_report_is_shown_without_rights_and_the_rest_keeps_its_policy(plane, worker):
+def test_only_report_result_has_sandbox_content_security_policy(plane, worker):
     job_id = start(plane).json()["id"]
     worker.finish(job_id)
     report = plane.ask("GET", f"{REPLAYS}/{job_id}/results/report.html", "viewer")
@@ -164,7 +164,7 @@ def test_a_report_is_shown_without_rights_and_the_rest_keeps_its_policy(plane, w
     assert model.headers["content-disposition"].startswith("attachment") and model.content == b"GOOD"
 
 
-def test_a_model_that_is_gone_from_the_disk_is_not_waited_for(plane, worker, tmp_path):
+def test_keep_returns_409_while_queued_and_503_if_result_is_lost(plane, worker, tmp_path):
     job_id = start(plane).json()["id"]
     early = plane.ask("POST", f"{REPLAYS}/{job_id}/keep", json={"model": "liver"})
     assert early.status_code == 409 and "the replay is queued" in early.json()["detail"]
@@ -175,7 +175,7 @@ def test_a_model_that_is_gone_from_the_disk_is_not_waited_for(plane, worker, tmp
 
 
 @pytest.mark.parametrize("given", ["lines=0-1", "bytes=x-y", "bytes=9-1", "", "zork"])
-def test_a_range_that_cannot_be_read_is_ignored(plane, worker, given):
+def test_malformed_range_header_returns_whole_result(plane, worker, given):
     job_id = start(plane).json()["id"]
     worker.finish(job_id)
     video = plane.ask("GET", f"{REPLAYS}/{job_id}/results/reconstruction.mp4", headers={"Range": given})
@@ -184,7 +184,7 @@ def test_a_range_that_cannot_be_read_is_ignored(plane, worker, given):
 
 
 @pytest.mark.parametrize("given", ["bytes=99999-", "bytes=-0"])
-def test_a_range_without_bytes_is_a_problem(plane, worker, given):
+def test_unsatisfiable_range_returns_416(plane, worker, given):
     job_id = start(plane).json()["id"]
     worker.finish(job_id)
     path = f"{REPLAYS}/{job_id}/results/reconstruction.mp4"
@@ -195,13 +195,13 @@ def test_a_range_without_bytes_is_a_problem(plane, worker, given):
 
 
 @pytest.mark.parametrize("file", ["log", "..%2fjobs.sqlite", "../jobs.sqlite", ".intrasplat.json", "report.json"])
-def test_no_other_file_is_handed_out(plane, worker, file):
+def test_results_route_returns_404_or_422_for_other_files(plane, worker, file):
     job_id = start(plane).json()["id"]
     worker.finish(job_id)
     assert plane.ask("GET", f"{REPLAYS}/{job_id}/results/{file}").status_code in (404, 422)
 
 
-def test_a_result_is_had_by_a_ticket_once(plane, worker):
+def test_result_is_downloadable_once_per_ticket(plane, worker):
     job_id = start(plane).json()["id"]
     worker.finish(job_id)
     path = f"{REPLAYS}/{job_id}/results/report.html"
@@ -211,7 +211,7 @@ def test_a_result_is_had_by_a_ticket_once(plane, worker):
     assert plane.client.get(path).status_code == 401
 
 
-def test_progress_is_said_until_the_end(plane, worker):
+def test_progress_websocket_sends_updates_until_replay_ends(plane, worker):
     job_id = start(plane).json()["id"]
     path = f"{REPLAYS}/{job_id}/progress"
     ticket = plane.ask("POST", "/v1/tickets", "viewer", json={"path": path}).json()["ticket"]
@@ -232,7 +232,7 @@ def test_progress_is_said_until_the_end(plane, worker):
 
 
 @pytest.mark.parametrize("job_id", ["0123456789abcdef", "x"])
-def test_nobody_watches_without_a_ticket_or_what_is_not_there(plane, job_id):
+def test_progress_websocket_refuses_missing_ticket_and_unknown_replay(plane, job_id):
     path = f"{REPLAYS}/{job_id}/progress"
     ticket = plane.ask("POST", "/v1/tickets", "viewer", json={"path": path}).json()["ticket"]
     for query in ("", "?ticket=x", f"?ticket={ticket}"):

@@ -94,7 +94,7 @@ def raw(port: int, data: bytes, timeout_s: float = 300.0) -> bytes:
         return answer
 
 
-def test_the_server_answers_without_naming_its_software(served):
+def test_server_omits_server_header(served):
     _, port, key = served
     answer, body = ask(port, "/v1/version", key)
     assert answer.status == 200 and json.loads(body)["api"] == "v1"
@@ -102,7 +102,7 @@ def test_the_server_answers_without_naming_its_software(served):
     assert ask(port, "/v1/version")[0].status == 401
 
 
-def test_answers_do_not_wait_to_be_acknowledged():
+def test_bind_sets_tcp_nodelay_on_accepted_connections():
     with bind(ServiceSettings(server={"port": 0})) as listener:
         client = socket.create_connection(listener.getsockname())
         connection, _ = listener.accept()
@@ -111,20 +111,20 @@ def test_answers_do_not_wait_to_be_acknowledged():
         connection.close()
 
 
-def test_the_key_is_printed_nowhere(served):
+def test_serve_does_not_print_admin_key(served):
     process, _, key = served
     said = "".join(process.lines)
     assert key not in said and key.split("_", 2)[2] not in said
     assert "admin.key" in said
 
 
-def test_a_head_that_does_not_come_is_not_waited_for(served):
+def test_server_closes_connection_with_incomplete_head(served):
     _, port, _ = served
     assert raw(port, b"GET /livez HTTP/1.1\r\nHost: localhost\r\nX-Slow: ") == b""
     assert raw(port, b"") == b""
 
 
-def test_a_body_that_does_not_come_is_refused(served):
+def test_stalled_request_body_returns_408(served):
     _, port, key = served
     head = (
         f"POST /v1/tickets HTTP/1.1\r\nHost: localhost\r\nAuthorization: Bearer {key}\r\nContent-Type: application/json\r\n"
@@ -134,7 +134,7 @@ def test_a_body_that_does_not_come_is_refused(served):
     assert answer.startswith(b"HTTP/1.1 408 ") and b"connection: close" in answer.lower()
 
 
-def test_a_body_that_is_refused_is_not_waited_for(served):
+def test_refused_request_is_answered_before_body_arrives(served):
     _, port, key = served
     for authorization, status in ((f"Authorization: Bearer {key}\r\n", b"413"), ("", b"401")):
         head = f"PUT /v1/models/a/versions HTTP/1.1\r\nHost: localhost\r\n{authorization}Content-Length: 999999999999\r\n\r\n"
@@ -159,14 +159,14 @@ def test_a_body_that_is_refused_is_not_waited_for(served):
         "\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03\r\n\r\n",
     ],
 )
-def test_two_ways_to_read_a_request_are_none(served, head):
+def test_ambiguous_request_framing_returns_400(served, head):
     """Request smuggling: what a proxy before the server could understand in another way is refused or ends the connection."""
     _, port, _ = served
     answer = raw(port, head.encode("latin1")).lower()
     assert answer.startswith(b"http/1.1 400") and b"connection: close" in answer and answer.count(b"http/1.1") == 1
 
 
-def test_a_head_without_an_end_is_refused(served):
+def test_endless_request_head_returns_431(served):
     _, port, _ = served
     try:
         answer = raw(port, b"GET /livez HTTP/1.1\r\nHost: localhost\r\nA: " + 1_000_000 * b"a")
@@ -175,7 +175,7 @@ def test_a_head_without_an_end_is_refused(served):
     assert answer.startswith(b"HTTP/1.1 431")
 
 
-def test_logs_are_json_with_the_request_and_without_the_query(served):
+def test_request_logs_are_json_without_query(served):
     process, port, key = served
     answer, _ = ask(port, "/v1/streams/a/mjpeg?ticket=s3cret", key)
     number = answer.headers["x-request-id"]
@@ -190,7 +190,7 @@ def test_logs_are_json_with_the_request_and_without_the_query(served):
 
 @pytest.mark.parametrize("form", ["json", "text"])
 @pytest.mark.slow
-def test_logs_do_not_have_the_ticket_of_a_websocket(tmp_path, form):
+def test_logs_omit_websocket_ticket(tmp_path, form):
     with serving(tmp_path, "--set", f"log.format={form}") as (process, port, _):
         with pytest.raises(InvalidStatus):
             connect(f"ws://127.0.0.1:{port}/v1/streams/a/display?ticket=s3cret")
@@ -203,7 +203,7 @@ def test_logs_do_not_have_the_ticket_of_a_websocket(tmp_path, form):
         assert "handshake" not in "".join(process.lines)  # to refuse is no error
 
 
-def test_sigterm_ends_it_with_0_and_the_log_has_it(tmp_path):
+def test_serve_exits_0_on_sigterm_and_writes_audit_entry(tmp_path):
     with serving(tmp_path) as (process, port, key):
         assert ask(port, "/v1/version", key)[0].status == 200
         process.send_signal(signal.SIGTERM)
@@ -213,14 +213,14 @@ def test_sigterm_ends_it_with_0_and_the_log_has_it(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_second_server_of_the_same_folder_is_refused(served, tmp_path):
+def test_second_server_of_same_data_folder_exits_2(served, tmp_path):
     folder = next(argument for argument in served[0].args if "server" in str(argument) and os.path.isdir(argument))
     done = subprocess.run([*SERVE, "--data", folder], capture_output=True, text=True, cwd=ROOT)
     assert done.returncode == 2 and "another process" in done.stderr and "Traceback" not in done.stderr
 
 
-def test_what_cannot_be_served_is_a_sentence(served, tmp_path):
-    """The exit code without a traceback is covered by `test_a_second_server_of_the_same_folder_is_refused`."""
+def test_bind_and_serve_command_raise_for_invalid_settings(served, tmp_path):
+    """The exit code without a traceback is covered by `test_second_server_of_same_data_folder_exits_2`."""
     _, port, _ = served
     for server, said in (
         ({"port": port}, "cannot listen on 127.0.0.1"),
@@ -245,7 +245,7 @@ def certificate(tmp_path_factory) -> Path:
 
 
 @pytest.mark.parametrize("files", [("cert.pem", "other.pem"), ("cert.pem", "nope"), ("key.pem", "key.pem")])
-def test_a_certificate_that_cannot_be_used_is_refused(certificate, files):
+def test_serve_raises_for_unusable_certificate(certificate, files):
     other = ["openssl", "genpkey", "-algorithm", "ed25519", "-out", str(certificate / "other.pem")]
     subprocess.run(other, check=True, capture_output=True)
     certfile, keyfile = (certificate / name for name in files)
@@ -255,7 +255,7 @@ def test_a_certificate_that_cannot_be_used_is_refused(certificate, files):
 
 
 @pytest.mark.slow
-def test_the_server_answers_over_tls(certificate, tmp_path):
+def test_server_over_tls_refuses_plain_http_and_old_tls_versions(certificate, tmp_path):
     options = [
         "--set",
         f"server.certfile={certificate / 'cert.pem'}",
@@ -288,7 +288,7 @@ def test_the_server_answers_over_tls(certificate, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_renewed_certificate_is_taken_without_a_restart(tmp_path):
+def test_renewed_certificate_is_served_without_restart(tmp_path):
     def renew(days: int) -> None:
         files = ["-keyout", str(tmp_path / "key.pem"), "-out", str(tmp_path / "cert.pem")]
         curve = ["-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1"]

@@ -61,7 +61,7 @@ def until(condition) -> None:
 
 @pytest.mark.parametrize(("path", "more"), [("mjpeg", ()), ("display", UPGRADE)])
 @pytest.mark.slow
-def test_a_viewer_that_takes_nothing_is_dropped_and_others_go_on(served, path, more):
+def test_stalled_viewer_is_dropped_while_healthy_viewer_continues(served, path, more):
     port, key, display, server = served
     address = f"/v1/streams/endoscope/{path}"
     with (
@@ -87,7 +87,7 @@ def test_a_viewer_that_takes_nothing_is_dropped_and_others_go_on(served, path, m
     until(lambda: display.open == 0)
 
 
-def test_metrics_count_it(served):
+def test_metrics_count_dropped_stalled_viewer(served):
     port, key, display, _ = served
     with socket.create_connection(("127.0.0.1", port)) as stuck:
         stuck.sendall(request("/v1/streams/endoscope/mjpeg", key))

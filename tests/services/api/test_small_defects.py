@@ -33,18 +33,18 @@ OCTETS = "application/octet-stream"
         ("/v1/models/a/versions/1/exports/ply?time_s=0&time_s=1", "time_s is given 2 times"),
     ],
 )
-def test_a_parameter_that_there_is_not_is_refused(plane, path, near):
+def test_unknown_or_repeated_query_parameter_returns_422(plane, path, near):
     answer = plane.ask("GET", path)
     assert answer.status_code == 422 and near in answer.json()["detail"]
 
 
 @pytest.mark.parametrize("value", ["nan", "inf", "-inf", "NaN", "1e400"])
 @pytest.mark.parametrize("where", ["models/a/versions/1", "streams/endoscope/snapshots/1f0c9a3b5d7e8f20"])
-def test_a_time_that_is_no_number_is_refused(plane, where, value):
+def test_export_returns_422_for_non_finite_time_s(plane, where, value):
     assert plane.ask("GET", f"/v1/{where}/exports/ply?time_s={value}").status_code == 422
 
 
-def test_probes_may_be_asked_with_anything(plane):
+def test_livez_and_readyz_ignore_unknown_parameters(plane):
     assert plane.client.get("/livez?x=1").status_code == 200 == plane.client.get("/readyz?x=1").status_code
 
 
@@ -52,7 +52,7 @@ def digest(data: bytes) -> str:
     return f"sha-256=:{base64.b64encode(hashlib.sha256(data).digest()).decode()}:"
 
 
-def test_slow_uploads_of_one_key_leave_room_for_others(new_plane):
+def test_slow_uploads_of_one_key_do_not_block_other_keys(new_plane):
     """Two uploads of the operator hang; the administrator's is taken, and a third of the operator's is not."""
 
     class SlowModels(FakeModels):
@@ -89,7 +89,7 @@ def test_slow_uploads_of_one_key_leave_room_for_others(new_plane):
 @pytest.mark.parametrize("raised", [NotThere, NotNow, OSError], ids=["gone", "files gone", "a bug"])
 @pytest.mark.parametrize("deleted", [True, False])
 @pytest.mark.parametrize("what", ["models", "recordings"])
-def test_what_is_deleted_during_its_check_is_no_error(new_plane, caplog, what, deleted, raised):
+def test_deletion_during_upload_check_is_not_logged_as_error(new_plane, caplog, what, deleted, raised):
     base = FakeModels if what == "models" else FakeRecordings
     checked = threading.Event()
 
@@ -135,7 +135,7 @@ raise KeyError("uncaught")
 
 @pytest.mark.slow
 @pytest.mark.parametrize("level", ["info", "error"])
-def test_every_line_of_the_log_is_json(level):
+def test_every_stderr_line_is_json_in_json_log_format(level):
     done = subprocess.run([sys.executable, "-W", "always", "-c", NOISY, level], capture_output=True, text=True)
     lines = [json.loads(line) for line in done.stderr.splitlines()]
     said = [line["message"] for line in lines]
@@ -146,7 +146,7 @@ def test_every_line_of_the_log_is_json(level):
     ]  # fmt: skip
 
 
-def test_what_the_pool_prints_is_in_the_log(caplog):
+def test_relayed_logs_every_line_of_pool_output(caplog):
     caplog.set_level(logging.INFO)
 
     async def run() -> None:
@@ -172,7 +172,7 @@ def test_what_the_pool_prints_is_in_the_log(caplog):
 @pytest.mark.parametrize(
     "moment", ["9999-12-31T23:59:59-14:00", "9999-12-31T23:59:59-00:01", "0001-01-01T00:00:00+14:00", "0001-01-01T00:00:00+00:01"]
 )  # fmt: skip
-def test_a_moment_that_utc_does_not_have_is_refused(plane, moment):
+def test_timestamps_outside_utc_range_return_422(plane, moment):
     quoted = moment.replace("+", "%2B")
     for path in (f"/v1/audit?since={quoted}", f"/v1/audit?until={quoted}", f"/v1/audit/export?since={quoted}"):
         assert plane.ask("GET", path).status_code == 422, path
@@ -186,12 +186,12 @@ def test_a_moment_that_utc_does_not_have_is_refused(plane, moment):
     + [{"heldout": value} for value in (0, 1, "yes", "true")]
     + [{"steps_per_frame": 1.0}, {"seed": 2.0}],
 )
-def test_options_of_replays_are_not_converted(plane, options):
+def test_post_replay_does_not_convert_option_types(plane, options):
     answer = plane.ask("POST", "/v1/replays", json={"recording": "case-7", "options": options})
     assert answer.status_code == 422
 
 
 @pytest.mark.parametrize("name", ["azimuth_deg", "elevation_deg", "zoom"])
 @pytest.mark.parametrize("value", [True, "1", None, [], 1e9])
-def test_the_virtual_camera_takes_numbers_alone(plane, name, value):
+def test_put_camera_returns_422_for_non_numbers(plane, name, value):
     assert plane.ask("PUT", "/v1/streams/endoscope/camera", json={name: value}).status_code == 422

@@ -37,7 +37,7 @@ def full_disk(monkeypatch):
     return set_full
 
 
-def test_a_change_is_refused_while_the_audit_log_cannot_be_written(plane, full_disk):
+def test_changes_return_503_while_audit_log_is_unwritable(plane, full_disk):
     before = plane.events()
     full_disk(True)
     answer = plane.ask("POST", "/v1/streams", json=WANTED)
@@ -56,7 +56,7 @@ def test_a_change_is_refused_while_the_audit_log_cannot_be_written(plane, full_d
     assert verify(plane.control.settings.data_dir / AUDIT_FILE).intact
 
 
-def test_the_end_of_a_service_whose_disk_is_full_is_no_bug(tmp_path, full_disk, caplog):
+def test_shutdown_with_full_disk_logs_warning_and_closes_audit_log(tmp_path, full_disk, caplog):
     app = new_app(ServiceSettings(paths={"data": tmp_path}), Parts())
     with TestClient(app):
         full_disk(True)
@@ -69,7 +69,7 @@ def test_the_end_of_a_service_whose_disk_is_full_is_no_bug(tmp_path, full_disk, 
 @pytest.mark.parametrize(
     ("free", "status"), [(state.SPARE_BYTES, "ready"), (state.SPARE_BYTES - 1, "degraded"), (0, "degraded")]
 )
-def test_little_free_space_is_degraded(plane, monkeypatch, free, status):
+def test_disk_check_is_degraded_below_spare_bytes(plane, monkeypatch, free, status):
     monkeypatch.setattr(shutil, "disk_usage", lambda folder: Usage(10 * state.SPARE_BYTES, 0, free))
     ready = plane.client.get("/readyz?verbose").json()
     assert ready["status"] == status and f"data: {free // 2**20} MiB free" in ready["checks"]["disk"]["detail"]
@@ -81,7 +81,7 @@ def test_little_free_space_is_degraded(plane, monkeypatch, free, status):
         }
 
 
-def test_one_full_or_unreadable_disk_among_others_is_degraded(tmp_path, monkeypatch):
+def test_disk_check_is_degraded_if_any_folder_is_full_or_unreadable(tmp_path, monkeypatch):
     """The order of the folders does not matter."""
     audit = AuditLog(tmp_path / AUDIT_FILE)
     audit.close()
@@ -110,7 +110,7 @@ def test_one_full_or_unreadable_disk_among_others_is_degraded(tmp_path, monkeypa
         assert not ok and f"c: {os.strerror(errno.EIO)}" in detail and f"a: {enough} MiB free" in detail
 
 
-def test_a_folder_of_its_own_is_looked_at(new_plane, tmp_path, monkeypatch):
+def test_disk_check_covers_configured_recordings_folder(new_plane, tmp_path, monkeypatch):
     asked = []
 
     def usage(folder):
@@ -129,7 +129,7 @@ def test_a_folder_of_its_own_is_looked_at(new_plane, tmp_path, monkeypatch):
     [(errno.ENOSPC, 507), (errno.EDQUOT, 507), (errno.EROFS, 503), (errno.EIO, 503), (errno.EMFILE, 503)],
 )
 @pytest.mark.parametrize("store", ["keys", "registry", "streams"])
-def test_a_store_whose_disk_refuses_is_no_bug(plane, monkeypatch, caplog, store, number, status):
+def test_disk_errors_of_stores_return_507_or_503_without_traceback(plane, monkeypatch, caplog, store, number, status):
     """An error of the disk in any store is an answer that names it, and not a traceback."""
 
     def refuse(*_, **__):
@@ -150,7 +150,7 @@ def test_a_store_whose_disk_refuses_is_no_bug(plane, monkeypatch, caplog, store,
 
 
 @pytest.mark.parametrize("gone", ["missing", "a file"])
-def test_an_upload_without_its_folder_is_no_bug(plane, gone):
+def test_upload_returns_503_if_uploads_folder_is_missing(plane, gone):
     folder = plane.control.uploads_dir
     folder.rmdir()
     if gone == "a file":

@@ -7,7 +7,7 @@ import pytest
 ENDOSCOPE = {"name": "endoscope", "source": "synthetic:?moving=1"}
 
 
-def test_the_life_of_a_stream(plane):
+def test_stream_create_stop_start_set_options_and_delete(plane):
     made = plane.ask("POST", "/v1/streams", "operator", json=ENDOSCOPE)
     assert (made.status_code, made.json()["state"]) == (201, "live")
     assert plane.ask("POST", "/v1/streams", "operator", json=ENDOSCOPE).status_code == 409
@@ -26,7 +26,7 @@ def test_the_life_of_a_stream(plane):
     ]  # fmt: skip
 
 
-def test_passwords_of_sources_are_shown_to_nobody(new_plane):
+def test_source_passwords_are_hidden_in_responses_and_audit_log(new_plane):
     address = "rtsp://user:pa55@10.0.0.5/stream?token=s3cret&fps=30"
     plane = new_plane(
         sources={"networks": ["10.0.0.0/8"]},
@@ -50,19 +50,19 @@ def test_passwords_of_sources_are_shown_to_nobody(new_plane):
         {"options": {"a": [1]}}, {"options": {str(n): n for n in range(51)}}, {"start": "perhaps"},
     ],
 )  # fmt: skip
-def test_refused_streams(plane, change):
+def test_post_stream_returns_422_for_invalid_values(plane, change):
     answer = plane.ask("POST", "/v1/streams", json={**ENDOSCOPE, **change})
     assert answer.status_code == 422 and answer.json()["errors"]
     assert plane.parts.streams.kept == {}
 
 
 @pytest.mark.parametrize("source", ["\x00:", "\n:x", "a\x7fb:", "[]{}:", "ä:", ":", "", 'a"b:'])
-def test_a_source_that_no_audit_entry_can_hold_is_refused(plane, source):
+def test_source_with_invalid_characters_returns_422_and_is_audited(plane, source):
     answer = plane.ask("POST", "/v1/streams", json={"name": "x", "source": source})
     assert answer.status_code == 422 and ("stream.create", "x", "refused") in plane.events()
 
 
-def test_the_virtual_camera_is_turned_by_whoever_watches(plane):
+def test_viewer_sets_virtual_camera_of_stream(plane):
     plane.ask("POST", "/v1/streams", json={"name": "endoscope", "source": "synthetic:"})
     path = "/v1/streams/endoscope/camera"
     answer = plane.ask("PUT", path, "viewer", json={"azimuth_deg": 20})

@@ -24,7 +24,7 @@ def said(audit: AuditLog) -> list[tuple[str, str, str]]:
     ]
 
 
-def test_events_are_written_while_the_server_runs_and_what_is_left_when_it_ends(audit):
+def test_system_events_are_written_while_running_and_at_exit(audit):
     async def run() -> None:
         events = SystemEvents()
         events.tell("process.started", "theatre/engine", pid=7)
@@ -39,7 +39,7 @@ def test_events_are_written_while_the_server_runs_and_what_is_left_when_it_ends(
     assert (newest.actor, newest.detail) == ("system", {"reason": "killed by SIGKILL"})
 
 
-def test_more_than_may_wait_are_counted(audit, monkeypatch):
+def test_system_events_over_queue_limit_are_counted_as_missed(audit, monkeypatch):
     monkeypatch.setattr(log, "MOST_WAITING", 20)
 
     async def run() -> None:
@@ -56,7 +56,7 @@ def test_more_than_may_wait_are_counted(audit, monkeypatch):
     ).entries[0].detail == {"events": 3}
 
 
-def test_what_cannot_be_written_is_in_the_log_and_the_next_one_is_tried(audit, caplog, monkeypatch):
+def test_unwritable_system_event_is_logged_and_next_is_written(audit, caplog, monkeypatch):
     async def run() -> None:
         events = SystemEvents()
         async with events.written_to(audit):
@@ -71,7 +71,7 @@ def test_what_cannot_be_written_is_in_the_log_and_the_next_one_is_tried(audit, c
     assert "the disk is full" in caplog.text
 
 
-def test_a_check_of_a_model_is_an_event(plane):
+def test_model_check_writes_audit_entry(plane):
     import hashlib
     from base64 import b64encode
 

@@ -30,26 +30,26 @@ def manager() -> Iterator[tuple[socket.socket, str]]:
         yield heard, f"{folder}/notify"
 
 
-def test_without_systemd_nothing_is_said():
+def test_service_manager_without_socket_sends_nothing():
     alone = ServiceManager({})
     alone.tell("READY=1")
     assert alone.feed_s is None
     asyncio.run(alone.feed_watchdog())
 
 
-def test_variables_are_taken_out_of_the_environment(manager):
+def test_service_manager_removes_its_environment_variables(manager):
     environment = {"NOTIFY_SOCKET": manager[1], "WATCHDOG_USEC": "30000000", "WATCHDOG_PID": str(os.getpid()), "A": "b"}
     assert ServiceManager(environment).feed_s == 15.0
     assert environment == {"A": "b"}
 
 
 @pytest.mark.parametrize("wrong", [{"WATCHDOG_PID": "1"}, {"WATCHDOG_USEC": "soon"}, {"NOTIFY_SOCKET": ""}])
-def test_a_watchdog_of_another_process_is_not_fed(manager, wrong):
+def test_feed_s_is_none_for_watchdog_of_other_process_or_bad_values(manager, wrong):
     environment = {"NOTIFY_SOCKET": manager[1], "WATCHDOG_USEC": "1000", "WATCHDOG_PID": str(os.getpid())}
     assert ServiceManager({**environment, **wrong}).feed_s is None
 
 
-def test_a_socket_in_the_abstract_name_space_is_found():
+def test_service_manager_sends_to_abstract_socket():
     name = f"intrasplat-test-{os.getpid()}"
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as heard:
         heard.bind(f"\0{name}")
@@ -58,12 +58,12 @@ def test_a_socket_in_the_abstract_name_space_is_found():
         assert heard.recv(100) == b"READY=1\nSTATUS=serving"
 
 
-def test_a_manager_that_is_gone_changes_nothing(caplog):
+def test_service_manager_logs_missing_socket(caplog):
     ServiceManager({"NOTIFY_SOCKET": "/nowhere/notify"}).tell("READY=1")
     assert "systemd was not notified of READY=1" in caplog.text
 
 
-def test_the_loop_feeds_the_watchdog_and_a_loop_that_stands_still_does_not(manager):
+def test_watchdog_is_fed_only_while_event_loop_runs(manager):
     heard, address = manager
 
     async def served() -> None:
@@ -92,7 +92,7 @@ def _received(heard: socket.socket) -> bytes:
 
 
 @pytest.mark.slow
-def test_a_server_says_that_it_is_ready_lives_and_ends(manager, tmp_path):
+def test_serve_notifies_systemd_of_ready_watchdog_and_stopping(manager, tmp_path):
     heard, address = manager
     process = subprocess.Popen(
         [sys.executable, "-m", "services.cli", "serve", "--port", "0", "--set", "streams={}", "--data", str(tmp_path / "d"),
