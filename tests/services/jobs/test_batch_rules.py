@@ -43,18 +43,18 @@ def begin(place: Path, done: bool = True) -> dict[str, int]:
     return counts
 
 
-def test_a_result_that_is_there_is_not_made_again(place):
+def test_batch_skips_recordings_with_results(place):
     assert begin(place)["done"] == 2
 
 
-def test_a_result_that_was_removed_is_made_again(place):
+def test_batch_queues_recording_whose_result_was_removed(place):
     shutil.rmtree(place / "out" / "a.mp4")
     counts = begin(place)
     assert (counts["done"], counts["queued"]) == (1, 1)
 
 
 @pytest.mark.parametrize("file", ["report.json", "frames.jsonl", ".intrasplat.json"])
-def test_a_result_without_one_of_its_files_is_refused(place, file):
+def test_batch_refuses_result_with_missing_files(place, file):
     (place / "out" / "a.mp4" / file).unlink()
     with pytest.raises(InvalidSetting, match=r"out/a\.mp4 are missing"):
         begin(place)
@@ -69,7 +69,7 @@ def test_a_result_without_one_of_its_files_is_refused(place, file):
         lambda path: shutil.copy(path.with_name("b.mp4"), path),
     ],
 )
-def test_another_recording_under_an_old_name_is_refused_until_its_result_is_removed(place, change):
+def test_batch_refuses_changed_recording_until_its_result_is_removed(place, change):
     change(place / "in" / "a.mp4")
     with pytest.raises(InvalidSetting, match=r"a\.mp4 is another recording"):
         begin(place)
@@ -77,13 +77,13 @@ def test_another_recording_under_an_old_name_is_refused_until_its_result_is_remo
     assert begin(place)["queued"] == 1
 
 
-def test_a_recording_that_was_copied_with_another_date_is_the_same(place):
+def test_batch_ignores_modification_time_of_recordings(place):
     os.utime(place / "in" / "a.mp4", (0, 0))
     assert begin(place)["done"] == 2
 
 
 @pytest.mark.parametrize("content", [b"", b"[", b"[]", b"\xff", b"[" * 50_000])
-def test_damaged_notes_are_one_sentence(place, content):
+def test_batch_refuses_damaged_recordings_json(place, content):
     (place / "out" / ".recordings.json").write_bytes(content)
     with pytest.raises(InvalidSetting, match="cannot be read"):
         begin(place)
@@ -96,7 +96,7 @@ def test_damaged_notes_are_one_sentence(place, content):
         ["session.json", "segments/0"], ["cameras.json", "views/0.png"], ["video.mp4", "valid_mask.png"], ["left.mp4", "right.mp4"], ["video.mp4", "poses.npy"],
     ],
 )  # fmt: skip
-def test_a_folder_that_is_a_recording_is_refused(tmp_path, names):
+def test_recordings_in_refuses_folder_that_is_a_recording(tmp_path, names):
     for name in names:
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
@@ -105,7 +105,7 @@ def test_a_folder_that_is_a_recording_is_refused(tmp_path, names):
 
 
 @pytest.mark.parametrize("name", [b"\xff\xfe.mp4", b"a\nb.mp4", b"a\x1b[2J.mp4", b"\xc3.mkv"])
-def test_a_name_that_is_no_text_refuses_itself_alone(tmp_path, name):
+def test_recordings_in_lists_files_with_unprintable_names_as_unusable(tmp_path, name):
     for each in (b"good.mp4", name):
         with open(os.path.join(os.fsencode(tmp_path), each), "wb"):
             pass
@@ -114,7 +114,7 @@ def test_a_name_that_is_no_text_refuses_itself_alone(tmp_path, name):
     assert [os.fsencode(name) for name, _ in unusable] == [name]
 
 
-def test_folders_and_videos_are_recordings_unless_they_are_hidden(tmp_path):
+def test_recordings_in_returns_visible_folders_and_videos(tmp_path):
     for name in ("a", ".b", "A folder"):
         (tmp_path / name).mkdir()
     for name in ("c.mp4", "D.MKV", ".e.mp4", "notes.txt", ".f"):
@@ -128,18 +128,18 @@ def test_folders_and_videos_are_recordings_unless_they_are_hidden(tmp_path):
 
 
 @pytest.mark.parametrize("depth", ["auto", *(name for name in DEPTHS if name != "onnx")])
-def test_jobs_take_every_registered_depth(depth):
+def test_job_options_accept_registered_depths(depth):
     assert JobOptions(depth=depth).depth == CallerJobOptions(depth=depth).depth == depth
 
 
 @pytest.mark.parametrize("depth", ["onnx", "onnx:", "nothing", "", "stereo:x", "auto:x", "ONNX:x", "light:"])
-def test_a_depth_that_there_is_not_is_refused(depth):
+def test_job_options_refuse_unknown_depths(depth):
     for kind in (JobOptions, CallerJobOptions):
         with pytest.raises(InvalidSetting):
             kind(depth=depth)
 
 
-def test_a_caller_names_a_network_of_the_server_by_its_absolute_path(tmp_path):
+def test_caller_job_options_require_absolute_path_of_onnx_file(tmp_path):
     assert JobOptions(depth="onnx:b.onnx").depth == "onnx:b.onnx", "a batch may name any local file"
     network = tmp_path / "depth.onnx"
     for missing in ("onnx:depth.onnx", f"onnx:{network}", "onnx:/etc/passwd"):
@@ -149,13 +149,13 @@ def test_a_caller_names_a_network_of_the_server_by_its_absolute_path(tmp_path):
     assert CallerJobOptions(depth=f"onnx:{network}").depth == f"onnx:{network}"
 
 
-def test_jobs_take_estimated_poses():
+def test_caller_job_options_accept_estimated_poses():
     assert CallerJobOptions(poses="estimated").chosen() == {"poses": "estimated"}
     with pytest.raises(InvalidSetting):
         CallerJobOptions(poses="x")
 
 
-def test_a_batch_that_cannot_begin_leaves_nothing(tmp_path, monkeypatch):
+def test_failed_new_batch_leaves_no_files(tmp_path, monkeypatch):
     (tmp_path / "in").mkdir()
     (tmp_path / "in" / "a.mp4").write_bytes(b"a")
 
@@ -172,7 +172,7 @@ def test_a_batch_that_cannot_begin_leaves_nothing(tmp_path, monkeypatch):
     assert list((tmp_path / "out").iterdir()) == []
 
 
-def test_a_batch_that_cannot_go_on_keeps_its_jobs(place, monkeypatch):
+def test_failed_continued_batch_keeps_its_jobs(place, monkeypatch):
     def full(*_):
         raise StoreUnavailable("its disk is full; free space")
 

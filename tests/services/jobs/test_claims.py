@@ -29,7 +29,7 @@ def submitted(store, count=1):
 
 
 @pytest.mark.slow
-def test_many_owners_never_share_a_job(new_store):
+def test_concurrent_claims_take_each_job_once(new_store):
     ids = submitted(new_store(), 20)
     taken = []
 
@@ -45,7 +45,7 @@ def test_many_owners_never_share_a_job(new_store):
     assert sorted(taken) == sorted(ids)
 
 
-def test_a_lease_that_is_renewed_is_kept_and_another_is_lost(new_store, clock):
+def test_renewed_lease_is_kept_and_expired_lease_is_lost(new_store, clock):
     store = new_store()
     (job_id,) = submitted(store)
     first, second = of(store, "first"), of(store, "second")
@@ -62,7 +62,7 @@ def test_a_lease_that_is_renewed_is_kept_and_another_is_lost(new_store, clock):
     assert store.get(job_id).state is JobState.DONE
 
 
-def test_a_job_whose_process_dies_again_and_again_has_failed(new_store):
+def test_job_fails_after_most_attempts(new_store):
     store = new_store()
     (job_id,) = submitted(store)
     claims = of(store, "pool", most_attempts=2)
@@ -73,7 +73,7 @@ def test_a_job_whose_process_dies_again_and_again_has_failed(new_store):
     assert store.get(job_id).state is JobState.FAILED and "begun 2 times" in store.get(job_id).reason
 
 
-def test_an_attempt_that_ended_with_its_pool_does_not_count(new_store):
+def test_give_back_without_counts_keeps_attempt_number(new_store):
     store = new_store()
     (job_id,) = submitted(store)
     claims = of(store, "pool", most_attempts=1)
@@ -82,7 +82,7 @@ def test_an_attempt_that_ended_with_its_pool_does_not_count(new_store):
         claims.give_back(job_id, counts=False)
 
 
-def test_a_result_that_is_there_is_not_made_again(new_store, clock):
+def test_take_marks_published_job_done(new_store, clock):
     store = new_store()
     (job_id,) = submitted(store)
     of(store, "dies between its rename and its note").take()
@@ -91,7 +91,7 @@ def test_a_result_that_is_there_is_not_made_again(new_store, clock):
     assert store.get(job_id).state is JobState.DONE
 
 
-def test_who_wants_a_job_to_end_is_heard(new_store):
+def test_renew_reports_cancelled_jobs(new_store):
     store = new_store()
     (job_id,) = submitted(store)
     claims = of(store, "pool")
@@ -102,7 +102,7 @@ def test_who_wants_a_job_to_end_is_heard(new_store):
     assert claims.take() is None and store.get(job_id).state is JobState.CANCELLED
 
 
-def test_jobs_of_the_dead_are_free_at_once(new_store):
+def test_free_releases_jobs_of_dead_owners(new_store):
     store = new_store()
     submitted(store, 2)
     of(store, "dead").take()

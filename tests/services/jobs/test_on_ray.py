@@ -34,7 +34,7 @@ def on_ray():
 
 
 @pytest.mark.filterwarnings("ignore")  # of Ray's own
-def test_jobs_run_on_ray_as_they_do_here(store, recording, tmp_path, on_ray):
+def test_pool_on_local_ray_finishes_fails_and_cancels_jobs(store, recording, tmp_path, on_ray):
     (good,) = store.submit([NewJob("a", str(recording))], {"steps_per_frame": 2}, "operator").ids
     (missing,) = store.submit([NewJob("c", str(tmp_path / "nothing"))], {}, "operator").ids
     (long,) = store.submit([NewJob("d", str(recording))], {"steps_per_frame": 10_000}, "operator").ids
@@ -62,7 +62,7 @@ def test_jobs_run_on_ray_as_they_do_here(store, recording, tmp_path, on_ray):
 
 @pytest.mark.parametrize("address", ["no address", "scheme://x"])
 @pytest.mark.filterwarnings("ignore")
-def test_an_address_without_ray_is_refused_with_a_sentence(address):
+def test_on_ray_raises_for_unusable_address(address):
     from services.jobs.runners import OnRay
 
     with pytest.raises(StoreUnavailable, match=r"Ray at .* cannot be used"):

@@ -24,7 +24,7 @@ def attempts_left(tmp_path):
     return [path.name for path in (tmp_path / "results" / RUNNING).glob("*/*") if path.is_dir()]
 
 
-def test_as_many_at_once_as_may(store, runner, new_pool, tmp_path):
+def test_pool_runs_at_most_workers_attempts_and_publishes_results(store, runner, new_pool, tmp_path):
     ids = submitted(store, 3)
     pool = new_pool(workers=2, threads=3, niceness=4, pack_models=True)
     pool.step()
@@ -45,7 +45,7 @@ def test_as_many_at_once_as_may(store, runner, new_pool, tmp_path):
     assert len(attempts_left(tmp_path)) == 2
 
 
-def test_what_fails_has_its_reason_and_is_not_tried_again(store, runner, new_pool, tmp_path):
+def test_failed_job_keeps_reason_and_is_not_retried(store, runner, new_pool, tmp_path):
     (job_id,) = submitted(store)
     pool = new_pool()
     pool.step()
@@ -57,7 +57,7 @@ def test_what_fails_has_its_reason_and_is_not_tried_again(store, runner, new_poo
     assert runner.tasks == {} and attempts_left(tmp_path) == []
 
 
-def test_what_dies_is_tried_again(store, runner, new_pool, tmp_path):
+def test_killed_attempt_is_retried_up_to_most_attempts(store, runner, new_pool, tmp_path):
     (job_id,) = submitted(store)
     pool = new_pool(most_attempts=2)
     for _ in range(2):
@@ -67,7 +67,7 @@ def test_what_dies_is_tried_again(store, runner, new_pool, tmp_path):
     assert store.get(job_id).state is JobState.FAILED and attempts_left(tmp_path) == []
 
 
-def test_what_is_cancelled_is_killed_and_leaves_nothing(store, runner, new_pool, tmp_path):
+def test_cancelled_job_is_killed_and_leaves_no_files(store, runner, new_pool, tmp_path):
     (job_id,) = submitted(store)
     pool = new_pool()
     pool.step()
@@ -79,7 +79,7 @@ def test_what_is_cancelled_is_killed_and_leaves_nothing(store, runner, new_pool,
     assert not (tmp_path / "results" / job_id).exists()
 
 
-def test_an_attempt_without_its_claim_publishes_nothing(store, runner, new_pool, tmp_path):
+def test_attempt_with_lost_claim_is_not_published(store, runner, new_pool, tmp_path):
     (job_id,) = submitted(store)
     slow, other = new_pool(), type(runner)()
     slow.step()
@@ -94,7 +94,7 @@ def test_an_attempt_without_its_claim_publishes_nothing(store, runner, new_pool,
     assert result(tmp_path, job_id) == "in time" and store.get(job_id).state is JobState.DONE
 
 
-def test_a_result_that_is_there_stays_as_it_is(store, runner, new_pool, tmp_path):
+def test_existing_result_is_kept_and_job_is_done(store, runner, new_pool, tmp_path):
     (job_id,) = submitted(store)
     pool = new_pool()
     pool.step()
@@ -105,7 +105,7 @@ def test_a_result_that_is_there_stays_as_it_is(store, runner, new_pool, tmp_path
     assert result(tmp_path, job_id) == "first" and store.get(job_id).state is JobState.DONE
 
 
-def test_what_is_in_the_way_of_a_result_is_not_overwritten(store, runner, new_pool, tmp_path):
+def test_job_fails_if_result_folder_holds_other_files(store, runner, new_pool, tmp_path):
     (job_id,) = submitted(store)
     pool = new_pool()
     pool.step()
@@ -117,7 +117,7 @@ def test_what_is_in_the_way_of_a_result_is_not_overwritten(store, runner, new_po
     assert (tmp_path / "results" / job_id / "mine").read_text() == "x"
 
 
-def test_a_pool_that_ends_gives_back_what_runs_and_publishes_what_is_done(store, runner, new_pool, tmp_path):
+def test_ending_pool_publishes_finished_and_requeues_running_jobs(store, runner, new_pool, tmp_path):
     ids = submitted(store, 2)
     pool = new_pool(workers=2)
     pool.step()
@@ -128,7 +128,7 @@ def test_a_pool_that_ends_gives_back_what_runs_and_publishes_what_is_done(store,
     assert list((tmp_path / "results" / RUNNING).iterdir()) == []
 
 
-def test_a_database_that_does_not_answer_is_waited_for(store, runner, new_pool, monkeypatch):
+def test_pool_retries_after_database_failure(store, runner, new_pool, monkeypatch):
     submitted(store)
     pool: JobPool = new_pool()
     monkeypatch.setattr("services.jobs.pool.AGAIN_S", 0.0)
@@ -145,7 +145,7 @@ def test_a_database_that_does_not_answer_is_waited_for(store, runner, new_pool, 
     assert len(looks) == 2
 
 
-def test_a_database_that_fails_without_end_ends_a_pool_with_patience(store, runner, new_pool, monkeypatch):
+def test_pool_raises_if_database_fails_longer_than_patience(store, runner, new_pool, monkeypatch):
     submitted(store)
     pool: JobPool = new_pool()
     monkeypatch.setattr("services.jobs.pool.AGAIN_S", 0.0)
@@ -159,7 +159,7 @@ def test_a_database_that_fails_without_end_ends_a_pool_with_patience(store, runn
 
 
 @pytest.mark.parametrize("file", ["report.json", "model.isplat"])
-def test_a_removed_result_is_gone(new_pool, tmp_path, file):
+def test_results_remove_deletes_result_and_may_be_repeated(new_pool, tmp_path, file):
     pool = new_pool()
     (tmp_path / "results" / "one").mkdir()
     (tmp_path / "results" / "one" / file).write_text("{}")

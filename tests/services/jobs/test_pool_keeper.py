@@ -54,13 +54,13 @@ def kept(monkeypatch):
     return run
 
 
-def test_the_pool_runs_while_there_are_jobs_and_restarts_with_a_delay_after_a_failure(kept):
+def test_keeper_runs_pool_while_jobs_are_open_and_delays_restarts(kept):
     assert kept([0, 0], []) == (0, [keepers.POLL_S] * 2)
     assert kept([1, 2], [0, 0]) == (2, [keepers.POLL_S] * 2)
     assert kept([1], [3]) == (1, [7.5, keepers.POLL_S])
 
 
-def test_a_store_that_cannot_be_read_is_asked_again(kept):
+def test_keeper_retries_unavailable_store(kept):
     assert kept([StoreUnavailable("locked"), 1], [0]) == (1, [keepers.POLL_S] * 2)
 
 
@@ -82,7 +82,7 @@ def program(monkeypatch):
     return use
 
 
-def test_the_pool_gets_its_settings_and_no_credentials(program, monkeypatch, caplog):
+def test_keeper_passes_settings_but_no_credentials_to_pool(program, monkeypatch, caplog):
     monkeypatch.setenv("INTRASPLAT_SECRET", "hidden")
     monkeypatch.setenv("LANG", "C")
     caplog.set_level(logging.INFO)
@@ -94,7 +94,7 @@ def test_the_pool_gets_its_settings_and_no_credentials(program, monkeypatch, cap
     assert program.environment["LANG"] == "C" and "INTRASPLAT_SECRET" not in program.environment
 
 
-def test_at_the_end_the_pool_is_asked_to_stop_and_one_that_hangs_is_killed(program, monkeypatch):
+def test_keeper_stops_pool_and_kills_hanging_pool(program, monkeypatch):
     async def run(code: str) -> int | None:
         keeper = program(code)
         await keeper._end()  # not started yet
@@ -111,7 +111,7 @@ def test_at_the_end_the_pool_is_asked_to_stop_and_one_that_hangs_is_killed(progr
     assert asyncio.run(run("import time; time.sleep(1000)")) == -9
 
 
-def test_lines_of_the_pool_are_logged_at_their_level(caplog):
+def test_relayed_logs_pool_lines_at_their_level(caplog):
     caplog.set_level(logging.DEBUG)
 
     async def run() -> None:

@@ -21,7 +21,7 @@ from services.jobs.runners import OnRay, Task
 SETTINGS = PoolProcess("sqlite://", "/results", PoolSettings(workers=3), "local", 2.5)
 
 
-def test_a_configuration_is_one_line_and_read_back() -> None:
+def test_pool_process_settings_round_trip_as_one_line() -> None:
     line = SETTINGS.line()
     assert line.count(b"\n") == 1 and line.endswith(b"\n")
     assert PoolProcess.of_line(line.decode()) == SETTINGS
@@ -31,7 +31,7 @@ def test_a_configuration_is_one_line_and_read_back() -> None:
     ("signalled", "idle_s", "input_ended", "is_over"),
     [(False, 2.5, False, False), (True, 0.0, False, True), (False, 2.6, False, True), (False, 0.0, True, True)],
 )
-def test_a_pool_runs_until_a_signal_an_idle_time_or_the_end_of_its_input(
+def test_pool_program_ends_on_signal_idle_time_or_end_of_input(
     monkeypatch: pytest.MonkeyPatch, signalled: bool, idle_s: float, input_ended: bool, is_over: bool
 ) -> None:
     handlers: dict[int, Any] = {}
@@ -65,7 +65,7 @@ def test_a_pool_runs_until_a_signal_an_idle_time_or_the_end_of_its_input(
     assert set(handlers) == {pools.signal.SIGINT, pools.signal.SIGTERM, pools.signal.SIGHUP}
 
 
-def test_a_pool_without_its_runner_ends_with_a_sentence(
+def test_pool_program_exits_2_if_runner_is_unavailable(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def fail(ray: Any) -> None:
@@ -79,7 +79,7 @@ def test_a_pool_without_its_runner_ends_with_a_sentence(
     assert pools.main() == 2 and "Ray does not answer" in caplog.text
 
 
-def test_jobs_of_dead_pools_are_free_and_their_folders_gone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_new_pool_frees_jobs_and_folders_of_dead_pools(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     freed: list[Any] = []
     monkeypatch.setattr(pools, "Claims", lambda *_: SimpleNamespace(free=freed.append))
     results = SimpleNamespace(folder=tmp_path, is_published=None)
@@ -98,7 +98,7 @@ def test_jobs_of_dead_pools_are_free_and_their_folders_gone(tmp_path: Path, monk
     assert not alive.folder.exists()
 
 
-def test_a_pool_is_idle_since_its_last_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_idle_s_counts_from_end_of_last_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     now = SimpleNamespace(s=100.0)
     monkeypatch.setattr(pools, "Claims", lambda *_: None)
     monkeypatch.setattr(pools.time, "monotonic", lambda: now.s)
@@ -157,7 +157,7 @@ def ray(monkeypatch: pytest.MonkeyPatch) -> Ray:
 TASK = Task("a", "/recording", "/folder", {"device": "cuda"}, threads=3, niceness=5, pack_model=False)
 
 
-def test_attempts_on_ray_are_started_without_retries_and_end_with_their_reason(ray: Ray) -> None:
+def test_on_ray_starts_tasks_without_retries_and_reports_their_end(ray: Ray) -> None:
     runner = OnRay("local")
     assert ray.calls == [("init", "local", False)] and os.environ["RAY_USAGE_STATS_ENABLED"] == "0"
     assert runner.ended() == {}
@@ -173,7 +173,7 @@ def test_attempts_on_ray_are_started_without_retries_and_end_with_their_reason(r
     assert runner.ended() == {"c": "TaskCancelledError of Ray"}
 
 
-def test_attempts_on_ray_are_cancelled_by_force(ray: Ray) -> None:
+def test_on_ray_kill_and_close_cancel_tasks_by_force(ray: Ray) -> None:
     runner = OnRay("ray://head:10001")
     assert ray.calls == [("init", "ray://head:10001", None)]
     for name in ("a", "b", "c"):

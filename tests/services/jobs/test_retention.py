@@ -41,7 +41,7 @@ class FakeEvents:
         self.entries.append((event, subject, outcome, detail))
 
 
-def test_at_start_what_waits_is_checked_and_what_is_too_old_goes():
+def test_recording_retention_checks_pending_and_expires_old_at_start():
     store, events = FakeStore([Expired("case-1", "it is older than 2 days")]), FakeEvents()
     retention = RecordingRetention(store, 2, 10**9, events)
 
@@ -55,13 +55,13 @@ def test_at_start_what_waits_is_checked_and_what_is_too_old_goes():
     assert events.entries == [("recording.expire", "case-1", "done", {"why": "it is older than 2 days"})]
 
 
-def test_without_bounds_nothing_goes():
+def test_recording_retention_without_bounds_expires_nothing():
     store = FakeStore([Expired("case-1", "")])
     asyncio.run(RecordingRetention(store, None, None, FakeEvents()).enforce())
     assert store.asked == []
 
 
-def test_replays_that_ended_go_with_their_results(tmp_path):
+def test_replay_retention_removes_surplus_ended_replays_and_results(tmp_path):
     store = JobStore(f"sqlite:///{tmp_path / 'jobs.sqlite'}", lambda _, name: tmp_path / name)
     results, events = Results(tmp_path / "results"), FakeEvents()
     ids = store.submit([NewJob(name) for name in "abc"], {}, "operator").ids

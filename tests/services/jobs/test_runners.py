@@ -52,7 +52,7 @@ def ends(forks: Forks, count: int) -> Mapping[str, str]:
     return found
 
 
-def test_an_attempt_has_a_session_a_log_and_a_priority_of_its_own(forks, body, tmp_path):
+def test_fork_has_own_session_log_and_priority(forks, body, tmp_path):
     def told(task: Task) -> None:
         os.write(1, b"to the log\n")
         os.write(2, b"errors too\n")
@@ -75,7 +75,7 @@ def test_an_attempt_has_a_session_a_log_and_a_priority_of_its_own(forks, body, t
     assert log.read_text() == "to the log\nerrors too\n" and stat.S_IMODE(log.stat().st_mode) == 0o600
 
 
-def test_an_attempt_that_raises_ends_with_a_trace_in_its_log(forks, body, tmp_path):
+def test_fork_that_raises_exits_1_with_traceback_in_log(forks, body, tmp_path):
     def failing(task: Task) -> None:
         sys.stderr = os.fdopen(2, "w")  # pytest's own goes elsewhere
         raise KeyboardInterrupt("no such thing")
@@ -86,7 +86,7 @@ def test_an_attempt_that_raises_ends_with_a_trace_in_its_log(forks, body, tmp_pa
     assert "KeyboardInterrupt: no such thing" in (tmp_path / "a" / "log").read_text()
 
 
-def test_one_attempt_is_killed_and_another_goes_on(forks, body, tmp_path):
+def test_kill_ends_only_named_fork(forks, body, tmp_path):
     def waiting(task: Task) -> None:
         while not (Path(task.folder) / "go").exists():
             time.sleep(0.01)
@@ -123,7 +123,7 @@ def endless(task: Task) -> None:
     signal.pause()
 
 
-def test_attempts_end_when_the_runner_closes(body, tmp_path):
+def test_close_ends_running_forks(body, tmp_path):
     body(endless)
     forks = Forks()
     forks.start(task(tmp_path))
@@ -133,7 +133,7 @@ def test_attempts_end_when_the_runner_closes(body, tmp_path):
     assert not is_running(pid)
 
 
-def test_attempts_end_when_their_pool_dies(body, tmp_path):
+def test_forks_end_when_pool_process_dies(body, tmp_path):
     body(endless)
     pool = os.fork()
     if pool == 0:
@@ -175,7 +175,7 @@ print(found)
 """
 
 
-def test_an_attempt_computes_after_its_pool_computed_with_threads(tmp_path):
+def test_fork_computes_after_parent_used_openmp_threads(tmp_path):
     environment = {**os.environ, "OMP_NUM_THREADS": "2"}
     words = [sys.executable, "-c", FORKED_AFTER_OPENMP, str(tmp_path)]
     said = subprocess.run(words, capture_output=True, text=True, check=True, timeout=120, env=environment)
@@ -201,7 +201,7 @@ def replayed(monkeypatch):
     torch.set_num_threads(threads)
 
 
-def test_a_finished_job_reports_its_last_frame_and_keeps_the_last_prediction(replayed, tmp_path):
+def test_finished_job_reports_last_progress_and_last_known_prediction(replayed, tmp_path):
     def run(tell):
         tell(Progress("replay", 1, 3, psnr_tissue_db=30.0, previous_frame_db=28.0, next_frame_db=27.0))
         tell(Progress("replay", 3, 3, psnr_tissue_db=33.0, previous_frame_db=29.0))
@@ -214,7 +214,7 @@ def test_a_finished_job_reports_its_last_frame_and_keeps_the_last_prediction(rep
     assert job.progress() == JobProgress(3, 3, 33.0, 29.0, 27.0)
 
 
-def test_progress_is_written_a_few_times_a_second(replayed, tmp_path, monkeypatch):
+def test_work_limits_rate_of_progress_writes(replayed, tmp_path, monkeypatch):
     now, written = [100.0], []
     monkeypatch.setattr(runners.time, "monotonic", lambda: now[0])
     monkeypatch.setattr(Task, "say_progress", lambda self, reached: written.append(reached.frames_done))
@@ -236,7 +236,7 @@ def test_progress_is_written_a_few_times_a_second(replayed, tmp_path, monkeypatc
         (ValueError("x"), "a bug in this program (ValueError); the log has the rest"),
     ],
 )
-def test_a_failed_job_has_its_reason(replayed, tmp_path, capsys, error, reason):
+def test_failed_job_reports_reason_and_logs_error(replayed, tmp_path, capsys, error, reason):
     def run(tell):
         raise error
 
@@ -247,7 +247,7 @@ def test_a_failed_job_has_its_reason(replayed, tmp_path, capsys, error, reason):
     assert type(error).__name__ in capsys.readouterr().err
 
 
-def test_a_reason_does_not_name_folders_of_the_server(replayed, tmp_path):
+def test_failure_reason_omits_server_folders(replayed, tmp_path):
     def run(tell):
         raise InvalidSetting(f"{tmp_path}/recordings/one is damaged; upload it again")
 
@@ -256,7 +256,7 @@ def test_a_reason_does_not_name_folders_of_the_server(replayed, tmp_path):
     assert job.outcome() == (JobState.FAILED, "one is damaged; upload it again")
 
 
-def test_a_model_is_packed_in_place_of_its_folder(replayed, tmp_path, monkeypatch):
+def test_pack_model_replaces_model_folder_by_isplat_file(replayed, tmp_path, monkeypatch):
     def run(tell):
         (job.out / "model").mkdir(parents=True)
 
@@ -268,7 +268,7 @@ def test_a_model_is_packed_in_place_of_its_folder(replayed, tmp_path, monkeypatc
     assert (job.out / "model.isplat").read_text() == "model"
 
 
-def test_jobs_run_on_ray_only_where_it_is_named(monkeypatch):
+def test_new_runner_uses_ray_only_if_address_is_given(monkeypatch):
     monkeypatch.setattr(runners, "OnRay", lambda address: f"Ray at {address}")
     assert new_runner("head:6379") == "Ray at head:6379"
     loaded = []

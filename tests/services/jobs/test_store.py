@@ -15,13 +15,13 @@ from services.jobs.store import DAY_S, METADATA, MOST_AT_ONCE, SCHEMA, Claims, J
 from services.registry import records
 
 
-def test_the_migrations_make_the_tables_that_the_program_uses(new_store):
+def test_job_migrations_create_tables_of_metadata(new_store):
     with new_store().database.reading() as connection:
         context = MigrationContext.configure(connection, opts={"version_table": SCHEMA.version_table})
         assert compare_metadata(context, METADATA) == []
 
 
-def test_a_batch_is_one_job_for_each_recording(new_store):
+def test_submit_creates_one_job_per_recording_in_one_batch(new_store):
     store = new_store()
     made = store.submit([NewJob("a"), NewJob("b")], {"seed": 3}, "operator")
     jobs = store.newest()
@@ -37,7 +37,7 @@ def test_a_batch_is_one_job_for_each_recording(new_store):
     assert store.newest(state="done") == []
 
 
-def test_one_idempotency_key_makes_one_batch(new_store):
+def test_submit_with_same_idempotency_key_creates_one_batch(new_store):
     store = new_store()
     first = store.submit([NewJob("a"), NewJob("b")], {"seed": 3}, "operator", "key")
     again = store.submit([NewJob("a"), NewJob("b")], {"seed": 3}, "operator", "key")
@@ -49,7 +49,7 @@ def test_one_idempotency_key_makes_one_batch(new_store):
     assert store.counts()["queued"] == 4
 
 
-def test_many_requests_at_once_with_one_key_make_one_batch(new_store):
+def test_concurrent_submits_with_same_key_create_one_batch(new_store):
     stores = [new_store() for _ in range(4)]
     batches = []
     threads = [
@@ -63,7 +63,7 @@ def test_many_requests_at_once_with_one_key_make_one_batch(new_store):
     assert len(set(batches)) == 1 and stores[0].counts()["queued"] == 1
 
 
-def test_all_recordings_or_none(store):
+def test_submit_creates_no_jobs_if_any_recording_is_missing(store):
     def find(connection, name):
         raise NotFound(f"there is no recording {name}")
 
@@ -76,7 +76,7 @@ def test_all_recordings_or_none(store):
             store.submit([NewJob("a")] * count, {}, "operator")
 
 
-def test_cancelling_and_forgetting(new_store):
+def test_cancel_and_forget_follow_job_state(new_store):
     store = new_store()
     queued, running = store.submit([NewJob("a"), NewJob("b")], {}, "operator").ids
     store.cancel(queued, "nurse")
@@ -93,7 +93,7 @@ def test_cancelling_and_forgetting(new_store):
         store.get(queued)
 
 
-def test_what_ended_too_long_ago_or_is_too_much(new_store, monkeypatch):
+def test_surplus_lists_jobs_over_age_or_count_limit(new_store, monkeypatch):
     store = new_store()
     ids = store.submit([NewJob(name) for name in "abcde"], {}, "operator").ids
     began = records.now()
@@ -110,7 +110,7 @@ def test_what_ended_too_long_ago_or_is_too_much(new_store, monkeypatch):
     assert [why.partition(" ")[0] for _, why in store.surplus(3.5 * DAY_S, 1)] == ["1", "2", "it"]
 
 
-def test_a_recording_is_in_use_until_its_jobs_have_ended(new_store):
+def test_uses_recording_is_true_until_its_jobs_ended(new_store):
     store = new_store()
     (job_id,) = store.submit([NewJob("a")], {}, "operator").ids
 
@@ -123,6 +123,6 @@ def test_a_recording_is_in_use_until_its_jobs_have_ended(new_store):
     assert not used("a")
 
 
-def test_options_that_are_defaults_are_not_kept():
+def test_job_options_chosen_omits_defaults():
     assert JobOptions(seed=0, scale=0.5).chosen() == {"scale": 0.5}
     assert JobOptions().chosen() == {}

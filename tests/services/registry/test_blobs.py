@@ -21,7 +21,7 @@ def remote(request: pytest.FixtureRequest) -> RemoteBlobs:
     return store
 
 
-def test_a_remote_file_is_there_whole_until_it_is_removed(remote: RemoteBlobs, tmp_path: Path) -> None:
+def test_remote_blob_is_readable_until_removed(remote: RemoteBlobs, tmp_path: Path) -> None:
     (tmp_path / "staged").write_bytes(b"whole")
     assert remote.stored() == []
     remote.publish(tmp_path / "staged", "key")
@@ -36,7 +36,7 @@ def test_a_remote_file_is_there_whole_until_it_is_removed(remote: RemoteBlobs, t
         pass
 
 
-def test_a_file_that_arrived_in_part_is_noticed(
+def test_remote_publish_raises_for_partial_upload(
     remote: RemoteBlobs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "staged").write_bytes(b"whole")
@@ -45,7 +45,7 @@ def test_a_file_that_arrived_in_part_is_noticed(
         remote.publish(tmp_path / "staged", "key")
 
 
-def test_a_file_of_another_machine_is_abandoned_after_an_hour(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_remote_blob_is_abandoned_after_one_hour(monkeypatch: pytest.MonkeyPatch) -> None:
     moment = datetime.datetime(2026, 1, 1, tzinfo=datetime.UTC)
     store = RemoteBlobs("memory://ages/blobs", {})
     described = [
@@ -67,7 +67,7 @@ def test_a_file_of_another_machine_is_abandoned_after_an_hour(monkeypatch: pytes
     assert {each.size for each in store.stored()} == {3}
 
 
-def test_a_folder_keeps_files_that_nobody_changes(tmp_path: Path) -> None:
+def test_folder_blobs_are_stored_read_only(tmp_path: Path) -> None:
     store = open_blobs(None, tmp_path / "blobs")
     assert isinstance(store, FolderBlobs)
     assert store.folder.stat().st_mode & 0o777 == 0o700
@@ -93,12 +93,12 @@ class _Botocore(Exception):
         (_Botocore("no answer"), "does not answer: no answer; check its address"),
     ],
 )
-def test_errors_of_a_store_are_said(error: Exception, why: str) -> None:
+def test_store_errors_raise_store_unavailable_with_cause(error: Exception, why: str) -> None:
     with pytest.raises(StoreUnavailable, match=why), folder._store_errors("s3://x"):
         raise error
 
 
-def test_a_bug_stays_one() -> None:
+def test_store_errors_passes_other_exceptions_and_bad_url_is_refused() -> None:
     with pytest.raises(KeyError), folder._store_errors("s3://x"):
         raise KeyError("bug")
     with pytest.raises(StoreUnavailable, match="give s3://BUCKET/PREFIX"):
@@ -112,7 +112,7 @@ def test_a_bug_stays_one() -> None:
         ("linked file", False), ("folder for a file", False),
     ],
 )  # fmt: skip
-def test_an_unpacked_model_is_intact_if_its_own_files_are_those_that_were_uploaded(tmp_path, change, is_intact):
+def test_is_intact_only_for_regular_files_with_uploaded_digests(tmp_path, change, is_intact):
     """Links lead to files that may change."""
     model = tmp_path / "model"
     model.mkdir()

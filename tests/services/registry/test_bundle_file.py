@@ -25,12 +25,12 @@ def contents(model):
     return {name: (model / name).read_bytes() for name in (MANIFEST, TENSORS)}
 
 
-def test_names_and_sizes_are_those_of_the_bundle():
+def test_bundle_file_names_and_limits_match_bundle():
     assert (MANIFEST, TENSORS) == (bundle.MANIFEST, bundle.TENSORS)
     assert bundle_file.MOST_MANIFEST_BYTES == bundle.MAX_MANIFEST_BYTES
 
 
-def test_what_is_packed_comes_out_again_and_packs_to_the_same_bytes(tmp_path):
+def test_pack_and_unpack_round_trip_is_byte_identical(tmp_path):
     model = save_model(tmp_path / "model")
     size = pack(model, tmp_path / "a.isplat")
     assert size == (tmp_path / "a.isplat").stat().st_size
@@ -39,7 +39,7 @@ def test_what_is_packed_comes_out_again_and_packs_to_the_same_bytes(tmp_path):
     assert (tmp_path / "a.isplat").read_bytes() == (tmp_path / "b.isplat").read_bytes()
 
 
-def test_python_reads_it_as_a_tar_archive(tmp_path):
+def test_packed_bundle_is_readable_by_tarfile(tmp_path):
     model = save_model(tmp_path / "model")
     pack(model, tmp_path / "a.isplat")
     with tarfile.open(tmp_path / "a.isplat", "r:") as archive:
@@ -48,7 +48,7 @@ def test_python_reads_it_as_a_tar_archive(tmp_path):
 
 
 @pytest.mark.parametrize("style", [tarfile.USTAR_FORMAT, tarfile.GNU_FORMAT])
-def test_an_archive_that_python_wrote_is_taken(tmp_path, style):
+def test_unpack_accepts_archive_written_by_tarfile(tmp_path, style):
     model = save_model(tmp_path / "model")
     with tarfile.open(tmp_path / "a.isplat", "w", format=style) as archive:
         for name in (MANIFEST, TENSORS):
@@ -58,14 +58,14 @@ def test_an_archive_that_python_wrote_is_taken(tmp_path, style):
 
 @pytest.mark.skipif(shutil.which("tar") is None, reason="there is no tar")
 @pytest.mark.parametrize("style", ["ustar", "gnu"])
-def test_an_archive_that_tar_wrote_is_taken(tmp_path, style):
+def test_unpack_accepts_archive_written_by_tar(tmp_path, style):
     model = save_model(tmp_path / "model")
     subprocess.run(["tar", f"--format={style}", "-cf", tmp_path / "a.isplat", MANIFEST, TENSORS], cwd=model, check=True)
     assert unpacked(tmp_path / "a.isplat", tmp_path / "b") == contents(model)
 
 
 @pytest.mark.parametrize("sizes", [(0, 0), (1, 511), (512, 512), (513, 1)])
-def test_every_size_fills_its_blocks(tmp_path, sizes):
+def test_pack_and_unpack_round_trip_for_sizes_around_block_size(tmp_path, sizes):
     model = tmp_path / "model"
     model.mkdir()
     for name, size in zip((MANIFEST, TENSORS), sizes, strict=True):
@@ -74,7 +74,7 @@ def test_every_size_fills_its_blocks(tmp_path, sizes):
     assert unpacked(tmp_path / "a.isplat", tmp_path / "b") == contents(model)
 
 
-def test_a_file_that_is_there_is_replaced_only_on_request(tmp_path):
+def test_pack_replaces_existing_file_only_with_overwrite(tmp_path):
     model = save_model(tmp_path / "model")
     (tmp_path / "a.isplat").write_bytes(b"mine")
     with pytest.raises(FileExistsError):
@@ -84,7 +84,7 @@ def test_a_file_that_is_there_is_replaced_only_on_request(tmp_path):
     assert unpacked(tmp_path / "a.isplat", tmp_path / "b") == contents(model)
 
 
-def test_an_archive_cut_anywhere_is_refused(tmp_path):
+def test_members_of_rejects_truncated_archive(tmp_path):
     model = save_model(tmp_path / "model")
     pack(model, tmp_path / "a.isplat")
     payload = (tmp_path / "a.isplat").read_bytes()

@@ -27,7 +27,7 @@ from tests.services.registry.made import packed_model, save_model
 from tests.services.registry.stub_check import ALWAYS_READY, says
 
 
-def test_the_limits_of_a_model_are_those_of_the_guide():
+def test_model_limits_match_service_guide():
     guide = (Path(__file__).parents[3] / "docs" / "service.md").read_text(encoding="utf-8").replace("\n", " ")
     stated = (
         f"Limits are {records.MOST_GAUSSIANS:,} Gaussians, {records.MOST_PIXELS:,} pixels, {records.CHECK_S:g} s and"
@@ -57,7 +57,7 @@ def checked(checked_words):
 
 
 @pytest.mark.slow
-def test_a_good_model_is_described_and_rendered(tmp_path):
+def test_check_describes_and_renders_valid_model(tmp_path):
     folder = save_model(tmp_path / "model")
     seen = []
     verdict = run_check(folder, validated=lambda description: seen.append(dict(description)))
@@ -76,7 +76,7 @@ def test_a_good_model_is_described_and_rendered(tmp_path):
     assert verdict.description.keys() - validated.keys() == {"render_ms", "covered"}
 
 
-def test_a_model_of_another_renderer_is_rendered_by_it(checked, tmp_path):
+def test_check_renders_model_with_its_own_renderer(checked, tmp_path):
     """A model of weighted sums has no picture by alpha blending."""
     model = load_bundle(save_model(tmp_path / "alpha"))
     gaussians = WeightedSumRenderer.extended(model.gaussians)
@@ -86,7 +86,7 @@ def test_a_model_of_another_renderer_is_rendered_by_it(checked, tmp_path):
     assert (validated["renderer"], ready["stage"]) == ("weighted_sum", "ready")
 
 
-def test_a_check_states_its_result_in_words(checked_words, tmp_path):
+def test_check_without_json_prints_text(checked_words, tmp_path):
     first, second = checked_words(save_model(tmp_path / "model"))
     assert first.startswith("validated: gaussians 5, ") and second.startswith("ready: render_ms ")
 
@@ -99,27 +99,27 @@ def test_a_check_states_its_result_in_words(checked_words, tmp_path):
         ("MOST_PIXELS", 191, r"192 pixels \(16x12\); at most 191"),
     ],
 )
-def test_a_model_over_a_budget_is_rejected_before_it_is_read(tmp_path, budget, most, reason, checked, monkeypatch):
+def test_check_rejects_model_over_limit_before_reading(tmp_path, budget, most, reason, checked, monkeypatch):
     monkeypatch.setattr(check, budget, most)
     (verdict,) = checked(save_model(tmp_path / "model"))
     assert verdict["stage"] == "rejected"
     assert re.search(reason, verdict["reason"])
 
 
-def test_a_model_without_gaussians_is_rejected(tmp_path, checked):
+def test_check_rejects_model_without_gaussians(tmp_path, checked):
     (verdict,) = checked(save_model(tmp_path / "model", count=0))
     assert verdict["stage"] == "rejected" and "no Gaussians" in verdict["reason"]
 
 
 @pytest.mark.slow
-def test_a_check_without_enough_memory_is_a_verdict(tmp_path):
+def test_check_rejects_model_over_memory_limit(tmp_path):
     folder = save_model(tmp_path / "model", count=40_000)
     code = "import sys\nfrom services.registry import check, records\nrecords.CHECK_MEMORY_BYTES = 50 << 20\nsys.exit(check.main())"
     verdict = run_check(folder, program=(sys.executable, "-c", code))
     assert verdict.reason is not None and "memory" in verdict.reason
 
 
-def test_a_machine_without_memory_says_nothing_about_the_model(tmp_path, monkeypatch, capsys):
+def test_check_gives_no_verdict_if_machine_lacks_memory(tmp_path, monkeypatch, capsys):
     """Through the same program in this process: the reader finds too little memory left."""
     folder = save_model(tmp_path / "model")
     monkeypatch.setattr(check, "limit_resources", lambda device: None)
@@ -129,7 +129,7 @@ def test_a_machine_without_memory_says_nothing_about_the_model(tmp_path, monkeyp
     assert said.out == "" and "of memory to load" in said.err
 
 
-def test_the_reason_names_no_folder_of_the_machine(tmp_path, checked):
+def test_rejection_reason_omits_server_folder(tmp_path, checked):
     folder = save_model(tmp_path / "model")
     (folder / "model.safetensors").write_bytes(b"short")
     (verdict,) = checked(folder)
@@ -137,13 +137,13 @@ def test_the_reason_names_no_folder_of_the_machine(tmp_path, checked):
 
 
 @pytest.mark.slow
-def test_a_check_that_computes_too_long_is_ended(tmp_path):
+def test_limit_resources_ends_process_over_cpu_time(tmp_path):
     endless = "from services.registry import records\nrecords.CHECK_S = 0.1\nrecords.limit_resources('cpu')\nwhile True: pass\n"
     done = subprocess.run([sys.executable, "-c", endless], capture_output=True)
     assert -done.returncode == signal.SIGXCPU
 
 
-def test_a_check_that_lasts_too_long_is_ended_with_what_it_started(tmp_path, monkeypatch):
+def test_check_over_time_limit_is_killed_with_child_processes(tmp_path, monkeypatch):
     pid_file = tmp_path / "pid"
     program = says(
         f"import subprocess, sys, time; child = subprocess.Popen(['sleep', '60']); open({str(pid_file)!r}, 'w').write(str(child.pid)); time.sleep(60)"
@@ -164,7 +164,7 @@ def test_a_check_that_lasts_too_long_is_ended_with_what_it_started(tmp_path, mon
 
 
 @pytest.mark.parametrize("name", ["SIGKILL", "SIGSEGV", "SIGXCPU"])
-def test_a_model_that_brings_its_check_down_is_rejected(tmp_path, name):
+def test_model_is_rejected_if_check_dies_by_signal(tmp_path, name):
     program = says(f"import os, signal; os.kill(os.getpid(), signal.{name})")
     assert f"was ended by {name}" in run_check(tmp_path, program=program).reason
 
@@ -179,12 +179,12 @@ def test_a_model_that_brings_its_check_down_is_rejected(tmp_path, name):
         (("/nowhere/python",), "cannot be started: No such file"),
     ],
 )
-def test_a_check_that_cannot_be_run_says_nothing_about_the_model(tmp_path, program, said):
+def test_run_check_raises_if_program_gives_no_verdict(tmp_path, program, said):
     with pytest.raises(CheckFailed, match=said):
         run_check(tmp_path, program=program)
 
 
-def test_a_check_that_failed_can_be_made_again(tmp_path, files):
+def test_version_can_be_checked_again_after_check_failed(tmp_path, files):
     with ModelRegistry(tmp_path, check_program=says("raise SystemExit(1)")) as registry:
         registry.upload("liver", packed_model(files), None, "surgeon")
         with pytest.raises(CheckFailed):
@@ -195,7 +195,7 @@ def test_a_check_that_failed_can_be_made_again(tmp_path, files):
         assert registry.check("liver", 1).state == "ready"
 
 
-def test_closing_the_registry_ends_its_checks(tmp_path, files):
+def test_closing_registry_ends_running_and_waiting_checks(tmp_path, files):
     """Two are under way: one runs, the other waits for it. Neither version is rejected for that."""
     begun = tmp_path / "begun"
     program = says(f"import time; open({str(begun)!r}, 'w').close(); time.sleep(60)")
@@ -216,7 +216,7 @@ def test_closing_the_registry_ends_its_checks(tmp_path, files):
     registry.close()
 
 
-def test_credentials_do_not_reach_the_check(tmp_path, monkeypatch):
+def test_check_environment_contains_no_credentials(tmp_path, monkeypatch):
     monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "secret")
     program = says("import json, os; print(json.dumps({'stage': 'rejected', 'reason': ' '.join(os.environ)}))")
     monkeypatch.setenv("INTRASPLAT_KEY_FILE", "key")
@@ -225,14 +225,14 @@ def test_credentials_do_not_reach_the_check(tmp_path, monkeypatch):
     assert "PATH" in names and not any("AWS" in name or "INTRASPLAT_" in name for name in names)
 
 
-def test_a_flood_of_words_is_not_collected(tmp_path):
+def test_run_check_survives_output_flood(tmp_path):
     program = says(
         "import sys\nfor _ in range(100_000): sys.stdout.write('x' * 100)\nprint('\\n{\"stage\": \"ready\"}')"
     )
     assert run_check(tmp_path, program=program).reason is None
 
 
-def test_a_picture_that_is_not_finite_is_rejected(tmp_path, monkeypatch, capsys):
+def test_check_rejects_model_with_non_finite_render(tmp_path, monkeypatch, capsys):
     """Through the same program in this process, with a renderer that is broken."""
     folder = save_model(tmp_path / "model")
     monkeypatch.setattr(check, "limit_resources", lambda device: None)

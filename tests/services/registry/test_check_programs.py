@@ -31,7 +31,7 @@ class Limits:
 
 
 @pytest.mark.parametrize("device", ["cpu", "cuda"])
-def test_a_check_has_limits_beyond_what_it_took_to_start(monkeypatch: pytest.MonkeyPatch, device: str) -> None:
+def test_limit_resources_adds_limits_to_resources_in_use(monkeypatch: pytest.MonkeyPatch, device: str) -> None:
     limits = Limits(monkeypatch, {})
     limit_resources(device)
     assert limits.nice == [records.NICENESS] and limits.set[resource.RLIMIT_CORE] == (0, 0)
@@ -41,14 +41,14 @@ def test_a_check_has_limits_beyond_what_it_took_to_start(monkeypatch: pytest.Mon
     assert limits.set.get(resource.RLIMIT_DATA) == ((most, most) if device == "cpu" else None)
 
 
-def test_limits_of_the_service_itself_are_not_exceeded(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_limit_resources_keeps_lower_hard_limits(monkeypatch: pytest.MonkeyPatch) -> None:
     limits = Limits(monkeypatch, {resource.RLIMIT_CPU: 60, resource.RLIMIT_DATA: records.CHECK_MEMORY_BYTES + 1001})
     limit_resources("cpu")
     assert limits.set[resource.RLIMIT_CPU] == (60, 60)
     assert limits.set[resource.RLIMIT_DATA] == (records.CHECK_MEMORY_BYTES + 1000,) * 2
 
 
-def test_the_memory_of_this_process_is_counted() -> None:
+def test_taken_bytes_counts_allocated_memory() -> None:
     before = records.taken_bytes()
     kept = bytearray(64 << 20)
     assert 60 << 20 < records.taken_bytes() - before < 80 << 20
@@ -63,7 +63,7 @@ def test_the_memory_of_this_process_is_counted() -> None:
     ],
     ids=str,
 )  # fmt: skip
-def test_what_says_that_memory_is_missing(error: Exception, says_so: bool) -> None:
+def test_says_out_of_memory_recognises_memory_errors(error: Exception, says_so: bool) -> None:
     assert says_out_of_memory(error) == says_so
 
 
@@ -77,7 +77,7 @@ FAILURES = [
 
 @pytest.mark.parametrize(("error", "code", "stage", "said"), FAILURES, ids=lambda each: type(each).__name__)
 @pytest.mark.parametrize("program", ["check", "convert"])
-def test_only_what_the_file_is_to_blame_for_is_a_verdict(
+def test_check_and_convert_reject_only_for_errors_of_the_file(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, program: str, error: Exception,
     code: int, stage: str | None, said: str,
 ) -> None:  # fmt: skip
@@ -97,7 +97,7 @@ def test_only_what_the_file_is_to_blame_for_is_a_verdict(
 
 
 @pytest.mark.parametrize("program", ["check", "convert"])
-def test_other_errors_are_faults_of_the_program(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, program: str) -> None:
+def test_check_and_convert_raise_other_errors(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, program: str) -> None:
     def fail(*_: Any) -> None:
         raise RuntimeError("shapes differ")
 
@@ -109,7 +109,7 @@ def test_other_errors_are_faults_of_the_program(monkeypatch: pytest.MonkeyPatch,
         check.main([*arguments, "--json"])
 
 
-def test_a_gpu_without_memory_says_nothing_about_the_model(
+def test_check_gives_no_verdict_if_gpu_is_out_of_memory(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     def fail(*_: Any) -> None:
@@ -122,7 +122,7 @@ def test_a_gpu_without_memory_says_nothing_about_the_model(
 
 
 @pytest.mark.parametrize(("values", "kind"), [(True, BundleCorrupt), (False, BundleError)])
-def test_values_that_no_model_can_have_are_the_files_fault(
+def test_convert_raises_bundle_corrupt_for_invalid_values_and_counts(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, values: bool, kind: type[Exception]
 ) -> None:
     class Model:

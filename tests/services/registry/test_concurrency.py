@@ -14,7 +14,7 @@ from tests.services.registry.stub_check import says
 
 
 @pytest.mark.slow
-def test_of_two_processes_that_activate_at_once_one_wins(new_registry, files, database_url, tmp_path):
+def test_concurrent_activations_in_two_processes_succeed_once(new_registry, files, database_url, tmp_path):
     registry = new_registry()
     for seed in range(3):
         add_ready(registry, files, seed)
@@ -48,7 +48,7 @@ def test_of_two_processes_that_activate_at_once_one_wins(new_registry, files, da
         results.join_thread()
 
 
-def test_uploads_at_once_get_different_numbers(registry, files):
+def test_concurrent_uploads_get_different_version_numbers(registry, files):
     file = packed_model(files)
     with ThreadPoolExecutor(4) as pool:
         records = list(pool.map(lambda _: registry.upload("liver", file, None, "surgeon"), range(12)))
@@ -56,7 +56,7 @@ def test_uploads_at_once_get_different_numbers(registry, files):
     assert_whole(registry)
 
 
-def test_two_checks_of_one_version_agree(registry, files):
+def test_concurrent_checks_of_same_version_agree(registry, files):
     version = registry.upload("liver", packed_model(files), None, "surgeon").version
     with ThreadPoolExecutor(2) as pool:
         first, second = pool.map(lambda _: registry.check("liver", version), range(2))
@@ -64,7 +64,7 @@ def test_two_checks_of_one_version_agree(registry, files):
 
 
 @pytest.mark.slow
-def test_checks_wait_for_each_other(tmp_path, files):
+def test_checks_run_one_at_a_time(tmp_path, files):
     """Each check takes a file for itself, and fails where it is taken."""
     taken = str(tmp_path / "taken")
     program = says(
@@ -80,7 +80,7 @@ def test_checks_wait_for_each_other(tmp_path, files):
 
 
 @pytest.mark.slow
-def test_readers_always_see_one_active_version(registry, files):
+def test_readers_see_active_version_during_activations_and_rollbacks(registry, files):
     """Activations and rollbacks run concurrently with the readers."""
     for seed in range(2):
         add_ready(registry, files, seed)
@@ -103,7 +103,7 @@ def test_readers_always_see_one_active_version(registry, files):
     assert_whole(registry)
 
 
-def test_a_version_that_is_deleted_while_it_is_checked_is_gone(new_registry, files):
+def test_check_raises_not_found_if_version_is_deleted_meanwhile(new_registry, files):
     registry = new_registry()
     version = registry.upload("liver", packed_model(files), None, "surgeon").version
     registry._reached = lambda step: registry.delete("liver", version, "admin") if step == "check ended" else None

@@ -45,7 +45,7 @@ def converted(monkeypatch, capsys, tmp_path):
 
 
 @pytest.mark.parametrize("format_name", FILES)
-def test_a_splat_file_becomes_a_static_model(converted, tmp_path, format_name):
+def test_convert_makes_static_model_from_splat_file(converted, tmp_path, format_name):
     said = converted(written(tmp_path, format_name))
     assert said["stage"] == "ready" and said["gaussians"] == 144
     made = tmp_path / "made.isplat"
@@ -71,7 +71,7 @@ def test_a_splat_file_becomes_a_static_model(converted, tmp_path, format_name):
         ("a.spz", b"NGSP" + bytes(40), "version"),
     ],
 )
-def test_a_file_that_is_something_else_is_refused_in_one_sentence(converted, tmp_path, name, content, reason):
+def test_convert_rejects_invalid_splat_file_with_reason(converted, tmp_path, name, content, reason):
     (tmp_path / name).write_bytes(content)
     said = converted(tmp_path / name)
     assert said["stage"] == "rejected" and str(tmp_path) not in said["reason"]
@@ -79,13 +79,13 @@ def test_a_file_that_is_something_else_is_refused_in_one_sentence(converted, tmp
     assert not (tmp_path / "made.isplat").exists()
 
 
-def test_too_many_gaussians_are_refused(converted, tmp_path, monkeypatch):
+def test_convert_rejects_splat_file_with_too_many_gaussians(converted, tmp_path, monkeypatch):
     monkeypatch.setattr(check, "MOST_GAUSSIANS", 100)
     assert "144 Gaussians; at most 100" in converted(written(tmp_path, "ply"))["reason"]
 
 
 @pytest.mark.slow
-def test_an_uploaded_splat_file_is_converted_checked_and_activated(tmp_path):
+def test_uploaded_splat_file_is_converted_checked_and_activated(tmp_path):
     with ModelRegistry(tmp_path / "registry") as registry:
         file = written(tmp_path, "spz").rename(tmp_path / "upload-1")
         made = registry.upload_splats("liver", file, "spz", "test")
@@ -106,7 +106,7 @@ def test_an_uploaded_splat_file_is_converted_checked_and_activated(tmp_path):
         ("pass", CheckFailed, "without a result"),
     ],
 )
-def test_the_end_of_a_conversion_is_told_apart(tmp_path, program, error, message):
+def test_upload_splats_raises_rejected_or_check_failed_by_program_end(tmp_path, program, error, message):
     with ModelRegistry(tmp_path / "registry", convert_program=(sys.executable, "-c", program)) as registry:
         (tmp_path / "upload-1").write_bytes(b"ply")
         with pytest.raises(error, match=message):

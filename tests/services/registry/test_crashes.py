@@ -72,7 +72,7 @@ def run_dying():
 
 
 @pytest.mark.parametrize("action", STEPS)
-def test_every_step_is_known(action, tmp_path, files):
+def test_registry_actions_reach_all_listed_steps(action, tmp_path, files):
     prepare(tmp_path, files, action)
     steps = []
     with ModelRegistry(tmp_path, check_program=ALWAYS_READY, reached=steps.append) as registry:
@@ -81,7 +81,7 @@ def test_every_step_is_known(action, tmp_path, files):
 
 
 @pytest.mark.parametrize(("action", "step"), [(action, step) for action, steps in STEPS.items() for step in steps])
-def test_a_kill_at_a_step_leaves_the_old_or_the_new(run_dying, action, step, tmp_path, files, database_url):
+def test_kill_at_any_step_leaves_old_or_new_state(run_dying, action, step, tmp_path, files, database_url):
     prepare(tmp_path, files, action, database_url)
     assert run_dying(tmp_path, database_url or "", packed_model(files, 2), action, step) == -9
     happened = action in COMMITTED and STEPS[action].index(step) >= STEPS[action].index(COMMITTED[action])
@@ -105,7 +105,7 @@ def test_a_kill_at_a_step_leaves_the_old_or_the_new(run_dying, action, step, tmp
             assert_whole(registry)
 
 
-def test_kills_at_random_while_versions_are_swapped(tmp_path, files):
+def test_random_kills_during_activations_lose_no_confirmed_change(tmp_path, files):
     prepare(tmp_path, files, "activate")
     dice = random.Random(0)
     with ModelRegistry(tmp_path, check_program=ALWAYS_READY) as reader:

@@ -24,13 +24,13 @@ def database(database_url, tmp_path):
     opened.close()
 
 
-def test_the_migrations_make_the_tables_that_the_program_uses(database):
+def test_registry_migrations_create_tables_of_metadata(database):
     database.migrate()
     with database.reading() as connection:
         assert compare_metadata(MigrationContext.configure(connection), METADATA) == []
 
 
-def test_migrating_twice_changes_nothing(database):
+def test_second_migration_keeps_data(database):
     database.migrate()
     with database.writing() as connection:
         connection.execute(sa.insert(MODELS).values(name="liver", created_at="now", last_version=0))
@@ -39,7 +39,7 @@ def test_migrating_twice_changes_nothing(database):
         assert connection.execute(sa.select(MODELS.c.name)).scalars().all() == ["liver"]
 
 
-def test_several_programs_that_start_at_once_migrate_once(database):
+def test_concurrent_migrations_succeed(database):
     errors = []
 
     def migrate():
@@ -56,7 +56,7 @@ def test_several_programs_that_start_at_once_migrate_once(database):
     assert errors == []
 
 
-def test_a_database_of_a_later_version_is_refused_and_left_alone(database):
+def test_migrate_raises_for_newer_schema_and_leaves_it_unchanged(database):
     database.migrate()
     with database.writing() as connection:
         connection.execute(sa.text("UPDATE alembic_version SET version_num = '0999'"))
@@ -68,7 +68,7 @@ def test_a_database_of_a_later_version_is_refused_and_left_alone(database):
         assert connection.execute(sa.text("SELECT version_num FROM alembic_version")).scalar() == "0999"
 
 
-def test_what_failed_is_undone(database):
+def test_failed_transaction_is_rolled_back(database):
     database.migrate()
     with pytest.raises(ZeroDivisionError), database.writing() as connection:
         connection.execute(sa.insert(MODELS).values(name="liver", created_at="now", last_version=0))
@@ -97,7 +97,7 @@ def test_a_second_writer_waits_for_the_first(database):
     assert order == ["first", "second"]
 
 
-def test_sqlite_keeps_what_was_committed_and_lets_readers_go_on(tmp_path):
+def test_sqlite_uses_wal_and_allows_reads_during_write(tmp_path):
     database = Database(f"sqlite:///{tmp_path / 'a.sqlite'}")
     with database.reading() as connection:
         asked = [
@@ -111,13 +111,13 @@ def test_sqlite_keeps_what_was_committed_and_lets_readers_go_on(tmp_path):
     database.close()
 
 
-def test_a_file_that_is_no_database_is_named(tmp_path):
+def test_registry_raises_for_file_that_is_not_sqlite(tmp_path):
     (tmp_path / "registry.sqlite").write_bytes(b"something else entirely" * 100)
     with pytest.raises(StoreUnavailable, match=r"registry\.sqlite does not answer: file is not a database"):
         ModelRegistry(tmp_path)
 
 
-def test_a_server_that_does_not_answer_is_named_without_its_password():
+def test_database_error_names_server_without_password():
     database = Database("postgresql://somebody:secret@127.0.0.1:1/registry")
     with pytest.raises(StoreUnavailable, match=r"somebody:\*\*\*@127\.0\.0\.1.*does not answer") as raised:
         database.migrate()
@@ -125,12 +125,12 @@ def test_a_server_that_does_not_answer_is_named_without_its_password():
 
 
 @pytest.mark.parametrize("url", ["", "nonsense", "mysql://host/x", "oracle://host/x", "nothing://x"])
-def test_other_databases_are_refused(url):
+def test_database_raises_for_unsupported_url(url):
     with pytest.raises(StoreUnavailable, match="cannot be opened"):
         Database(url)
 
 
-def test_connections_that_the_server_ended_are_opened_again(postgresql):
+def test_connection_closed_by_postgresql_is_reopened(postgresql):
     url = new_database(postgresql)
     database, other = Database(url), Database(url)
     database.migrate()
@@ -145,7 +145,7 @@ def test_connections_that_the_server_ended_are_opened_again(postgresql):
     other.close()
 
 
-def test_a_full_disk_is_said_with_its_remedy(tmp_path):
+def test_full_disk_raises_store_unavailable_with_advice(tmp_path):
     database = Database(f"sqlite:///{tmp_path / 'registry.sqlite'}")
     with pytest.raises(StoreUnavailable, match="its disk is full; free space"), database.writing() as connection:
         connection.exec_driver_sql("PRAGMA max_page_count = 1")
@@ -154,7 +154,7 @@ def test_a_full_disk_is_said_with_its_remedy(tmp_path):
 
 
 @pytest.mark.parametrize(("free", "said"), [(4096, "its disk is full; free space"), (1 << 30, "check that it runs")])
-def test_an_error_of_the_disk_is_a_full_disk_only_where_no_space_is_free(tmp_path, monkeypatch, free, said):
+def test_disk_io_error_is_reported_as_full_disk_only_without_free_space(tmp_path, monkeypatch, free, said):
     database = Database(f"sqlite:///{tmp_path / 'registry.sqlite'}")
     monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=free))
     cause = sqlite3.OperationalError("disk I/O error")

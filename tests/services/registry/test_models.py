@@ -13,7 +13,7 @@ from tests.services.registry.made import add_ready, assert_whole, packed_model, 
 from tests.services.registry.stub_check import ALWAYS_READY, says
 
 
-def test_a_version_is_uploaded_checked_and_activated(registry, files):
+def test_version_is_uploaded_checked_and_activated(registry, files):
     file = packed_model(files)
     record = registry.upload("liver", file, sha256(file).upper(), "surgeon")
     assert (record.name, record.version, record.state, record.reason) == ("liver", 1, "uploaded", None)
@@ -43,7 +43,7 @@ def test_a_version_is_uploaded_checked_and_activated(registry, files):
     assert_whole(registry)
 
 
-def test_what_is_there_stays_when_it_is_opened_again(new_registry, files):
+def test_reopened_registry_keeps_versions_and_models(new_registry, files):
     with new_registry() as registry:
         registry.activate("liver", add_ready(registry, files), None, "admin")
         before = registry.versions("liver"), registry.models()
@@ -52,7 +52,7 @@ def test_what_is_there_stays_when_it_is_opened_again(new_registry, files):
         assert_whole(registry)
 
 
-def test_numbers_count_up_and_are_never_given_twice(registry, files):
+def test_version_numbers_increase_and_are_not_reused(registry, files):
     assert [add_ready(registry, files, seed) for seed in (0, 1)] == [1, 2]
     registry.delete("liver", 2, "admin")
     assert add_ready(registry, files, 1) == 3
@@ -64,7 +64,7 @@ def test_numbers_count_up_and_are_never_given_twice(registry, files):
     assert_whole(registry)
 
 
-def test_activation_compares_before_it_swaps(registry, files):
+def test_activate_raises_conflict_unless_expected_version_is_active(registry, files):
     first, second = add_ready(registry, files, 0), add_ready(registry, files, 1)
     registry.activate("liver", first, None, "admin")
     with pytest.raises(Conflict, match="has version 1 active, not no version as expected"):
@@ -76,7 +76,7 @@ def test_activation_compares_before_it_swaps(registry, files):
     assert [version.state for version in registry.versions("liver")] == ["retired", "active"]
 
 
-def test_an_unchecked_and_a_rejected_version_are_not_activated(new_registry, files):
+def test_activate_raises_for_unchecked_or_rejected_version(new_registry, files):
     registry = new_registry(check_program=says("""print('{"stage": "rejected", "reason": "it is blue"}')"""))
     version = registry.upload("liver", packed_model(files), None, "surgeon").version
     with pytest.raises(Conflict, match="is uploaded; only one that is ready or retired"):
@@ -88,7 +88,7 @@ def test_an_unchecked_and_a_rejected_version_are_not_activated(new_registry, fil
     assert registry.check("liver", version) == rejected
 
 
-def test_rollback_goes_back_step_by_step(registry, files):
+def test_rollback_reactivates_earlier_versions_in_order(registry, files):
     for seed in range(3):
         version = add_ready(registry, files, seed)
         registry.activate("liver", version, version - 1 or None, "admin")
@@ -107,7 +107,7 @@ def test_rollback_goes_back_step_by_step(registry, files):
     assert_whole(registry)
 
 
-def test_rollback_skips_what_was_deleted(registry, files):
+def test_rollback_skips_deleted_versions(registry, files):
     for seed in range(2):
         add_ready(registry, files, seed)
     for version, expected in ((1, None), (2, 1), (1, 2), (2, 1)):
@@ -117,13 +117,13 @@ def test_rollback_skips_what_was_deleted(registry, files):
         registry.rollback("liver", "admin")
 
 
-def test_nothing_was_ever_active(registry, files):
+def test_rollback_raises_before_first_activation(registry, files):
     add_ready(registry, files)
     with pytest.raises(Conflict, match="no version that was active before any"):
         registry.rollback("liver", "admin")
 
 
-def test_deleting_removes_the_files_and_never_the_active_version(registry, files, tmp_path):
+def test_delete_removes_unshared_files_and_refuses_active_version(registry, files, tmp_path):
     first, second = add_ready(registry, files, 0), add_ready(registry, files, 1)
     same = add_ready(registry, files, 1)
     registry.activate("liver", first, None, "admin")
@@ -157,19 +157,19 @@ def test_deleting_removes_the_files_and_never_the_active_version(registry, files
         lambda registry: registry.delete("x", 1, "a"),
     ],
 )
-def test_an_unknown_model_is_named(sqlite_registry, call):
+def test_registry_calls_raise_not_found_for_unknown_model(sqlite_registry, call):
     with pytest.raises(NotFound, match="there is no model 'x'"):
         call(sqlite_registry)
 
 
-def test_a_wrong_digest_is_refused_and_nothing_is_kept(sqlite_registry, files, tmp_path):
+def test_upload_with_wrong_digest_is_rejected_and_not_kept(sqlite_registry, files, tmp_path):
     with pytest.raises(Rejected, match=r"its sender said 0000.*; upload it again"):
         sqlite_registry.upload("liver", packed_model(files), 64 * "0", "surgeon")
     assert sqlite_registry.models() == []
     assert [list((tmp_path / "registry" / folder).iterdir()) for folder in ("incoming", "blobs")] == [[], []]
 
 
-def test_a_file_over_the_limit_is_refused(tmp_path, files):
+def test_upload_over_size_limit_is_rejected(tmp_path, files):
     file = packed_model(files)
     with ModelRegistry(tmp_path, most_upload_bytes=file.stat().st_size - 1) as registry:
         with pytest.raises(Rejected, match="more than"):
@@ -178,18 +178,18 @@ def test_a_file_over_the_limit_is_refused(tmp_path, files):
 
 
 @pytest.mark.parametrize("name", ["", "Liver", "../liver", "a/b", "-a", "a.", 65 * "a", "lé", "a\n", "a\0"])
-def test_names_that_could_be_something_else_are_refused(sqlite_registry, files, name):
+def test_upload_rejects_invalid_model_names(sqlite_registry, files, name):
     with pytest.raises(Rejected, match="cannot be the name of a model"):
         sqlite_registry.upload(name, packed_model(files), None, "surgeon")
 
 
 @pytest.mark.parametrize("by", ["", 201 * "a", "a\nb"])
-def test_who_it_was_has_to_be_said(sqlite_registry, files, by):
+def test_upload_rejects_invalid_user_names(sqlite_registry, files, by):
     with pytest.raises(Rejected, match="`by` must be"):
         sqlite_registry.upload("liver", packed_model(files), None, by)
 
 
-def test_an_unpacked_copy_that_was_changed_is_made_again(sqlite_registry, files, caplog):
+def test_changed_unpacked_copy_is_unpacked_again(sqlite_registry, files, caplog):
     version = add_ready(sqlite_registry, files)
     folder = sqlite_registry.folder_of("liver", version)
     tensors = folder / "model.safetensors"
@@ -201,7 +201,7 @@ def test_an_unpacked_copy_that_was_changed_is_made_again(sqlite_registry, files,
 
 
 @pytest.mark.parametrize("damage", ["gone", "changed", "cut"])
-def test_a_stored_file_that_is_damaged_is_not_served_and_named_at_start(sqlite_registry, files, tmp_path, damage):
+def test_damaged_blob_is_not_activated_and_listed_by_recover(sqlite_registry, files, tmp_path, damage):
     versions = [add_ready(sqlite_registry, files, seed) for seed in (0, 1)]
     sqlite_registry.activate("liver", versions[1], None, "admin")
     shutil.rmtree(tmp_path / "registry" / "unpacked")
@@ -223,7 +223,7 @@ def test_a_stored_file_that_is_damaged_is_not_served_and_named_at_start(sqlite_r
     assert sqlite_registry.version("liver", 1).state == "ready"
 
 
-def test_a_version_that_was_damaged_is_not_rolled_back_to(sqlite_registry, files, tmp_path):
+def test_rollback_raises_if_blob_of_earlier_version_is_missing(sqlite_registry, files, tmp_path):
     for version in (add_ready(sqlite_registry, files, 0), add_ready(sqlite_registry, files, 1)):
         sqlite_registry.activate("liver", version, version - 1 or None, "admin")
     shutil.rmtree(sqlite_registry.folder_of("liver", 1))
@@ -235,12 +235,12 @@ def test_a_version_that_was_damaged_is_not_rolled_back_to(sqlite_registry, files
     assert [version.state for version in sqlite_registry.versions("liver")] == ["retired", "active"]
 
 
-def test_a_file_that_is_not_there_is_named(sqlite_registry, tmp_path):
+def test_upload_raises_for_missing_file(sqlite_registry, tmp_path):
     with pytest.raises(StoreUnavailable, match=r"nothing\.isplat is missing"):
         sqlite_registry.upload("liver", tmp_path / "nothing.isplat", None, "surgeon")
 
 
-def test_a_full_disk_is_said_and_nothing_is_kept(sqlite_registry, files, tmp_path, monkeypatch):
+def test_upload_on_full_disk_raises_and_keeps_nothing(sqlite_registry, files, tmp_path, monkeypatch):
     def full(descriptor):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -251,7 +251,7 @@ def test_a_full_disk_is_said_and_nothing_is_kept(sqlite_registry, files, tmp_pat
     assert sqlite_registry.models() == [] and not list((tmp_path / "registry" / "incoming").iterdir())
 
 
-def test_leftovers_are_removed_and_what_is_not_ours_stays(tmp_path, files):
+def test_recover_removes_leftovers_and_keeps_foreign_files(tmp_path, files):
     root = tmp_path / "registry"
     with ModelRegistry(root, check_program=ALWAYS_READY) as registry:
         add_ready(registry, files)
@@ -273,7 +273,7 @@ def test_leftovers_are_removed_and_what_is_not_ours_stays(tmp_path, files):
         assert_whole(registry)
 
 
-def test_nothing_is_removed_while_somebody_writes(sqlite_registry, tmp_path):
+def test_recover_skips_removal_while_lock_is_held(sqlite_registry, tmp_path):
     (tmp_path / "registry" / "incoming" / "half.part").write_bytes(b"half")
     with sqlite_registry._lock.shared():
         found = sqlite_registry.recover(wait_s=0)

@@ -46,7 +46,7 @@ def objects(bucket):
     return [path.rsplit("/", 1)[-1] for path in files.find(name)]
 
 
-def test_files_lie_in_the_bucket_under_their_digest(registry, bucket, files, tmp_path):
+def test_s3_objects_are_named_by_digest(registry, bucket, files, tmp_path):
     assert registry.recover().removed == ()
     version = add_ready(registry, files)
     registry.activate("liver", version, None, "admin")
@@ -60,7 +60,7 @@ def test_files_lie_in_the_bucket_under_their_digest(registry, bucket, files, tmp
     assert objects(bucket) == [key]
 
 
-def test_an_object_that_is_gone_or_changed_is_noticed(registry, bucket, files, tmp_path):
+def test_missing_or_changed_s3_object_raises(registry, bucket, files, tmp_path):
     store, name = bucket
     versions = [registry.upload("liver", packed_model(files, seed), None, "surgeon").version for seed in (0, 1)]
     for key in objects(bucket):
@@ -76,7 +76,7 @@ def test_an_object_that_is_gone_or_changed_is_noticed(registry, bucket, files, t
     assert not list((tmp_path / "registry" / "incoming").iterdir())
 
 
-def test_uploads_that_no_version_names_are_removed_once_they_are_old(bucket, s3):
+def test_s3_orphan_is_abandoned_only_after_age_limit(bucket, s3):
     store, name = bucket
     orphan = f"{64 * 'a'}-{16 * 'b'}.isplat"
     store.pipe(f"{name}/isplat/{orphan}", b"x")
@@ -89,7 +89,7 @@ def test_uploads_that_no_version_names_are_removed_once_they_are_old(bucket, s3)
     assert old.stored() == []
 
 
-def test_an_upload_that_ended_before_its_row_is_removed_once_it_is_old(bucket, s3, files, tmp_path, monkeypatch):
+def test_recover_removes_old_s3_upload_without_row(bucket, s3, files, tmp_path, monkeypatch):
     def stop(step):
         if step == "blob stored":
             raise KeyboardInterrupt
@@ -105,14 +105,14 @@ def test_an_upload_that_ended_before_its_row_is_removed_once_it_is_old(bucket, s
     assert objects(bucket) == []
 
 
-def test_an_upload_that_the_store_does_not_take_leaves_nothing(s3, credentials, files, tmp_path):
+def test_upload_to_missing_bucket_raises_and_keeps_nothing(s3, credentials, files, tmp_path):
     with ModelRegistry(tmp_path, blobs_url="s3://no-such-bucket/x", blob_options=s3) as registry:
         with pytest.raises(StoreUnavailable, match="no-such-bucket"):
             registry.upload("liver", packed_model(files), None, "surgeon")
         assert registry.models() == [] and not list((tmp_path / "incoming").iterdir())
 
 
-def test_a_store_that_does_not_answer_is_named(credentials, files, tmp_path):
+def test_upload_error_names_unreachable_s3_store(credentials, files, tmp_path):
     options = {"endpoint_url": "http://127.0.0.1:1", "config_kwargs": {"retries": {"max_attempts": 0}}}
     with (
         ModelRegistry(tmp_path, blobs_url="s3://models/x", blob_options=options) as registry,
@@ -121,6 +121,6 @@ def test_a_store_that_does_not_answer_is_named(credentials, files, tmp_path):
         registry.upload("liver", packed_model(files), None, "surgeon")
 
 
-def test_an_unknown_kind_of_store_is_refused(tmp_path):
+def test_registry_raises_for_unknown_blob_protocol(tmp_path):
     with pytest.raises(StoreUnavailable, match="cannot be used: Protocol not known"):
         ModelRegistry(tmp_path, blobs_url="nowhere://models")

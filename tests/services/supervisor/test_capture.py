@@ -98,7 +98,7 @@ It runs in a separate interpreter: other tests of this one may start processes m
 
 
 @pytest.mark.parametrize("kind", ["url", "file"])
-def test_no_source_is_read_in_a_process_of_its_own(kind, video_url, tmp_path):
+def test_capture_starts_no_child_process(kind, video_url, tmp_path):
     address = video_url if kind == "url" else f"{tmp_path}/v.mkv"
     run = subprocess.run(
         [sys.executable, "-c", CAPTURE_COUNTED, address],
@@ -110,7 +110,7 @@ def test_no_source_is_read_in_a_process_of_its_own(kind, video_url, tmp_path):
     assert run.stdout.split("\n")[-2:-1] == ["1 []"], run.stdout + run.stderr
 
 
-def test_the_options_of_every_scheme_say_so(monkeypatch):
+def test_capture_opens_every_scheme_with_process_option_false(monkeypatch):
     """Blocking sources such as cameras run in a child process unless configured otherwise."""
     opened = []
 
@@ -142,7 +142,7 @@ class StuckCamera:
         return None
 
 
-def test_a_camera_whose_driver_is_stuck_ends_the_process(monkeypatch):
+def test_capture_exits_if_camera_driver_is_stuck(monkeypatch):
     monkeypatch.setattr(capture_module, "STUCK_AFTER_S", {"v4l2": 0.05})
 
     class Ended(BaseException): ...
@@ -225,7 +225,7 @@ def published(monkeypatch, *sources, most):
 FRAME = Frame(0, 0, np.zeros((6, 8, 3), np.uint8))
 
 
-def test_a_source_is_opened_again_after_errors_and_waits_longer_each_time(monkeypatch):
+def test_capture_reopens_source_with_growing_back_off(monkeypatch):
     first, second = Scripted(FRAME, FRAME, SourceError("cable unplugged")), Scripted(FRAME)
     none = SourceUnavailable("connection refused")
     worker, publisher, capture, before = published(monkeypatch, none, none, first, none, second, most=3)
@@ -241,14 +241,14 @@ def test_a_source_is_opened_again_after_errors_and_waits_longer_each_time(monkey
         capture.describe({})
 
 
-def test_a_source_without_frames_reports_its_state_and_waits_only_at_its_end(monkeypatch):
+def test_capture_reports_source_states_and_waits_only_when_ended(monkeypatch):
     source = Scripted(SourceState.STALLED, SourceState.RECONNECTING, SourceState.ENDED, FRAME)
     worker, _, _, _ = published(monkeypatch, source, most=1)
     assert [state for state, _ in worker.said] == ["stalled", "reconnecting", "ended", "live"]
     assert worker.said[0][1] == "the source is stalled" and worker.waits == [capture_module.POLL_S]
 
 
-def test_an_open_source_is_described_and_counts_for_itself(monkeypatch):
+def test_capture_describes_open_source_and_reports_its_counts(monkeypatch):
     seen = []
 
     class Reporting(Scripted):

@@ -64,7 +64,7 @@ def until(what) -> None:
         time.sleep(0.01)
 
 
-def test_frames_come_with_all_that_they_have(folder):
+def test_captured_source_receives_image_mask_depth_and_status(folder):
     capture = StandIn(folder, run=1)
     source = CapturedSource(folder)
     assert (source.description.camera, source.description.fields) == (ABOUT.camera, ABOUT.fields)
@@ -79,7 +79,7 @@ def test_frames_come_with_all_that_they_have(folder):
     capture.close()
 
 
-def test_numbers_and_times_go_on_when_capture_is_there_again(folder):
+def test_captured_source_continues_numbers_and_times_after_restart(folder):
     capture = StandIn(folder, run=1)
     source = CapturedSource(folder)
     source.open()
@@ -100,7 +100,7 @@ def test_numbers_and_times_go_on_when_capture_is_there_again(folder):
     ("said", "state"),
     [("stalled", SourceState.STALLED), ("ended", SourceState.STALLED), ("opening", SourceState.RECONNECTING)],
 )
-def test_it_says_what_capture_says_of_its_source(folder, said, state):
+def test_captured_source_reports_state_of_capture_process(folder, said, state):
     capture = StandIn(folder, run=1)
     source = CapturedSource(folder)
     source.open()
@@ -113,7 +113,7 @@ def test_it_says_what_capture_says_of_its_source(folder, said, state):
     capture.close()
 
 
-def test_a_message_that_is_no_frame_is_counted(folder, monkeypatch):
+def test_captured_source_counts_malformed_messages(folder, monkeypatch):
     capture = StandIn(folder, run=1)
     source = CapturedSource(folder)
     source.open()
@@ -128,14 +128,14 @@ def test_a_message_that_is_no_frame_is_counted(folder, monkeypatch):
     capture.close()
 
 
-def test_waiting_for_capture_ends_when_it_is_told_to(folder):
+def test_captured_source_stops_waiting_on_stop_request(folder):
     stop = threading.Event()
     threading.Timer(0.2, stop.set).start()
     with pytest.raises(SourceUnavailable, match="has not opened its source"):
         CapturedSource(folder, stop.is_set)
 
 
-def test_frames_are_scaled_to_what_the_engine_keeps_up_with(folder):
+def test_captured_source_scales_frames_and_camera(folder):
     capture = StandIn(folder, run=1)
     sizes: list[tuple[int, int]] = []
 

@@ -14,7 +14,7 @@ from services.supervisor.launcher import NO_USE
 from services.supervisor.worker import ENGINE_ON_CPU, EngineSpec, ProcessSpec
 
 
-def test_every_setting_of_the_specification_reaches_the_session(tmp_path):
+def test_live_settings_take_over_engine_spec(tmp_path):
     chosen = {
         "device": "cuda", "field": "basis", "renderer": "alpha", "seed": 5, "tool_mask": "none", "depth": "light",
         "eyes": "both", "poses": "estimated", "out_of_body": "off",
@@ -26,7 +26,7 @@ def test_every_setting_of_the_specification_reaches_the_session(tmp_path):
 
 
 @pytest.mark.parametrize("again", [False, True])
-def test_only_the_first_start_tries_everything_out(monkeypatch, again):
+def test_started_runs_trial_and_warm_up_on_first_start_only(monkeypatch, again):
     calls = []
     monkeypatch.setattr(engines, "new_parts", lambda settings, source: calls.append(("new", settings)) or "parts")
     monkeypatch.setattr(engines, "warm_up", lambda settings, source: calls.append(("warm", settings)) or "warm parts")
@@ -79,7 +79,7 @@ def shown(monkeypatch):
     return world
 
 
-def test_reconstruction_and_models_alternate_and_everything_is_closed(shown):
+def test_show_alternates_reconstruction_and_model_and_closes_parts(shown):
     def want(what):
         return lambda: setattr(shown.screen, "wanted", what)
 
@@ -97,13 +97,13 @@ def test_reconstruction_and_models_alternate_and_everything_is_closed(shown):
     assert reported == {"tell_figures": {"s": 3, "m": 1, "l": 2}, "tell_measures": {"ages": "AGES"}}
 
 
-def test_a_restarted_engine_says_so_to_its_first_reconstruction(shown):
+def test_show_passes_again_to_first_reconstruction(shown):
     shown.steps = [lambda: setattr(shown, "stopped", True)]
     shown.run(again=True)
     assert shown.reconstructed == [True]
 
 
-def test_a_failure_stops_the_process_and_closes_everything(shown):
+def test_show_requests_stop_and_closes_parts_on_error(shown):
     def fail():
         raise InvalidSetting("no")
 
@@ -170,7 +170,7 @@ def reconstructing(monkeypatch):
     return world
 
 
-def test_a_reconstruction_reports_its_state_its_pictures_and_its_figures(reconstructing):
+def test_reconstruct_reports_states_scores_pictures_and_figures(reconstructing):
     world, scores = reconstructing, []
     world.screen.scored = scores.append
 
@@ -197,7 +197,7 @@ def test_a_reconstruction_reports_its_state_its_pictures_and_its_figures(reconst
 @pytest.mark.parametrize(
     ("stopped", "wanted", "ends"), [(False, "live", False), (True, "live", True), (False, "model", True)]
 )
-def test_a_reconstruction_ends_on_a_stop_or_when_a_model_is_wanted(reconstructing, stopped, wanted, ends):
+def test_reconstruct_stops_on_stop_request_or_wanted_model(reconstructing, stopped, wanted, ends):
     world, asked = reconstructing, []
     world.stopped, world.screen.wanted = stopped, wanted
     world.during = lambda graph, stop: asked.append(stop())
@@ -205,7 +205,7 @@ def test_a_reconstruction_ends_on_a_stop_or_when_a_model_is_wanted(reconstructin
     assert asked == [ends] and world.source_stop() == ends
 
 
-def test_figures_of_a_graph_before_and_while_it_runs():
+def test_graph_figures_are_empty_before_run_and_complete_during_run():
     assert engines.graph_figures(SimpleNamespace()) == engines.graph_figures(SimpleNamespace(metrics=None)) == {}
     source = SimpleNamespace(state=SimpleNamespace(value="live"), counts=lambda: {"late": 1})
     counts = SimpleNamespace(frames=3, steps=9, passed_over=2, withheld={"blur": 4}, withheld_now={"blur": 1})
@@ -226,7 +226,7 @@ def test_figures_of_a_graph_before_and_while_it_runs():
     ("error", "code"), [(None, 0), (SourceUnavailable("not open yet"), 0), (InvalidSetting("wrong"), NO_USE)]
 )
 @pytest.mark.parametrize("device", ["cpu", "cuda"])
-def test_the_exit_code_tells_the_supervisor_if_a_restart_is_of_use(runtime, monkeypatch, error, code, device):
+def test_engine_exit_code_tells_if_restart_is_useful(runtime, monkeypatch, error, code, device):
     path = ProcessSpec(stream="a", engine=EngineSpec(device=device)).write(runtime.stream("a"))
     publisher, seen = Recorder(), {}
 

@@ -29,20 +29,20 @@ class Machine:
         return choose_working_size(about, lambda scale: 2e-3 + 0.18e-6 * scale**2 * pixels, share)
 
 
-def test_the_size_leaves_half_of_the_time_to_viewers(tmp_path):
+def test_engine_scale_uses_half_of_frame_interval(tmp_path):
     scale = engine_scale(EngineSpec(), stream(), tmp_path / "size", Machine())
     pixels = scale**2 * 640 * 512
     assert 0.75 < (2e-3 + 0.18e-6 * pixels) * 30 / SHARE_OF_INTERVAL <= 1
 
 
-def test_it_is_measured_once_and_taken_again_by_the_next_engine(tmp_path):
+def test_engine_scale_is_measured_once_and_cached(tmp_path):
     machine, kept = Machine(), tmp_path / "size"
     first = engine_scale(EngineSpec(), stream(), kept, machine)
     assert engine_scale(EngineSpec(), stream(), kept, machine) == first and machine.measured == 1
 
 
 @pytest.mark.parametrize("other", [stream(1280, 1024), stream(fps=60.0)])
-def test_another_source_is_measured_anew(tmp_path, other):
+def test_engine_scale_is_measured_again_for_other_source(tmp_path, other):
     machine, kept = Machine(), tmp_path / "size"
     engine_scale(EngineSpec(), stream(), kept, machine)
     engine_scale(EngineSpec(), other, kept, machine)
@@ -53,14 +53,14 @@ def test_another_source_is_measured_anew(tmp_path, other):
     "text", ["", "{", "[]", "7", "{}", '{"size": [640, 512, 30.0], "scale": "x"}', '{"size": [640, 512, 30.0], "scale": null}',
              '{"size": [640, 512, 30.0], "scale": 0}', '{"size": [640, 512, 30.0], "scale": 9}', '{"size": 3, "scale": 0.5}'],
 )  # fmt: skip
-def test_a_damaged_file_is_replaced(tmp_path, text):
+def test_engine_scale_replaces_damaged_cache_file(tmp_path, text):
     machine, kept = Machine(), tmp_path / "size"
     kept.write_text(text)
     scale = engine_scale(EngineSpec(), stream(), kept, machine)
     assert machine.measured == 1 and json.loads(kept.read_text())["scale"] == scale
 
 
-def test_what_is_asked_for_is_taken_and_a_gpu_reconstructs_all_of_it(tmp_path):
+def test_engine_scale_is_not_measured_if_set_or_on_gpu(tmp_path):
     machine, kept = Machine(), tmp_path / "size"
     assert engine_scale(EngineSpec(engine_scale=0.75), stream(), kept, machine) == 0.75
     assert engine_scale(EngineSpec(device="cuda"), stream(), kept, machine) == 1.0
@@ -68,7 +68,7 @@ def test_what_is_asked_for_is_taken_and_a_gpu_reconstructs_all_of_it(tmp_path):
     assert machine.measured == 0 and not kept.exists()
 
 
-def test_the_time_of_a_frame_is_kept_in_milliseconds(tmp_path):
+def test_engine_scale_cache_keeps_frame_time_in_milliseconds(tmp_path):
     scale = engine_scale(EngineSpec(), stream(), tmp_path / "size", Machine())
     kept = json.loads((tmp_path / "size").read_text())
     assert kept["size"] == [640, 512, 30.0]

@@ -56,7 +56,7 @@ ENGINE = {
 CAPTURE = {"state": "stalled", "figures": {"frames": 10, "counts": {"clock_restarts": 2}}}
 
 
-def test_all_that_a_stream_tells_is_there():
+def test_graph_families_export_all_measures_of_stream():
     families = GraphFamilies()
     measures = {
         "ages": durations(0.02, 0.03, 9.0),
@@ -85,13 +85,13 @@ def test_all_that_a_stream_tells_is_there():
     assert found['intrasplat_model_info{model="liver",show="model",stream="one",version="3"}'] == 1
 
 
-def test_a_stream_that_has_told_nothing_yet_has_a_source_state_alone():
+def test_graph_families_of_starting_stream_have_source_state_only():
     families = GraphFamilies()
     families.add("one", {"capture": {"state": "starting", "figures": {}}, "engine": {"state": "down"}}, {"ages": "x"})
     assert {name.partition("{")[0] for name in samples(families)} == {"intrasplat_source_state"}
 
 
-def test_the_live_model_is_one_series_however_often_it_is_published():
+def test_live_model_info_has_no_version_label():
     families = GraphFamilies()
     engine = {"state": "running", "figures": {"picture": {"show": "live", "model_version": 812}, "model": None}}
     families.add("one", {"capture": CAPTURE, "engine": engine}, {})
@@ -111,7 +111,7 @@ class Hub:
         return {"encoded": 5, "slow viewer": 2} if kind == "shown" else {}
 
 
-def test_streams_tell_their_state_processes_and_viewers_and_stopped_ones_their_state():
+def test_stream_measures_cover_processes_and_viewers_if_running():
     process = SimpleNamespace(measures={"ages": durations(0.5)}, causes={"killed by signal 9": 3, "heartbeat": 1})
     idle = SimpleNamespace(measures={}, causes={})
     running = SimpleNamespace(
@@ -148,7 +148,7 @@ def test_streams_tell_their_state_processes_and_viewers_and_stopped_ones_their_s
     assert value("display_latency_seconds_count", stream="one", picture=other) is None
 
 
-def test_a_graph_tells_what_its_tracker_has_seen():
+def test_graph_measures_return_operators_paths_and_queues():
     from operators.graph import Application, Operator
     from services.supervisor.engine import graph_measures
 
@@ -182,7 +182,7 @@ def test_a_graph_tells_what_its_tracker_has_seen():
     assert list(measures["queues"].values()) == [{"queued": 0, "dropped": {}}]
 
 
-def test_ends_have_few_causes():
+def test_cause_of_maps_exit_descriptions_to_few_causes():
     said = {
         "killed by SIGKILL": "SIGKILL",
         "it has said nothing for 3.1 s; it was killed": "hung",
@@ -193,5 +193,5 @@ def test_ends_have_few_causes():
     assert {how: cause_of(how) for how in said} == said
 
 
-def test_without_streams_there_are_families_and_no_samples():
+def test_stream_measures_without_streams_have_no_samples():
     assert all(not family.samples for family in StreamMeasures().collect())

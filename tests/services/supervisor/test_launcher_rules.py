@@ -49,7 +49,7 @@ def asked(launcher: Launcher, request: bytes) -> dict[str, object]:
         ({"command": "status", "pid": 8}, {"ok": True, "status": None}),
     ],
 )
-def test_a_request_to_the_launcher_gets_its_answer(
+def test_launcher_answers_known_requests(
     launcher: Launcher, request_: dict[str, object], answer: dict[str, object], monkeypatch
 ) -> None:
     monkeypatch.setattr(launcher, "_reap", lambda: launcher._ends.update({7: "signal 9"}))
@@ -66,20 +66,20 @@ def test_a_request_to_the_launcher_gets_its_answer(
         (packed_json({"command": "start", "module": "os", "arguments": []}), "ValueError: 'os' is not forked"),
     ],
 )
-def test_a_wrong_request_is_refused_and_the_launcher_goes_on(launcher: Launcher, request_: bytes, error: str) -> None:
+def test_launcher_refuses_malformed_request_without_stopping(launcher: Launcher, request_: bytes, error: str) -> None:
     answer = asked(launcher, request_)
     assert answer["ok"] is False and str(answer["error"]).startswith(error)
     assert not launcher._stopped
 
 
-def test_a_ping_names_the_next_supervisor(launcher: Launcher) -> None:
+def test_ping_sets_supervisor_of_launcher(launcher: Launcher) -> None:
     launcher._parent.identity = DEAD
     assert launcher._parent.lost(0.0)
     asked(launcher, packed_json({"command": "ping", "supervisor": asdict(ProcessIdentity.own())}))
     assert not launcher._parent.lost(1.0)
 
 
-def test_it_ends_when_it_is_told_to_is_an_orphan_or_its_socket_is_gone(tmp_path: Path) -> None:
+def test_launcher_serve_ends_on_stop_orphan_or_removed_socket(tmp_path: Path) -> None:
     stopped = Launcher(tmp_path / "stopped", Parent(None, 0.0))
     assert asked(stopped, packed_json({"command": "stop"})) == {"ok": True}
     orphan = Launcher(tmp_path / "orphan", Parent(DEAD, 0.0))
@@ -91,7 +91,7 @@ def test_it_ends_when_it_is_told_to_is_an_orphan_or_its_socket_is_gone(tmp_path:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_newest_ends_are_remembered(launcher: Launcher, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_launcher_remembers_newest_exit_statuses(launcher: Launcher, monkeypatch: pytest.MonkeyPatch) -> None:
     ended = iter([*((number, 9) for number in range(1, MOST_REMEMBERED + 3)), (0, 0)])
     monkeypatch.setattr(launchers.os, "waitpid", lambda pid, flags: next(ended))
     launcher._reap()
@@ -107,7 +107,7 @@ def test_the_newest_ends_are_remembered(launcher: Launcher, monkeypatch: pytest.
     assert len(launcher._ends) == MOST_REMEMBERED
 
 
-def test_an_old_socket_is_replaced(tmp_path: Path) -> None:
+def test_launcher_replaces_old_socket_file(tmp_path: Path) -> None:
     (tmp_path / "socket").write_text("left by another")
     launcher = Launcher(tmp_path / "socket", Parent(None, 0.0))
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
@@ -130,7 +130,7 @@ class Started:
 @pytest.mark.parametrize(
     ("ready_s", "engine_s", "forked"), [(59.0, 59.0, True), (61.0, 60.0, False), (None, 60.0, False)]
 )
-def test_an_engine_waits_a_minute_for_a_launcher_that_is_loading(tmp_path, monkeypatch, ready_s, engine_s, forked):
+def test_engine_start_waits_up_to_60_s_for_loading_launcher(tmp_path, monkeypatch, ready_s, engine_s, forked):
     by = launchers.ByLauncher(RuntimeFolder(tmp_path))
     by._direct = direct = Started()
     asked = []
@@ -156,7 +156,7 @@ def test_an_engine_waits_a_minute_for_a_launcher_that_is_loading(tmp_path, monke
     assert (asked, direct.modules[1:]) == (([("start", *engine)], []) if forked else ([], [engine]))
 
 
-def test_a_launcher_is_asked_every_second_and_started_again_when_it_has_ended(tmp_path, monkeypatch):
+def test_by_launcher_pings_every_second_and_restarts_ended_launcher(tmp_path, monkeypatch):
     by = launchers.ByLauncher(RuntimeFolder(tmp_path))
     by._direct = direct = Started()
     times, there, alive = [], [], {}
@@ -191,9 +191,7 @@ def test_a_launcher_is_asked_every_second_and_started_again_when_it_has_ended(tm
 
 
 @pytest.mark.parametrize(("argument", "code"), [("7", 7), ("wrong", 1)])
-def test_a_forked_process_has_its_environment_log_and_session_and_ends_with_the_code_of_its_module(
-    tmp_path, monkeypatch, argument, code
-):
+def test_forked_process_has_environment_log_session_and_exit_code(tmp_path, monkeypatch, argument, code):
     module = ModuleType("forked_by_a_test")
 
     def main(arguments):
@@ -233,7 +231,7 @@ class Ended:
     ("stop", "deadly", "signals"),
     [(True, (signal.SIGTERM,), [signal.SIGTERM]), (True, (), [signal.SIGTERM, signal.SIGKILL]), (False, (), [])],
 )
-def test_a_launcher_is_ended_only_on_request(tmp_path, monkeypatch, stop, deadly, signals):
+def test_by_launcher_close_ends_launcher_only_with_stop(tmp_path, monkeypatch, stop, deadly, signals):
     by, identity, waited = launchers.ByLauncher(RuntimeFolder(tmp_path)), Ended(*deadly), []
     monkeypatch.setattr(launchers, "recorded_launcher", lambda folder: identity)
     monkeypatch.setattr(launchers, "status_of_child", waited.append)
@@ -246,7 +244,7 @@ def test_a_launcher_is_ended_only_on_request(tmp_path, monkeypatch, stop, deadly
     assert (by._folder.path / launchers.SOCKET).exists() == (by._folder.path / launchers.RECORD).exists() == (not stop)
 
 
-def test_a_launcher_that_is_still_loading_is_ended_by_its_process_id(tmp_path, monkeypatch):
+def test_by_launcher_close_ends_loading_launcher_by_pid(tmp_path, monkeypatch):
     by, identity = launchers.ByLauncher(RuntimeFolder(tmp_path)), Ended(signal.SIGTERM)
     monkeypatch.setattr(launchers, "recorded_launcher", lambda folder: None)
     monkeypatch.setattr(launchers, "status_of_child", lambda pid: None)
@@ -262,7 +260,7 @@ def test_a_launcher_that_is_still_loading_is_ended_by_its_process_id(tmp_path, m
     ("answer", "error"),
     [(b'{"ok": true, "pid": 7}', None), (b'{"ok": false, "error": "no memory"}', "refuses 'start': no memory"), (b"{}", "refuses"), (None, "has not answered 'start' within")],
 )  # fmt: skip
-def test_a_wrong_answer_of_the_launcher_is_an_error(tmp_path, monkeypatch, answer, error):
+def test_by_launcher_raises_no_answer_for_refusal_or_timeout(tmp_path, monkeypatch, answer, error):
     by = launchers.ByLauncher(RuntimeFolder(tmp_path))
     requests = []
 
@@ -297,7 +295,7 @@ def test_a_wrong_answer_of_the_launcher_is_an_error(tmp_path, monkeypatch, answe
 
 
 @pytest.mark.parametrize("fails", [False, True])
-def test_a_process_that_the_launcher_does_not_start_is_started_directly(tmp_path, monkeypatch, fails):
+def test_by_launcher_starts_process_directly_if_launcher_fails(tmp_path, monkeypatch, fails):
     by, asked = launchers.ByLauncher(RuntimeFolder(tmp_path)), []
     by._direct = direct = Started()
     by.ready.set()
@@ -323,7 +321,7 @@ def test_a_process_that_the_launcher_does_not_start_is_started_directly(tmp_path
     ("is_ready", "answer", "how"),
     [(True, {"status": "signal 9"}, "signal 9"), (True, {}, None), (True, None, None), (False, {"status": "no"}, None)],
 )
-def test_how_a_forked_process_ended_is_asked_of_the_launcher(tmp_path, monkeypatch, is_ready, answer, how):
+def test_how_ended_asks_launcher_for_exit_status(tmp_path, monkeypatch, is_ready, answer, how):
     by = launchers.ByLauncher(RuntimeFolder(tmp_path))
 
     async def ask(command, **arguments):
@@ -340,7 +338,7 @@ def test_how_a_forked_process_ended_is_asked_of_the_launcher(tmp_path, monkeypat
     assert asyncio.run(by.how_ended(8)) == "exit code 3"
 
 
-def test_a_request_to_start_forks_and_closes_what_the_child_does_not_use(launcher, tmp_path, monkeypatch):
+def test_launcher_start_forks_and_closes_unused_descriptors(launcher, tmp_path, monkeypatch):
     request = {"module": "services.supervisor.engine", "arguments": ["--a", 5], "environment": {"B": 6}, "log": str(tmp_path / "log")}  # fmt: skip
     monkeypatch.setattr(os, "fork", lambda: 77)
     answer = asked(launcher, packed_json({"command": "start", **request}))
@@ -367,7 +365,7 @@ def test_a_request_to_start_forks_and_closes_what_the_child_does_not_use(launche
 
 
 @pytest.mark.parametrize("hangs", [False, True])
-def test_children_that_do_not_end_after_the_supervisor_are_killed(launcher, monkeypatch, hangs):
+def test_launcher_kills_children_that_do_not_end(launcher, monkeypatch, hangs):
     now, killed = SimpleNamespace(s=100.0), []
 
     def sleep(seconds):
@@ -386,7 +384,7 @@ def test_children_that_do_not_end_after_the_supervisor_are_killed(launcher, monk
     assert 100.5 < now.s < 102 if not hangs else 101 < now.s < 103
 
 
-def test_the_program_serves_until_it_is_told_to_end(tmp_path, monkeypatch):
+def test_launcher_program_records_itself_while_serving(tmp_path, monkeypatch):
     folder, handlers, made = RuntimeFolder(tmp_path), {}, []
 
     class Served:

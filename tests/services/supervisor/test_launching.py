@@ -39,7 +39,7 @@ def asked(path, data: bytes) -> dict:
         return json.loads(connection.recv(1 << 16))
 
 
-def test_the_launcher_answers(launcher):
+def test_launcher_answers_ping_and_status_over_socket(launcher):
     assert asked(launcher, b'{"command": "ping"}') == {"ok": True}
     assert asked(launcher, b'{"command": "status", "pid": 1}') == {"ok": True, "status": None}
 
@@ -58,18 +58,18 @@ def test_the_launcher_answers(launcher):
     ],
     ids=repr,
 )
-def test_the_launcher_refuses_and_goes_on(launcher, data):
+def test_launcher_refuses_bad_requests_over_socket_and_continues(launcher, data):
     assert asked(launcher, data)["ok"] is False
     assert asked(launcher, b'{"command": "ping"}') == {"ok": True}
 
 
-def test_a_launcher_whose_socket_was_removed_ends(runtime):
+def test_launcher_ends_if_its_socket_is_removed(runtime):
     launcher = Launcher(runtime.path / SOCKET, Parent(None, 0.0))
     (runtime.path / SOCKET).unlink()
     launcher.serve()
 
 
-def test_a_direct_start_is_a_session_of_its_own_and_says_how_it_ended(runtime):
+def test_direct_start_has_own_session_log_and_exit_status(runtime):
     output = runtime.path / "log"
 
     async def run() -> str | None:
@@ -88,7 +88,7 @@ def test_a_direct_start_is_a_session_of_its_own_and_says_how_it_ended(runtime):
     assert not is_of_no_use(how) and is_of_no_use("exit code 2")
 
 
-def test_a_launcher_that_was_never_opened_can_be_closed_twice(runtime):
+def test_by_launcher_close_is_idempotent(runtime):
     async def run() -> list[str]:
         start = ByLauncher(runtime)
         for stop in (False, True):
@@ -102,7 +102,7 @@ def test_a_launcher_that_was_never_opened_can_be_closed_twice(runtime):
     assert recorded_launcher(runtime) is None
 
 
-def test_without_a_launcher_processes_are_started_directly(runtime):
+def test_by_launcher_starts_process_directly_before_open(runtime):
     async def run() -> str | None:
         start = ByLauncher(runtime)
         pid = await start.start("services.supervisor.capture", ["--spec", "/none"], runtime.path / "log", {})
@@ -116,7 +116,7 @@ def test_without_a_launcher_processes_are_started_directly(runtime):
     assert recorded_launcher(runtime) is None
 
 
-def test_engines_wait_for_a_launcher_that_is_loading_and_capture_does_not(runtime, monkeypatch):
+def test_engine_start_waits_for_loading_launcher_and_capture_does_not(runtime, monkeypatch):
     directly: list[str] = []
 
     async def start_directly(module, arguments, output, environment, *, fresh=False) -> int:

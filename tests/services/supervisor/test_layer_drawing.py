@@ -37,7 +37,7 @@ def drawn(layer, model, orbit=Orbit(), **options):
     return drawing.draw(layer, LayerScene(model, model.camera, 1.0, {"state": "live"}, **options))
 
 
-def test_near_is_warmer_and_the_legend_has_both_depths():
+def test_depth_layer_is_warmer_near_and_legend_has_depth_range():
     image, said = drawn("depth", wall_and_post(), metric=True)
     left, right = image[60, 30].astype(int), image[60, 130].astype(int)
     assert left[0] > left[2] and right[2] > right[0] - 20
@@ -45,7 +45,7 @@ def test_near_is_warmer_and_the_legend_has_both_depths():
     assert said["legend"]["low"] == pytest.approx(2, abs=0.4) and said["legend"]["high"] == pytest.approx(4, abs=0.4)
 
 
-def test_planes_that_are_there_are_not_rendered_again(monkeypatch):
+def test_depth_layer_uses_given_planes_without_rendering(monkeypatch):
     monkeypatch.setattr("services.supervisor.screen.render", None)
     model = wall_and_post()
     plane = np.full((120, 160), 7.0, np.float32)
@@ -53,7 +53,7 @@ def test_planes_that_are_there_are_not_rendered_again(monkeypatch):
     assert said["legend"]["unit"] == "relative" and said["legend"]["low"] < 1 < said["legend"]["high"]
 
 
-def test_confidence_falls_with_the_time_since_it_was_seen():
+def test_confidence_layer_darkens_with_time_unseen():
     image, said = drawn("confidence", wall_and_post(unseen=True))
     assert "time" in said["legend"]["counts"]
     certain, _ = drawn("confidence", wall_and_post())
@@ -62,7 +62,7 @@ def test_confidence_falls_with_the_time_since_it_was_seen():
     assert image[left].astype(int).sum() < certain[left].astype(int).sum() - 100
 
 
-def test_a_virtual_camera_looks_round_the_post():
+def test_orbit_layer_renders_turned_camera_and_marks_unobserved():
     model = wall_and_post()
     orbit, depths = Orbit(-40, 10, 1.2), DepthColours()
     plain = model.render(1.0)
@@ -80,13 +80,13 @@ def test_a_virtual_camera_looks_round_the_post():
     assert np.abs(image.astype(int) - straight).mean() > 10
 
 
-def test_what_nobody_sees_now_has_no_colour_in_the_virtual_view():
+def test_orbit_layer_desaturates_tissue_out_of_view():
     image, _ = drawn("orbit", wall_and_post(unseen=True))
     left, right = image[60, 30].astype(int), image[60, 130].astype(int)
     assert np.ptp(left) <= 2 and np.ptp(right) > 100
 
 
-def test_a_virtual_view_never_says_live():
+def test_label_of_orbit_layer_is_empty_for_live_state():
     image = np.zeros((200, 300, 3), np.uint8)
     label(image, "orbit", PictureState.LIVE, 10)
     assert not image.any()
@@ -98,7 +98,7 @@ def test_a_virtual_view_never_says_live():
 
 
 @pytest.mark.parametrize("layer", ["depth", "confidence", "orbit"])
-def test_a_snapshot_on_any_device_is_drawn_as_its_model_is(layer, device):
+def test_layers_of_snapshot_match_layers_of_its_model(layer, device):
     model = wall_and_post(unseen=True)
     here = model.to(device)
     snapshot = SnapshotSlots(device).publish(

@@ -59,7 +59,7 @@ def next_picture(layers, reader, offered=None):
     return picture_from(reader.recv_multipart(copy=False))
 
 
-def test_without_viewers_nothing_is_drawn_and_no_scene_is_asked_for(opened):
+def test_layers_without_viewers_do_not_request_scene(opened):
     def asked():
         raise AssertionError("nobody watches")
 
@@ -71,7 +71,7 @@ def test_without_viewers_nothing_is_drawn_and_no_scene_is_asked_for(opened):
     assert "failed" not in figures
 
 
-def test_what_is_watched_is_drawn_and_only_that_until_the_viewer_leaves(opened):
+def test_only_watched_layer_is_drawn_until_viewer_leaves(opened):
     with opened.reader("depth") as reader:
         header = next_picture(opened.layers, reader).header
         assert (header["layer"], header["seq"], header["state"]) == ("depth", 5, "live")
@@ -85,14 +85,14 @@ def test_what_is_watched_is_drawn_and_only_that_until_the_viewer_leaves(opened):
     assert figures["depth"]["drawn"] >= 1 and figures["orbit"]["drawn"] == figures["confidence"]["drawn"] == 0
 
 
-def test_all_that_are_watched_take_turns(opened):
+def test_all_watched_layers_get_pictures(opened):
     with opened.reader("depth") as depth, opened.reader("confidence") as confidence, opened.reader("orbit") as orbit:
         for _ in range(3):
             for reader in (depth, confidence, orbit):
                 next_picture(opened.layers, reader)
 
 
-def test_a_picture_is_never_said_to_be_better_than_the_screen(opened):
+def test_layer_state_is_source_lost_or_frozen_as_scene(opened):
     with opened.reader("depth") as reader:
         lost = scene(state="source lost")
         while next_picture(opened.layers, reader, lost).header["state"] != "source lost":
@@ -102,7 +102,7 @@ def test_a_picture_is_never_said_to_be_better_than_the_screen(opened):
             pass
 
 
-def test_a_scene_that_cannot_be_drawn_is_said_and_the_next_one_is_drawn(opened):
+def test_layers_report_drawing_error_and_draw_next_scene(opened):
     with opened.reader("depth") as reader:
         until_s = time.monotonic() + SOON_S
         while "failed" not in opened.layers.figures()["layers"]:
@@ -113,7 +113,7 @@ def test_a_scene_that_cannot_be_drawn_is_said_and_the_next_one_is_drawn(opened):
         next_picture(opened.layers, reader)
 
 
-def test_the_camera_is_that_of_the_next_picture(opened):
+def test_camera_command_applies_to_next_orbit_picture(opened):
     assert opened.layers.camera({"azimuth_deg": 12}) == {"azimuth_deg": 12.0, "elevation_deg": 0.0, "zoom": 1.0}
     with opened.reader("orbit") as reader:
         while next_picture(opened.layers, reader).header["azimuth"] != 12.0:
@@ -121,17 +121,17 @@ def test_the_camera_is_that_of_the_next_picture(opened):
 
 
 @pytest.mark.parametrize("wrong", [{"zoom": "2"}, {"azimuth_deg": True}, {"elevation_deg": None}])
-def test_a_camera_that_is_no_numbers_is_refused(opened, wrong):
+def test_camera_command_rejects_non_numbers(opened, wrong):
     with pytest.raises(BadMessage, match="give a number"):
         opened.layers.camera(wrong)
 
 
-def test_a_camera_out_of_range_is_refused(opened):
+def test_camera_command_rejects_angles_out_of_range(opened):
     with pytest.raises(InvalidSetting, match="azimuth"):
         opened.layers.camera({"azimuth_deg": 90})
 
 
-def test_the_sockets_go_with_it(runtime):
+def test_clean_removes_sockets_of_closed_layers(runtime):
     layers = Layers(runtime.stream("b"), "cpu", Drawing)
     layers.open()
     until_s = time.monotonic() + SOON_S

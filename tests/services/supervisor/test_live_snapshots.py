@@ -35,7 +35,7 @@ def take(answer, folder):
         return snapshots.take({"folder": str(folder)})
 
 
-def test_the_model_is_written_as_it_was_given(tmp_path):
+def test_take_writes_model_and_reports_its_figures(tmp_path):
     model = uniform((0.9, 0.1, 0.1), version=8)
     said = take(lambda request: request.answer(model, SimpleNamespace(seq=41), 1_500_000), tmp_path / "model")
     assert (said["seq"], said["model_version"], said["gaussians"]) == (41, 8, 144)
@@ -43,7 +43,7 @@ def test_the_model_is_written_as_it_was_given(tmp_path):
     assert load_bundle(tmp_path / "model").sha256() == model.sha256()
 
 
-def test_a_snapshot_on_any_device_is_written_as_its_model(device, tmp_path):
+def test_take_writes_same_bundle_for_snapshot_and_model_on_device(device, tmp_path):
     model = uniform((0.1, 0.9, 0.1))
     slots = SnapshotSlots(device)
     snapshot = slots.publish(
@@ -55,7 +55,7 @@ def test_a_snapshot_on_any_device_is_written_as_its_model(device, tmp_path):
         assert load_bundle(folder).sha256() == model.sha256()
 
 
-def test_a_snapshot_is_let_go_of_before_it_is_written(tmp_path, monkeypatch):
+def test_take_releases_snapshot_before_writing(tmp_path, monkeypatch):
     model = uniform((0.1, 0.9, 0.1))
     snapshot = SnapshotSlots("cpu").publish(
         model.gaussians, None, version=1, camera=model.camera, time_window_s=model.time_window_s
@@ -69,7 +69,7 @@ def test_a_snapshot_is_let_go_of_before_it_is_written(tmp_path, monkeypatch):
     assert kept == [False]
 
 
-def test_what_cannot_be_written_is_refused_with_its_reason(tmp_path, monkeypatch):
+def test_take_raises_with_reason_without_live_model_or_folder(tmp_path, monkeypatch):
     with pytest.raises(CommandRefused, match="no live reconstruction runs"):
         LiveSnapshots().take({"folder": str(tmp_path)})
     with pytest.raises(CommandRefused, match="the reconstruction has ended"):

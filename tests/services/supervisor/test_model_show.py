@@ -99,7 +99,7 @@ def command(bundles, version: int, **more) -> dict:
     return {"folder": str(bundles / str(version)), "version": version, "name": "wall", **more}
 
 
-def test_each_picture_is_of_the_model_that_it_names(show, bundles):
+def test_pictures_match_model_version_of_their_header(show, bundles):
     for version in (1, 2, 3, 1, 2):
         show.models.show(command(bundles, version))
         until(lambda version=version: versions(show)[-1:] == [version])
@@ -110,7 +110,7 @@ def test_each_picture_is_of_the_model_that_it_names(show, bundles):
         assert (image.reshape(-1, 3).argmax(1) == colour.argmax()).all()
 
 
-def test_the_one_before_is_there_again_at_once(show, bundles):
+def test_show_previous_swaps_current_and_previous_model(show, bundles):
     show.models.show(command(bundles, 1))
     with pytest.raises(CommandRefused, match="no model was shown before"):
         show.models.show_previous({})
@@ -131,7 +131,7 @@ def fails_from_now_on(monkeypatch, version: int) -> None:
     monkeypatch.setattr(FinishedModel, "picture", picture)
 
 
-def test_a_model_whose_picture_is_not_finite_gives_way_to_the_one_before(show, bundles, monkeypatch):
+def test_model_with_non_finite_picture_is_replaced_by_previous(show, bundles, monkeypatch):
     show.models.show(command(bundles, 1))
     show.models.show(command(bundles, 2))
     until(lambda: versions(show)[-1:] == [2])
@@ -143,7 +143,7 @@ def test_a_model_whose_picture_is_not_finite_gives_way_to_the_one_before(show, b
     assert show.screen.wanted == "model"
 
 
-def test_without_one_before_the_live_reconstruction_is_shown(show, bundles, monkeypatch):
+def test_failed_model_without_previous_is_replaced_by_live(show, bundles, monkeypatch):
     show.models.show(command(bundles, 2))
     until(lambda: versions(show)[-1:] == [2])
     fails_from_now_on(monkeypatch, 2)
@@ -152,7 +152,7 @@ def test_without_one_before_the_live_reconstruction_is_shown(show, bundles, monk
     assert not (show.worker.folder.path / "engine.show").exists()
 
 
-def test_a_model_that_is_too_slow_again_and_again_gives_way(show, bundles):
+def test_model_over_most_ms_is_replaced_by_previous(show, bundles):
     show.models.show(command(bundles, 1))
     until(lambda: versions(show)[-1:] == [1])
     show.models.show(command(bundles, 2, most_ms=1e-6))
@@ -162,14 +162,14 @@ def test_a_model_that_is_too_slow_again_and_again_gives_way(show, bundles):
     assert "in a row" in show.models.figures()["gave_way"][0]["reason"]
 
 
-def test_values_that_are_not_finite_are_no_picture(bundles):
+def test_finished_model_picture_raises_for_non_finite_values(bundles):
     model = FinishedModel(bundles / "1", "wall", 1, device="cpu", renderer="alpha")
     model._model.gaussians.means[3, 1] = float("nan")
     with pytest.raises(NotFinite, match="wall 1 has values that are not finite"):
         model.picture(0.0)
 
 
-def test_the_live_reconstruction_takes_over_with_its_first_picture(show, bundles):
+def test_show_live_keeps_model_until_first_live_picture(show, bundles):
     show.models.show(command(bundles, 1))
     until(lambda: versions(show)[-1:] == [1])
     show.models.show_live({})
@@ -185,7 +185,7 @@ def test_the_live_reconstruction_takes_over_with_its_first_picture(show, bundles
     assert not show.screen.publish("live", live, np.zeros((2, 2, 3), np.uint8))
 
 
-def test_the_next_engine_begins_with_the_model(show, bundles):
+def test_begin_shows_model_of_previous_engine(show, bundles):
     show.models.show(command(bundles, 2))
     other = Screen(Published())
     models = ModelShow(show.worker, EngineSpec(), other)
@@ -209,13 +209,13 @@ def test_the_next_engine_begins_with_the_model(show, bundles):
         {"most_ms": "x"},
     ],
 )
-def test_wrong_arguments_are_refused(show, bundles, wrong):
+def test_show_command_rejects_wrong_arguments(show, bundles, wrong):
     with pytest.raises(BadMessage):
         show.models.show({**command(bundles, 1), **wrong})
     assert show.screen.wanted == "live"
 
 
-def test_times_go_round_the_window(bundles):
+def test_finished_model_time_wraps_around_time_window(bundles):
     model = FinishedModel(bundles / "1", "wall", 1, device="cpu", renderer="alpha")
     assert [model.at(time_s) for time_s in (0.0, 0.5, 2.0, 3.5, -1.0)] == [1.0, 1.5, 1.0, 2.5, 1.0]
 
@@ -226,7 +226,7 @@ def test_times_go_round_the_window(bundles):
         ([11, 11, 11, 11, 11], 1), ([11, 11, 11, 11, 10, 11, 11, 11, 11], 0), ([10.0] * 20, 0), ([10.01] * 4, 0), ([50, 50, 50, 50, 50], 1),
     ],
 )  # fmt: skip
-def test_a_model_gives_way_after_five_late_pictures_in_a_row(monkeypatch, took_ms, given_up):
+def test_model_is_replaced_after_five_consecutive_late_pictures(monkeypatch, took_ms, given_up):
     """A single late picture may be due to other load."""
     show, reasons = object.__new__(ModelShow), []
     show._late = 0

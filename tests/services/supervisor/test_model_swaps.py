@@ -48,7 +48,7 @@ async def watch(endpoint: str, seen: list[tuple[str, int, str]]) -> None:
         socket.close()
 
 
-def test_no_picture_is_of_two_models_and_none_of_another_than_it_says(runtime, bundles):
+def test_pictures_during_model_swaps_show_only_named_version(runtime, bundles):
     async def scenario() -> None:
         source = "synthetic:?width=64&height=64&frames=3&fps=20"
         settings = StreamSettings(source=source, device="cpu", options={"engine_scale": 1})

@@ -33,7 +33,7 @@ def process(state: str, picture: str | None = None) -> ProcessState:
         (process("live"), process("running", "source lost"), ("source lost", None)),
     ],
 )
-def test_the_worst_process_decides(
+def test_overall_state_is_that_of_worst_process(
     capture: ProcessState, engine: ProcessState, expected: tuple[str, str | None]
 ) -> None:
     assert overall(capture, engine) == expected

@@ -15,7 +15,7 @@ print(os.nice(0) - began)
 """
 
 
-def test_a_process_steps_back_and_never_forwards():
+def test_step_back_only_raises_niceness():
     done = subprocess.run(
         [sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True, start_new_session=True
     )

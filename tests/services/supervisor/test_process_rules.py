@@ -33,7 +33,7 @@ def managed(runtime, role="engine", start=None, **spec: Any) -> ManagedProcess:
     return process
 
 
-def test_a_rate_is_that_of_the_last_seconds():
+def test_rate_covers_last_seconds_and_restarts_with_smaller_count():
     rate = Rate(3.0)
     assert rate.hz is None
     rate.tell(10, 0.0)
@@ -54,7 +54,7 @@ def test_a_rate_is_that_of_the_last_seconds():
     assert rate.hz is None
 
 
-def test_a_rate_keeps_one_count_at_the_border_of_its_time():
+def test_rate_includes_count_at_start_of_its_interval():
     rate = Rate(3.0)
     for moment, count in ((0.0, 0), (1.0, 100), (4.0, 130)):
         rate.tell(count, moment)
@@ -65,7 +65,7 @@ def test_a_rate_keeps_one_count_at_the_border_of_its_time():
     assert rate.hz == round(129 / 3.9, 2)
 
 
-def test_a_process_hangs_when_it_is_silent_or_shows_nothing_for_longer_than_its_limit(runtime, clock):
+def test_hangs_reports_late_start_silence_and_missing_pictures(runtime, clock):
     process = managed(runtime, limits=ProcessLimits(start_s=20.0, heartbeat_s=3.0, hung_s=10.0))
     process._heard_s = 100.0
     assert process._hangs(120.0) is None
@@ -99,7 +99,7 @@ def test_a_process_hangs_when_it_is_silent_or_shows_nothing_for_longer_than_its_
         ("capture", "opening", {}, False),
     ],
 )
-def test_a_process_is_well_once_it_works(runtime, clock, role, state, figures, well):
+def test_process_is_well_from_first_working_heartbeat(runtime, clock, role, state, figures, well):
     process = managed(runtime, role)
     process._take({"state": state, "reason": "", "figures": figures})
     assert (process._well_s == 100.0) is well
@@ -108,7 +108,7 @@ def test_a_process_is_well_once_it_works(runtime, clock, role, state, figures, w
     assert process._well_s == (100.0 if well else 0.0)
 
 
-def test_the_state_is_that_of_the_heartbeat(runtime, clock):
+def test_process_state_follows_heartbeats(runtime, clock):
     process = managed(runtime, "capture")
     state = process.state
     assert (state.state, state.reason, state.pid, state.restarts, state.figures, state.heard_s, state.rate_hz) == (
@@ -138,13 +138,13 @@ def test_the_state_is_that_of_the_heartbeat(runtime, clock):
         ({"state": "live", "reason": "well"}, None),
     ],
 )
-def test_the_last_heartbeat_gives_the_reason_of_an_end(runtime, heartbeat, reason):
+def test_last_reason_is_from_ended_or_failed_heartbeat(runtime, heartbeat, reason):
     process = managed(runtime)
     process._heartbeat = heartbeat
     assert process._last_reason() == reason
 
 
-def test_an_engine_gets_its_gpu_alone(runtime):
+def test_environment_limits_engine_to_its_gpu(runtime):
     assert managed(runtime, engine=EngineSpec(gpu=1))._environment() == {"CUDA_VISIBLE_DEVICES": "1"}
     assert managed(runtime, engine=EngineSpec(gpu=0))._environment() == {"CUDA_VISIBLE_DEVICES": "0"}
     assert managed(runtime)._environment() == {}
@@ -194,7 +194,7 @@ class Starter:
         ((signal.SIGKILL,), [signal.SIGTERM, signal.SIGCONT, signal.SIGKILL]),
     ],
 )
-def test_a_process_that_does_not_finish_in_its_time_is_killed(runtime, deadly, signals):
+def test_end_kills_process_after_drain_s(runtime, deadly, signals):
     async def end() -> tuple[Identity, Starter]:
         start, identity = Starter(), Identity(*deadly)
         process = managed(runtime, start=start, limits=ProcessLimits(drain_s=4.0))
@@ -214,7 +214,7 @@ def test_a_process_that_does_not_finish_in_its_time_is_killed(runtime, deadly, s
         (None, None, "it ended"),
     ],
 )
-def test_the_end_of_a_watched_process_has_its_best_reason(runtime, how, heartbeat, said):
+def test_watched_prefers_exit_status_then_heartbeat_reason(runtime, how, heartbeat, said):
     async def watched() -> str:
         process, identity = managed(runtime, start=Starter(how)), Identity()
         process._heartbeat, process._heard_s = heartbeat, processes.time.monotonic()
@@ -224,9 +224,7 @@ def test_the_end_of_a_watched_process_has_its_best_reason(runtime, how, heartbea
     assert asyncio.run(watched()) == said
 
 
-def test_a_hung_process_is_killed_once_and_a_pause_of_the_supervisor_is_not_held_against_it(
-    runtime, clock, monkeypatch
-):
+def test_watched_kills_hung_process_but_tolerates_supervisor_pause(runtime, clock, monkeypatch):
     monkeypatch.setattr(processes, "POLL_S", 0.001)
 
     async def watched() -> tuple[str, list[int]]:
@@ -252,7 +250,7 @@ def test_a_hung_process_is_killed_once_and_a_pause_of_the_supervisor_is_not_held
     ("restarts", "never_well", "role", "again", "fresh"),
     [(0, 0, "engine", False, False), (1, 2, "engine", True, False), (5, 3, "engine", True, True), (5, 3, "capture", False, True)],
 )  # fmt: skip
-def test_how_a_process_is_started_depends_on_its_ends(runtime, restarts, never_well, role, again, fresh):
+def test_start_arguments_depend_on_earlier_ends(runtime, restarts, never_well, role, again, fresh):
     start = Starter()
     process = managed(runtime, role, start=start)
     process._restarts = SimpleNamespace(total=restarts, never_well=never_well)  # type: ignore[assignment]
@@ -263,7 +261,7 @@ def test_how_a_process_is_started_depends_on_its_ends(runtime, restarts, never_w
 
 
 @pytest.mark.parametrize(("size", "kept"), [(1 << 20, True), ((1 << 20) + 1, False)])
-def test_a_log_that_has_grown_too_long_is_begun_anew(runtime, size, kept):
+def test_start_removes_log_over_1_mib(runtime, size, kept):
     process = managed(runtime, start=Starter())
     log = process._folder.log("engine")
     log.write_bytes(bytes(size))
@@ -271,12 +269,12 @@ def test_a_log_that_has_grown_too_long_is_begun_anew(runtime, size, kept):
     assert log.exists() is kept
 
 
-def test_a_process_that_does_not_run_takes_no_command(runtime):
+def test_command_raises_no_answer_if_process_is_not_running(runtime):
     with pytest.raises(NoAnswer, match="the engine process of theatre does not run: it was not started"):
         asyncio.run(managed(runtime).command("ping"))
 
 
-def test_closing_ends_the_process(runtime):
+def test_close_ends_process_with_stopped_event(runtime):
     async def close() -> tuple[Any, Identity]:
         process, identity = managed(runtime, start=Starter()), Identity(signal.SIGTERM)
         process._identity = identity  # type: ignore[assignment]
@@ -296,7 +294,7 @@ def recorded(identity: Any, digest: str) -> Any:
     return SimpleNamespace(identity=identity, spec_digest=digest)
 
 
-def test_a_running_process_is_adopted_if_its_settings_are_these(runtime, monkeypatch):
+def test_running_process_with_same_spec_is_adopted(runtime, monkeypatch):
     process, identity = managed(runtime, start=Starter()), Identity(signal.SIGTERM)
     monkeypatch.setattr(process._folder, "record", lambda role: recorded(identity, process._spec.digest))
     process._heartbeat, process._well_s, process._shown = {"state": "ended"}, 5.0, (3, 5.0)
@@ -310,7 +308,7 @@ def test_a_running_process_is_adopted_if_its_settings_are_these(runtime, monkeyp
     assert (process._heartbeat, process._well_s, process._shown, process._rate.hz) == (None, 0.0, (0, 0.0), None)
 
 
-def test_a_running_process_with_other_settings_is_replaced(runtime, monkeypatch):
+def test_running_process_with_other_spec_is_replaced(runtime, monkeypatch):
     process, identity = managed(runtime, start=Starter()), Identity(signal.SIGTERM)
     monkeypatch.setattr(process._folder, "record", lambda role: recorded(identity, "others"))
     assert asyncio.run(process._running()) is None, "the starter cannot start it"
@@ -347,7 +345,7 @@ def kept(
     return waits
 
 
-def test_a_process_that_ends_again_and_again_waits_longer_before_each_start(runtime, monkeypatch, clock):
+def test_repeated_ends_lengthen_wait_before_restart(runtime, monkeypatch, clock):
     process = managed(runtime)
     waits = kept(process, monkeypatch, ["signal 9"] * 9)
     assert waits[0] == 0 and waits[1:] == sorted(waits[1:]) and waits[1] > 0
@@ -357,7 +355,7 @@ def test_a_process_that_ends_again_and_again_waits_longer_before_each_start(runt
     assert [event.kind for event in process.events] == ["ended"] * 9
 
 
-def test_a_process_that_worked_well_is_started_at_once(runtime, monkeypatch, clock):
+def test_process_that_ran_well_is_restarted_immediately(runtime, monkeypatch, clock):
     process = managed(runtime)
     process._well_s = clock.s - 3600
     assert kept(process, monkeypatch, ["signal 9"]) == [0.0]
@@ -365,7 +363,7 @@ def test_a_process_that_worked_well_is_started_at_once(runtime, monkeypatch, clo
     assert kept(managed(runtime), monkeypatch, [None])[0] == 0.0
 
 
-def test_after_an_end_that_no_start_can_mend_the_last_words_are_the_reason(runtime, monkeypatch, clock):
+def test_unrecoverable_end_reports_last_words_of_log(runtime, monkeypatch, clock):
     process = managed(runtime)
     process._folder.log("engine").write_text("Traceback\nValueError: the last words\n", encoding="utf-8")
     monkeypatch.setattr(processes, "is_of_no_use", lambda how: True)
@@ -377,7 +375,7 @@ def test_after_an_end_that_no_start_can_mend_the_last_words_are_the_reason(runti
     assert process.state.reason == "exit code 2"
 
 
-def test_a_process_that_another_one_serves_already_is_adopted_without_an_end(runtime, monkeypatch):
+def test_end_is_not_reported_if_another_process_holds_role(runtime, monkeypatch):
     process, rounds = managed(runtime), []
 
     async def running() -> Any:
@@ -397,7 +395,7 @@ def test_a_process_that_another_one_serves_already_is_adopted_without_an_end(run
     assert process.events == [] and not process.causes and len(rounds) == 3
 
 
-def test_only_a_process_that_spoke_is_pinged(runtime, monkeypatch):
+def test_ping_is_sent_only_after_first_heartbeat(runtime, monkeypatch):
     asked, rounds = [], []
     process = managed(runtime)
 
@@ -420,7 +418,7 @@ def test_only_a_process_that_spoke_is_pinged(runtime, monkeypatch):
     assert asked == [("ping", os.getpid())] * 2
 
 
-def test_heartbeats_of_the_supervised_process_count(runtime, monkeypatch):
+def test_listen_ignores_malformed_and_foreign_heartbeats(runtime, monkeypatch):
     """Those of an earlier process and texts that are no heartbeats are passed over."""
     heard = [b'{"pid": 6, "state": "ended"}', b"nonsense", b'{"pid": 7, "state": "live"}']
     closed = []

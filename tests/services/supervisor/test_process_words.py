@@ -31,7 +31,7 @@ LOGGED = "2026-11-23 19:00:00,123 {} services.supervisor.capture: {}\n"
         ("", ""),
     ],
 )
-def test_the_reason_of_an_end_is_a_sentence(tmp_path, printed, reason):
+def test_last_words_return_last_error_of_log(tmp_path, printed, reason):
     (tmp_path / "log").write_text(printed)
     assert last_words(tmp_path / "log") == reason
     assert last_words(tmp_path / "none") == ""
@@ -56,7 +56,7 @@ def capture(runtime, monkeypatch):
 
 
 @pytest.mark.parametrize("gone", SOURCE_GONE)
-def test_a_lost_source_is_told_once_and_its_return_once(capture, gone, caplog):
+def test_source_loss_and_recovery_are_reported_once(capture, gone, caplog):
     caplog.set_level(logging.INFO)
     assert capture("live") == []
     for _ in range(7):
@@ -72,7 +72,7 @@ def test_a_lost_source_is_told_once_and_its_return_once(capture, gone, caplog):
     assert said == ["lost", "recovered", "lost"]
 
 
-def test_a_source_that_was_never_there_is_lost_and_one_that_starts_is_not(capture):
+def test_source_is_lost_after_long_opening_but_not_while_starting(capture):
     for _ in range(100):
         assert capture("starting") == []
     for _ in range(9):
@@ -80,7 +80,7 @@ def test_a_source_that_was_never_there_is_lost_and_one_that_starts_is_not(captur
     assert said == ["lost"]
 
 
-def test_the_audit_log_has_the_loss_without_the_address(capture):
+def test_audit_log_records_source_loss_without_address(capture):
     for _ in range(20):
         capture("lost")
     capture("live")

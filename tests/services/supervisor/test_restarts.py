@@ -5,24 +5,24 @@ import pytest
 from services.supervisor.process import Rate, Restarts
 
 
-def test_the_first_start_is_at_once_and_waits_grow_to_a_cap():
+def test_restart_delay_starts_at_zero_and_doubles_to_most_s():
     restarts = Restarts(first_s=0.25, most_s=2.0, settled_s=5.0)
     assert [restarts.ended(0.0) for _ in range(7)] == [0.0, 0.25, 0.5, 1.0, 2.0, 2.0, 2.0]
 
 
-def test_a_process_that_has_worked_counts_from_the_beginning():
+def test_restart_delay_resets_after_settled_process():
     restarts = Restarts(first_s=0.25, most_s=2.0, settled_s=5.0)
     assert [restarts.ended(well_s) for well_s in (0.0, 4.9, 5.0, 0.0)] == [0.0, 0.25, 0.0, 0.25]
     assert (restarts.total, restarts.in_a_row) == (4, 2)
 
 
-def test_one_that_has_worked_is_not_kept_waiting_for_long():
+def test_restart_delay_of_working_process_is_capped_at_most_worked_s():
     restarts = Restarts(first_s=0.25, most_s=10.0, settled_s=5.0, most_worked_s=1.0)
     assert [restarts.ended(0.1) for _ in range(6)] == [0.0, 0.25, 0.5, 1.0, 1.0, 1.0]
     assert restarts.never_well == 0
 
 
-def test_ends_of_what_never_worked_are_counted_by_themselves():
+def test_never_well_counts_consecutive_ends_without_work():
     restarts = Restarts()
     counted = []
     for well_s in (0.0, 0.0, 0.1, 0.0, 3.0, 0.0):
@@ -31,12 +31,12 @@ def test_ends_of_what_never_worked_are_counted_by_themselves():
     assert counted == [1, 2, 0, 1, 0, 1]
 
 
-def test_many_ends_do_not_overflow():
+def test_restart_delay_does_not_overflow():
     restarts = Restarts()
     assert [restarts.ended(0.0) for _ in range(5000)][-1] == 10.0
 
 
-def test_the_rate_of_a_count_is_that_of_the_last_seconds():
+def test_rate_hz_covers_last_seconds():
     rate = Rate(over_s=3.0)
     assert rate.hz is None
     rate.tell(100, 10.0)

@@ -40,7 +40,7 @@ def engine(temporary) -> tuple[subprocess.Popen[str], Path]:
     return process, folder
 
 
-def test_only_folders_of_killed_engines_are_removed(temporary):
+def test_remove_dead_removes_only_scratch_folders_of_killed_engines(temporary):
     running, alive = engine(temporary)
     killed, dead = engine(temporary)
     killed.send_signal(signal.SIGKILL)
@@ -55,7 +55,7 @@ def test_only_folders_of_killed_engines_are_removed(temporary):
     assert not alive.exists()
 
 
-def test_a_next_engine_removes_what_is_left_and_uses_its_own_folder(temporary):
+def test_scratch_folder_removes_leftovers_and_becomes_tempdir(temporary):
     left = temporary / f"{worker.PREFIX}left"
     left.mkdir()
     os.utime(left, (0, 0))

@@ -79,7 +79,7 @@ def looks(parts, times=1):
     asyncio.run(look())
 
 
-def test_the_active_version_is_asked_for_once_and_again_when_it_changes_or_the_engine_is_new(parts):
+def test_show_active_sends_command_only_for_new_version_or_engine(parts):
     looks(parts, 3)
     assert parts.engine.asked == [("show_model", "/models/wall/1")]
     parts.registry.current = 2
@@ -91,7 +91,7 @@ def test_the_active_version_is_asked_for_once_and_again_when_it_changes_or_the_e
 
 
 @pytest.mark.parametrize("why", ["live", "stopped", "starting", "none active"])
-def test_nothing_is_asked_for_where_nothing_is_to_be_shown(parts, why):
+def test_show_active_sends_no_command_if_live_stopped_or_inactive(parts, why):
     if why == "live":
         parts.stream.settings.show = "live"
     elif why == "stopped":
@@ -104,7 +104,7 @@ def test_nothing_is_asked_for_where_nothing_is_to_be_shown(parts, why):
     assert parts.engine.asked == []
 
 
-def test_a_version_that_an_engine_gives_up_is_rolled_back_once_and_can_be_activated_again(parts):
+def test_version_given_up_by_engine_is_rolled_back_once(parts):
     parts.registry.current = 2
     looks(parts)
     parts.engine.gives_up(2, "its picture is not finite", instead=1)
@@ -119,14 +119,14 @@ def test_a_version_that_an_engine_gives_up_is_rolled_back_once_and_can_be_activa
     assert len(parts.registry.rolled_back) == 2
 
 
-def test_a_first_version_that_is_given_up_has_nothing_before_it(parts):
+def test_first_version_given_up_by_engine_raises_conflict(parts):
     looks(parts)
     parts.engine.gives_up(1, "its picture is not finite", instead=None)
     with pytest.raises(Conflict):
         looks(parts)
 
 
-def test_an_engine_that_refuses_is_not_asked_all_the_time(parts):
+def test_show_active_does_not_repeat_refused_command(parts):
     parts.engine.refuses = True
     with pytest.raises(CommandRefused):
         looks(parts)
@@ -149,7 +149,7 @@ def follows(parts, times):
     asyncio.run(follow())
 
 
-def test_the_reason_why_a_model_is_not_shown_is_kept_and_logged_once(parts, caplog):
+def test_model_fault_is_kept_and_logged_once(parts, caplog):
     parts.registry.active = lambda name: (_ for _ in ()).throw(NotFound(f"there is no model {name!r}"))
     follows(parts, 5)
     assert parts.stream.model_fault == "there is no model 'wall'"
@@ -163,7 +163,7 @@ def test_the_reason_why_a_model_is_not_shown_is_kept_and_logged_once(parts, capl
     assert parts.stream.model_fault is None
 
 
-def test_a_stream_that_does_not_show_its_model_says_why(tmp_path):
+def test_stream_view_reason_contains_model_fault(tmp_path):
     settings = StreamSettings(source="synthetic:", device="cpu", show="model wall")
     stream = Stream(settings, specs_of("theatre", settings), RuntimeFolder(tmp_path))
     states = {"capture": process("live"), "engine": process("running", "live")}

@@ -28,7 +28,7 @@ from services.supervisor.worker import specs_of
         ("pipe:/a?format=rgb24", "size"), ("pipe:/a?size=64x48", "format"), ("v4l2:/dev/video0?format=film", "format"),
     ],
 )  # fmt: skip
-def test_what_a_source_would_refuse_is_refused_with_its_name(address, option):
+def test_specs_of_raises_for_invalid_source_option(address, option):
     with pytest.raises(InvalidSetting, match=option):
         specs_of("theatre-1", StreamSettings(source=address))
 
@@ -42,16 +42,16 @@ def test_what_a_source_would_refuse_is_refused_with_its_name(address, option):
         "pipe:/a?size=64x48&format=rgb24", "udp://0.0.0.0:5000",
     ],
 )  # fmt: skip
-def test_what_a_source_takes_is_taken(address):
+def test_check_address_accepts_valid_addresses(address):
     check_address(address)
 
 
-def test_addresses_of_every_scheme_with_options_are_checked():
+def test_option_parsers_cover_all_source_schemes_with_options():
     assert set(PARSERS) <= set(SOURCES) and set(SOURCES) - set(PARSERS) == {"recording", *PROTOCOLS}
     assert MAX_SEED == SYNTHESIZED
 
 
 @pytest.mark.parametrize("name", ["field", "renderer", "tool_mask", "depth"])
-def test_names_that_the_engine_does_not_know_are_refused(name):
+def test_stream_settings_reject_unknown_engine_option_values(name):
     with pytest.raises(ValidationError, match=f"{name} is 'nope'"):
         StreamSettings(source="synthetic:", options={name: "nope"})

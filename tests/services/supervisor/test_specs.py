@@ -17,7 +17,7 @@ def spec(**changes) -> ProcessSpec:
     return ProcessSpec(**{"stream": "a", "capture": SourceSpec(address="synthetic:"), **changes})
 
 
-def test_a_process_reads_its_specification(runtime):
+def test_process_spec_round_trips_through_private_file(runtime):
     wanted = ProcessSpec(stream="a", engine=EngineSpec(device="cuda", gpu=3))
     path = wanted.write(runtime.stream("a"))
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
@@ -26,20 +26,20 @@ def test_a_process_reads_its_specification(runtime):
     assert read.supervisor == asdict(ProcessIdentity.own())
 
 
-def test_the_digest_changes_with_the_settings():
+def test_process_spec_digest_changes_with_settings():
     changed = spec(capture=SourceSpec(address="synthetic:", fps=5.0)), spec(limits=ProcessLimits(drain_s=1.0))
     assert spec().digest == spec().digest
     assert len({each.digest for each in (spec(), *changed, spec(stream="b"))}) == 4
 
 
 @pytest.mark.parametrize("name", ["", "A", "../x", "a/b", ".", "-a", "x" * 33, "a\n", "ä"])
-def test_names_that_are_no_names(name):
+def test_process_spec_rejects_invalid_stream_names(name):
     with pytest.raises(ValidationError):
         spec(stream=name)
 
 
 @pytest.mark.parametrize("parts", [{"capture": None}, {"engine": EngineSpec()}])
-def test_a_process_has_one_role(parts):
+def test_process_spec_requires_either_capture_or_engine(parts):
     with pytest.raises(ValidationError, match="either capture or engine"):
         spec(**parts)
 
@@ -47,12 +47,12 @@ def test_a_process_has_one_role(parts):
 @pytest.mark.parametrize(
     "wrong", [{"scale": 0}, {"scale": float("nan")}, {"fps": -1}, {"address": ""}, {"adress": "x"}], ids=str
 )
-def test_sources_that_are_none(wrong):
+def test_source_spec_rejects_invalid_values(wrong):
     with pytest.raises((InvalidSetting, TypeError)):
         SourceSpec(**{"address": "synthetic:", **wrong})
 
 
-def test_a_file_that_is_none_is_refused_in_one_sentence(runtime):
+def test_process_spec_read_raises_for_missing_damaged_or_wrong_file(runtime):
     with pytest.raises(InvalidSetting, match="cannot be read"):
         ProcessSpec.read(runtime.path / "none", "capture")
     path = runtime.path / "wrong"
@@ -66,7 +66,7 @@ def test_a_file_that_is_none_is_refused_in_one_sentence(runtime):
         ProcessSpec.read(spec().write(runtime.stream("a")), "engine")
 
 
-def test_streams_are_spread_over_gpus():
+def test_assigned_spreads_engines_over_gpus():
     cuda, fixed, cpu = EngineSpec(device="cuda"), EngineSpec(device="cuda", gpu=0), EngineSpec()
     placed: list[EngineSpec] = []
     for engine in (cpu, fixed, cuda, cuda, cuda):
@@ -75,7 +75,7 @@ def test_streams_are_spread_over_gpus():
     assert assigned(cuda, placed, 0) == cuda
 
 
-def test_an_address_that_is_refused_is_not_repeated():
+def test_source_spec_error_omits_rejected_address():
     with pytest.raises(InvalidSetting, match=r"^address is not valid; ") as refused:
         SourceSpec(address="rtsp://user:swordfish@camera/" + 5000 * "x")
     assert "swordfish" not in str(refused.value)

@@ -22,7 +22,7 @@ def wanted(device="cpu", **options):
     return settings.model_copy(update={"options": options})  # not checked yet
 
 
-def test_each_option_goes_to_the_process_that_it_is_for():
+def test_specs_of_passes_options_to_capture_or_engine():
     specs = specs_of("theatre-1", wanted(scale=0.5, tool_mask="none", seed=None))
     capture, engine = specs["capture"].capture, specs["engine"].engine
     assert {spec.stream for spec in specs.values()} == {"theatre-1"}
@@ -34,7 +34,7 @@ def test_each_option_goes_to_the_process_that_it_is_for():
     ("device", "found", "expected"),
     [("cpu", 2, ("cpu", None)), ("cuda", 2, ("cuda", None)), ("cuda:1", 2, ("cuda", 1)), ("auto", 0, ("cpu", None)), ("auto", 1, ("cuda", None))],
 )  # fmt: skip
-def test_devices(monkeypatch, device, found, expected):
+def test_specs_of_resolves_device_and_gpu(monkeypatch, device, found, expected):
     monkeypatch.setattr(workers, "gpus", lambda: found)
     engine = engine_of(device)
     assert (engine.device, engine.gpu) == expected
@@ -49,7 +49,7 @@ def test_devices(monkeypatch, device, found, expected):
         ({"budget_ms": "soon"}, "budget_ms is 'soon'; it must be a number"),
     ],
 )
-def test_options_that_cannot_be_are_refused_with_what_is_wrong(options, said):
+def test_specs_of_raises_for_unknown_or_invalid_options(options, said):
     with pytest.raises(InvalidSetting, match=said):
         engine_of(**options)
 
@@ -60,7 +60,7 @@ def test_options_that_cannot_be_are_refused_with_what_is_wrong(options, said):
     + [("loop", value) for value in (0, 1, "yes", "true", 1.0)]
     + [(name, value) for name in ("eyes", "poses", "out_of_body", "field", "renderer") for value in (True, 1, "", "x")],
 )  # fmt: skip
-def test_a_value_of_another_type_or_range_is_refused_and_not_converted(option, value):
+def test_specs_of_does_not_convert_option_types(option, value):
     with pytest.raises(InvalidSetting, match=option):
         engine_of(**{option: value})
 
@@ -70,18 +70,18 @@ def test_a_value_of_another_type_or_range_is_refused_and_not_converted(option, v
     "value",
     ["onnx", "onnx:", "onnx:a.onnx", "onnx:../a.onnx", "onnx:/etc/passwd", "onnx:/none.onnx", "recorded:1", "none:"],
 )
-def test_only_networks_are_followed_by_a_file_and_it_must_be_there(option, value):
+def test_specs_of_rejects_option_with_missing_onnx_file(option, value):
     with pytest.raises(InvalidSetting, match=option):
         engine_of(**{option: value})
 
 
-def test_a_network_of_the_server_is_taken(tmp_path):
+def test_specs_of_accepts_existing_onnx_file(tmp_path):
     network = tmp_path / "tools.onnx"
     network.write_bytes(b"")
     assert engine_of(tool_mask=f"onnx:{network}").tool_mask == f"onnx:{network}"
 
 
-def test_a_source_that_never_opened_counts_as_lost():
+def test_overall_reports_source_lost_if_source_never_opened():
     """A camera that is not there stays in the state `opening`: after a while that is a lost source, as the audit log says."""
     absent = ProcessState("opening", "there is no camera", 1, 0, {}, 0.1, lost=True)
     assert overall(absent, process("running")) == ("source lost", "there is no camera")
@@ -103,11 +103,11 @@ def process(state, reason="", **figures):
         (process("live"), process("down", "killed by SIGKILL"), ("starting", "the camera's picture is live; the engine is down: killed by SIGKILL")),
     ],
 )  # fmt: skip
-def test_a_stream_is_what_its_processes_are(capture, engine, expected):
+def test_overall_state_follows_capture_and_engine(capture, engine, expected):
     assert overall(capture, engine) == expected
 
 
-def test_a_stream_whose_frames_are_all_withheld_says_why_nothing_is_shown():
+def test_overall_explains_missing_picture_by_withheld_frames():
     capture = ProcessState("live", "", 1, 0, {}, 0.1)
 
     def reason(picture=None, **figures):
@@ -136,7 +136,7 @@ def test_a_stream_whose_frames_are_all_withheld_says_why_nothing_is_shown():
     assert reason(picture={"state": "live"}, frames=45, withheld=withheld) == ("live", None)
 
 
-def test_an_old_picture_is_explained_by_the_frames_withheld_since():
+def test_overall_explains_frozen_picture_by_withheld_frames():
     capture = ProcessState("live", "", 1, 0, {}, 0.1)
 
     def reason(state, **withheld):
@@ -151,7 +151,7 @@ def test_an_old_picture_is_explained_by_the_frames_withheld_since():
     assert reason("stale", blur=3) == ("stale", None) and reason("live", blur=30) == ("live", None)
 
 
-def test_what_is_asked_of_depth_eyes_and_poses_reaches_the_reconstruction(tmp_path):
+def test_depth_eyes_and_poses_options_reach_live_settings(tmp_path):
     asked = engine_of(depth="stereo", eyes="both", poses="estimated")
     settings = live_settings(asked, tmp_path, "a source")
     assert (settings.depth, settings.eyes, settings.poses) == ("stereo", "both", "estimated")

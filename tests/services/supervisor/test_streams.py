@@ -84,7 +84,7 @@ def kill(pid: int | None, number: int = signal.SIGKILL) -> None:
     os.kill(pid, number)
 
 
-def test_capture_is_there_again_after_it_was_killed_and_says_why(runtime):
+def test_killed_capture_is_restarted_with_reason(runtime):
     async def scenario() -> None:
         events: list[StreamEvent] = []
         async with capturing(runtime, events) as capture:
@@ -103,7 +103,7 @@ def test_capture_is_there_again_after_it_was_killed_and_says_why(runtime):
     asyncio.run(scenario())
 
 
-def test_a_process_that_hangs_is_replaced(runtime):
+def test_hung_capture_is_replaced(runtime):
     async def scenario() -> None:
         events: list[StreamEvent] = []
         async with capturing(runtime, events, heartbeat_s=1.0) as capture:
@@ -116,7 +116,7 @@ def test_a_process_that_hangs_is_replaced(runtime):
     asyncio.run(scenario())
 
 
-def test_an_address_that_cannot_work_is_said_and_tried_seldom(runtime):
+def test_capture_with_missing_file_fails_with_its_path(runtime):
     async def scenario() -> None:
         wrong = spec("/nowhere/to/be/found.mp4")
         process = ManagedProcess(wrong, runtime.stream("a"), Direct(), lambda event: None)
@@ -144,7 +144,7 @@ time.sleep(600)
 """
 
 
-def test_a_process_ends_when_its_supervisor_is_killed(runtime):
+def test_capture_ends_when_supervisor_is_killed(runtime):
     command = [sys.executable, "-c", DYING, str(runtime.path), SMALL]
     supervisor = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     assert supervisor.stdout is not None
@@ -156,7 +156,7 @@ def test_a_process_ends_when_its_supervisor_is_killed(runtime):
     assert sorted(file.name for file in (runtime.path / "a").iterdir()) == ["capture.lock", "capture.spec"]
 
 
-def test_capture_loads_no_torch(runtime):
+def test_capture_does_not_import_torch(runtime):
     program = (
         "import sys, services.supervisor.capture, services.supervisor.capture, operators.sources.recording\n"
         "assert 'torch' not in sys.modules"
@@ -198,7 +198,7 @@ asyncio.run(run())
 """
 
 
-def test_processes_outlive_the_control_plane_and_each_other(runtime, bundle):
+def test_processes_survive_kills_of_control_plane_and_each_other(runtime, bundle):
     """A single long scenario, because an engine takes seconds to start."""
 
     async def scenario() -> None:
@@ -284,7 +284,7 @@ def test_processes_outlive_the_control_plane_and_each_other(runtime, bundle):
 
 
 @pytest.mark.parametrize("what", ["said", "log"])
-def test_nothing_that_is_said_names_the_address(runtime, what):
+def test_state_and_log_omit_password_of_source_address(runtime, what):
     secret = spec("rtsp://user:swordfish@127.0.0.1:1/stream")
 
     async def scenario() -> None:

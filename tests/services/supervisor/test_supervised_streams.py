@@ -28,7 +28,7 @@ def stream(**options):
     return settings.model_copy(update={"options": options})
 
 
-def test_a_stream_is_stopped_until_it_is_started_and_gone_when_it_is_deleted(streams):
+def test_stream_is_created_stopped_changed_and_deleted(streams):
     async def run():
         made = streams.create("theatre-1", stream(scale=0.5))
         assert (made.name, made.state, made.device, dict(made.options)) == (
@@ -46,7 +46,7 @@ def test_a_stream_is_stopped_until_it_is_started_and_gone_when_it_is_deleted(str
     asyncio.run(run())
 
 
-def test_what_cannot_be_is_refused_and_changes_nothing(streams):
+def test_supervised_streams_refuse_invalid_requests_without_change(streams):
     async def run():
         streams.create("theatre-1", stream())
         with pytest.raises(Conflict, match="a stream named theatre-1 already exists"):
@@ -105,7 +105,7 @@ def processes(monkeypatch, streams):
     return Process.made
 
 
-def test_a_stream_is_started_once_and_leaves_nothing_when_it_stops(streams, processes):
+def test_stream_starts_once_and_stop_removes_its_folder(streams, processes):
     async def run():
         streams.create("theatre-1", stream())
         assert processes == []
@@ -130,7 +130,7 @@ def test_a_stream_is_started_once_and_leaves_nothing_when_it_stops(streams, proc
     asyncio.run(run())
 
 
-def test_a_launcher_is_there_before_the_first_stream_starts(streams, processes, monkeypatch):
+def test_launcher_opens_before_first_stream_starts(streams, processes, monkeypatch):
     monkeypatch.setattr(stream_module.Stream, "view", lambda self: self.name)
 
     async def run():
@@ -158,7 +158,7 @@ def slow(processes, monkeypatch):
 
 
 @pytest.mark.parametrize("late", ["start", "set_options", "stop", "delete"])
-def test_a_stream_that_is_deleted_meanwhile_is_not_started_again(streams, slow, late):
+def test_concurrent_calls_do_not_restart_deleted_stream(streams, slow, late):
     """Nothing would stop its processes: the API has forgotten it."""
 
     async def run():
@@ -175,7 +175,7 @@ def test_a_stream_that_is_deleted_meanwhile_is_not_started_again(streams, slow, 
     assert len(started) == 2 and all(process.closed for process in started)
 
 
-def test_options_that_are_set_at_the_same_time_are_all_kept(streams, slow):
+def test_concurrent_set_options_are_all_kept(streams, slow):
     async def run():
         streams.create("theatre-1", stream())
         await streams.start("theatre-1")
@@ -185,7 +185,7 @@ def test_options_that_are_set_at_the_same_time_are_all_kept(streams, slow):
     asyncio.run(run())
 
 
-def test_streams_of_the_settings_are_made_and_those_that_say_so_started(streams, processes, monkeypatch):
+def test_running_creates_streams_of_settings_and_starts_those_with_start(streams, processes, monkeypatch):
     closed, removed = [], []
 
     async def close(*, stop):
@@ -207,7 +207,7 @@ def test_streams_of_the_settings_are_made_and_those_that_say_so_started(streams,
     asyncio.run(run())
 
 
-def test_a_stream_without_a_gpu_of_its_own_gets_another_one(streams, processes, monkeypatch):
+def test_new_streams_alternate_between_gpus(streams, processes, monkeypatch):
     monkeypatch.setattr(stream_module, "gpus", lambda: 2)
     monkeypatch.setattr(stream_module.Stream, "view", lambda self: self.name)
     gpus = []

@@ -33,7 +33,7 @@ def new_worker(runtime):
     return make
 
 
-def test_a_running_process_answers_holds_its_role_and_leaves_no_trace(new_worker, runtime):
+def test_worker_answers_commands_holds_role_and_cleans_up(new_worker, runtime):
     before = [signal.getsignal(number) for number in SIGNALS]
     with new_worker({"extra": lambda arguments: {"twice": 2 * arguments["value"]}}) as worker:
         endpoint = worker.folder.commands("capture")
@@ -59,7 +59,7 @@ def test_a_running_process_answers_holds_its_role_and_leaves_no_trace(new_worker
 
 
 @pytest.mark.parametrize("number", SIGNALS)
-def test_a_signal_requests_a_stop(new_worker, number):
+def test_worker_signal_requests_stop(new_worker, number):
     with new_worker() as worker:
         signal.raise_signal(number)
         assert worker.stop_requested() and worker.stop_reason == f"it got {number.name}"
@@ -73,7 +73,7 @@ def test_a_signal_requests_a_stop(new_worker, number):
         (KeyError(), "failed", "KeyError"),
     ],
 )
-def test_the_last_state_is_how_the_process_ended(new_worker, error, state, reason):
+def test_worker_last_state_is_ended_or_failed(new_worker, error, state, reason):
     worker = new_worker()
     try:
         with worker:
@@ -84,7 +84,7 @@ def test_the_last_state_is_how_the_process_ended(new_worker, error, state, reaso
     assert worker._said == {"state": state, "reason": reason}
 
 
-def test_a_change_of_state_is_sent_at_once(new_worker):
+def test_worker_sends_state_changes_immediately(new_worker):
     worker, sent = new_worker(), []
     worker._heartbeats = SimpleNamespace(say_now=lambda: sent.append(worker._said["reason"]))
     for state, reason in (
@@ -96,7 +96,7 @@ def test_a_change_of_state_is_sent_at_once(new_worker):
     assert worker._said["reason"] == "x" * 2000
 
 
-def test_figures_are_new_in_every_heartbeat_and_measures_once_per_second(new_worker, monkeypatch):
+def test_worker_reports_new_figures_always_and_measures_once_per_second(new_worker, monkeypatch):
     now = SimpleNamespace(s=50.0)
     monkeypatch.setattr(workers, "time", SimpleNamespace(monotonic=lambda: now.s))
     worker, counts = new_worker(), {"figures": 0, "measures": 0}
@@ -155,7 +155,7 @@ def watch(monkeypatch):
 DEAD = ProcessIdentity(os.getpid(), "another boot 1")
 
 
-def test_an_orphan_stops_after_its_time_and_ends_itself_soon_after(new_worker, watch):
+def test_orphaned_worker_stops_after_orphan_after_s_then_exits(new_worker, watch):
     worker = new_worker(orphan_after_s=30.0, drain_s=10.0)
     worker._parent.identity = DEAD
     object.__setattr__(worker, "folder", SimpleNamespace(clean=lambda role: None))
@@ -164,7 +164,7 @@ def test_an_orphan_stops_after_its_time_and_ends_itself_soon_after(new_worker, w
     assert worker.stop_reason == "its supervisor has died"
 
 
-def test_a_process_stays_with_its_supervisor_and_with_the_next_one(new_worker, watch):
+def test_worker_keeps_running_with_living_or_next_supervisor(new_worker, watch):
     worker = new_worker(orphan_after_s=30.0)
     assert watch(worker, 1.0, 1e6) is None and not worker.stop_requested(), "run by hand"
     worker._parent.identity = ProcessIdentity.own()
@@ -181,7 +181,7 @@ def test_a_process_stays_with_its_supervisor_and_with_the_next_one(new_worker, w
         worker._handlers["ping"]({"supervisor": {"pid": "x"}})
 
 
-def test_a_process_that_does_not_finish_in_time_ends_itself(new_worker, watch):
+def test_worker_exits_if_not_finished_within_drain_s(new_worker, watch):
     worker = new_worker(drain_s=5.0)
     assert watch(worker, 1.0, 90.0) is None
     socket_file = runtime_file = worker.folder.path / "left"
