@@ -72,7 +72,7 @@ def at_work(estimator):
     assert estimator.begun.acquire(timeout=WAIT_S)
 
 
-def test_the_newest_frame_is_next_and_the_others_are_counted(beside, estimator, frame):
+def test_background_depth_takes_newest_frame_and_counts_skipped(beside, estimator, frame):
     beside.offer(frame(0))
     at_work(estimator)
     for seq in (1, 2, 3):
@@ -92,7 +92,7 @@ def test_the_newest_frame_is_next_and_the_others_are_counted(beside, estimator, 
     assert "depth was not estimated for 2 frames, because newer ones had arrived" in outcome.notes
 
 
-def test_the_newest_depth_is_taken_where_two_were_found(beside, estimator, frame):
+def test_background_depth_take_returns_newest_result(beside, estimator, frame):
     for seq in (0, 1):
         beside.offer(frame(seq))
         at_work(estimator)
@@ -102,7 +102,7 @@ def test_the_newest_depth_is_taken_where_two_were_found(beside, estimator, frame
     assert beside.take()[0].seq == 1
 
 
-def test_what_is_learned_of_a_depth_is_made_ready_where_it_is_found(beside, estimator, frame):
+def test_background_depth_prepares_late_depth_in_its_thread(beside, estimator, frame):
     beside.offer(frame(0))
     at_work(estimator)
     estimator.gate.release()
@@ -116,7 +116,7 @@ def test_what_is_learned_of_a_depth_is_made_ready_where_it_is_found(beside, esti
     assert float(late.believed.max()) == 100
 
 
-def test_an_estimator_learns_of_a_scene_whose_first_frame_was_passed_over(beside, estimator, frame):
+def test_background_depth_marks_new_scene_if_first_frame_was_skipped(beside, estimator, frame):
     estimator.gate.release(10)
     found = []
     for given in (frame(0), frame(3, scene=1), frame(4, scene=1), frame(5, scene=2, new_scene="cut")):
@@ -129,7 +129,7 @@ def test_an_estimator_learns_of_a_scene_whose_first_frame_was_passed_over(beside
 @pytest.mark.parametrize(
     ("choice", "fields"), [("gated", {"depth": PLANE}), ("none", {}), ("recorded", {}), ("auto", {})]
 )
-def test_where_there_is_nothing_to_look_for_nobody_is_asked(frame, choice, fields, estimator):
+def test_background_depth_does_not_estimate_if_not_needed(frame, choice, fields, estimator):
     beside = BackgroundDepth(choice, CAMERA)
     beside.start()
     for seq in range(3):
@@ -138,7 +138,7 @@ def test_where_there_is_nothing_to_look_for_nobody_is_asked(frame, choice, field
     assert estimator.asked == [] and beside.take() is None and beside.counts.passed_over == 0
 
 
-def test_what_is_doubted_is_not_found(beside, estimator, frame):
+def test_background_depth_counts_doubted_depth_and_returns_none(beside, estimator, frame):
     estimator.gate.release(10)
     for seq in (99, 100):
         beside.offer(frame(seq))
@@ -147,7 +147,7 @@ def test_what_is_doubted_is_not_found(beside, estimator, frame):
     assert beside.finder.doubts.counted() == {"the eyes are swapped": 1}
 
 
-def test_a_failure_is_raised_by_the_operator_and_once(estimator, frame, compute):
+def test_depth_op_raises_error_of_background_estimator(estimator, frame, compute):
     operator = DepthOp(None, choice="gated", camera=CAMERA, in_background=True)
     beside = operator.background
     operator.start()
@@ -160,7 +160,7 @@ def test_a_failure_is_raised_by_the_operator_and_once(estimator, frame, compute)
     operator.stop()
 
 
-def test_it_can_be_stopped_while_it_rests_and_started_again(estimator, frame):
+def test_background_depth_stops_during_rest_and_restarts(estimator, frame):
     beside = BackgroundDepth("gated", CAMERA, share=1e-6)  # rests for hours
     estimator.gate.release(10)
     for seq in (0, 1):
@@ -176,9 +176,7 @@ def test_it_can_be_stopped_while_it_rests_and_started_again(estimator, frame):
 @pytest.mark.parametrize(
     ("cores", "rest_s", "binds"), [(2, 0.6, True), (4, 0.6, True), (5, 0.0, False), (64, 0.0, False)]
 )
-def test_depth_rests_three_times_as_long_as_it_works_where_cores_are_few(
-    estimator, frame, monkeypatch, cores, rest_s, binds
-):
+def test_background_depth_rests_three_times_work_time_on_few_cores(estimator, frame, monkeypatch, cores, rest_s, binds):
     bound, rested, clock = [], [], iter(range(1000))
     monkeypatch.setattr("operators.depth.usable_cores", lambda: cores)
     monkeypatch.setattr("operators.depth.use_one_thread", lambda: bound.append(True))
@@ -193,12 +191,12 @@ def test_depth_rests_three_times_as_long_as_it_works_where_cores_are_few(
     assert rested == [pytest.approx(rest_s)] and bool(bound) == binds
 
 
-def test_few_cores_are_left_to_training():
+def test_share_of_is_a_quarter_on_few_cores():
     assert share_of(2) == share_of(FEW_CORES) == 0.25 and share_of(FEW_CORES + 1) == share_of(16) == 1.0
 
 
 @pytest.mark.parametrize(("choice", "kept"), [("auto", True), ("recorded", True), ("none", False), ("stereo", False)])
-def test_recorded_depth_is_kept_or_dropped_as_the_setting_says(frame, compute, choice, kept):
+def test_background_depth_op_keeps_or_drops_recorded_depth_by_setting(frame, compute, choice, kept):
     operator = DepthOp(None, choice=choice, camera=CAMERA, in_background=True)
     operator.start()
     given = frame(0, depth=PLANE, depth_origin=DEPTH_ORIGINS["measured"])
@@ -213,7 +211,7 @@ def test_recorded_depth_is_kept_or_dropped_as_the_setting_says(frame, compute, c
         assert outcome.notes == (f"the depth delivered with 1 frames was not used (depth is {choice!r})",)
 
 
-def test_the_outcome_has_what_came_and_what_was_found(estimator, frame, compute):
+def test_background_depth_outcome_counts_found_and_dropped_depth(estimator, frame, compute):
     operator = DepthOp(None, choice="gated", camera=CAMERA, in_background=True)
     operator.start()
     compute(operator, frame=frame(0, depth=PLANE, depth_origin=DEPTH_ORIGINS["measured"]))
@@ -227,12 +225,12 @@ def test_the_outcome_has_what_came_and_what_was_found(estimator, frame, compute)
     assert any("delivered with 1 frames was not used" in note for note in outcome.notes)
 
 
-def test_another_name_is_refused():
+def test_background_depth_refuses_unknown_estimator():
     with pytest.raises(InvalidSetting, match="depth is 'sonar'; choose auto"):
         BackgroundDepth("sonar", CAMERA)
 
 
-def test_a_small_share_of_a_core_leaves_the_next_frame_waiting_and_a_stop_does_not_wait(estimator, frame):
+def test_background_depth_small_core_share_delays_next_frame_but_not_stop(estimator, frame):
     beside = BackgroundDepth("gated", CAMERA, share=1e-9)  # microseconds of work are followed by hours of rest
     beside.start()
     beside.offer(frame(0))

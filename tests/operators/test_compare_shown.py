@@ -10,7 +10,7 @@ from operators.metrics import CompareShownOp, ShownComparison
 from tests.operators.conftest import make_rendered, run_once
 
 
-def test_pictures_are_counted_and_the_first_different_one_is_named() -> None:
+def test_compare_shown_counts_and_names_first_different_picture() -> None:
     """The session showed frames 1, 2, 4, 5 and 7. Those of 4 and 5 were other pictures."""
 
     def shown(seq: int, offset: int = 2) -> ShownLine:

@@ -24,7 +24,9 @@ def damaged(tmp_path: Path) -> Path:
     return path
 
 
-def test_damaged_frames_are_shown_and_not_used(damaged: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_replay_shows_damaged_frames_without_training_or_score(
+    damaged: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     outcome = replay(ReplaySettings(damaged, tmp_path / "out", steps_per_frame=1, scale=0.4))
     source, display, quality = (outcome.find(kind) for kind in (SourceResult, DisplayResult, QualityResult))
     assert source is not None and display is not None and quality is not None

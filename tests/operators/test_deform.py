@@ -11,7 +11,7 @@ from operators.messages import Reconstruction
 from operators.rasterize import DeformOp
 
 
-def test_the_gaussians_are_those_of_the_frames_time(frame, model, camera, compute):
+def test_deform_evaluates_gaussians_at_frame_time(frame, model, camera, compute):
     still = model()
     field = BasisField(still.gaussians.count, (0.0, 1.0), bumps=4)
     with torch.no_grad():
@@ -26,7 +26,7 @@ def test_the_gaussians_are_those_of_the_frames_time(frame, model, camera, comput
     assert scene.camera == camera
 
 
-def test_a_frames_own_pose_moves_the_camera(frame, model, compute):
+def test_deform_uses_pose_of_frame_for_camera(frame, model, compute):
     pose = np.eye(4)
     pose[2, 3] = 4.0
     (scene,) = compute(DeformOp(None), reconstruction=Reconstruction(frame(0, pose=pose), model(), trained=False))

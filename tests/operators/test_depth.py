@@ -60,7 +60,7 @@ def outcome_of(operator):
 
 
 @pytest.mark.parametrize("choice", ["auto", "recorded"])
-def test_recorded_depth_goes_through_as_it_is(frame, compute, choice):
+def test_depth_op_passes_recorded_depth_unchanged(frame, compute, choice):
     given = frame(0, depth=PLANE, depth_origin=DEPTH_ORIGINS["measured"])
     operator = started(choice)
     (passed,) = compute(operator, frame=given)
@@ -70,7 +70,7 @@ def test_recorded_depth_goes_through_as_it_is(frame, compute, choice):
     assert outcome.notes == ()
 
 
-def test_none_drops_recorded_depth_and_says_so(frame, compute):
+def test_depth_none_drops_recorded_depth_with_note(frame, compute):
     operator = started("none")
     (passed,) = compute(operator, frame=frame(0, depth=PLANE, depth_origin=DEPTH_ORIGINS["measured"]))
     assert (passed.depth, passed.depth_confidence, passed.depth_origin) == (None, None, None)
@@ -78,13 +78,13 @@ def test_none_drops_recorded_depth_and_says_so(frame, compute):
 
 
 @pytest.mark.parametrize("choice", ["auto", "recorded", "stereo"])
-def test_a_frame_with_nothing_to_find_depth_from_has_none(frame, compute, choice):
+def test_depth_op_without_stereo_or_poses_finds_no_depth(frame, compute, choice):
     given = frame(0)
     (passed,) = compute(started(choice), frame=given)
     assert passed.depth is None
 
 
-def test_what_is_found_counts_where_it_is_believed(frame, compute, registered):
+def test_depth_op_zeroes_depth_below_confidence_threshold(frame, compute, registered):
     confidence = np.ones((16, 24), np.float32)
     confidence[:8] = 0.4
     registered("half", DepthMap(PLANE, confidence, DEPTH_ORIGINS["light"], metric=False))
@@ -99,7 +99,7 @@ def test_what_is_found_counts_where_it_is_believed(frame, compute, registered):
     )
 
 
-def test_a_doubted_depth_is_not_used_and_the_doubt_is_said(frame, compute, registered):
+def test_depth_op_drops_doubted_depth_with_note(frame, compute, registered):
     registered("wrong", doubted((16, 24), DEPTH_ORIGINS["stereo"], "the eyes are swapped"))
     operator = started("wrong")
     for seq in range(3):
@@ -108,7 +108,7 @@ def test_a_doubted_depth_is_not_used_and_the_doubt_is_said(frame, compute, regis
     assert outcome_of(operator).notes == ("3 frames got no depth: the eyes are swapped",)
 
 
-def test_an_estimator_gets_the_camera_where_the_frame_was_taken(frame, compute, registered):
+def test_depth_op_passes_camera_with_frame_pose_to_estimator(frame, compute, registered):
     pose = np.eye(4)
     pose[2, 3] = 7
     asked = registered("asked", None).asked
@@ -117,18 +117,18 @@ def test_an_estimator_gets_the_camera_where_the_frame_was_taken(frame, compute, 
 
 
 @pytest.mark.parametrize("fields", [{"status": FrameStatus.DAMAGED}, {"withheld": "blur"}])
-def test_nothing_is_sought_in_a_frame_that_is_not_learned_from(frame, compute, registered, fields):
+def test_depth_op_skips_damaged_and_withheld_frames(frame, compute, registered, fields):
     asked = registered("asked", None).asked
     compute(started("asked"), frame=frame(0, **fields))
     assert asked == []
 
 
-def test_another_name_is_refused():
+def test_depth_op_refuses_unknown_estimator():
     with pytest.raises(InvalidSetting, match="depth is 'sonar'; choose auto, recorded, stereo"):
         DepthOp(None, choice="sonar", camera=CAMERA)
 
 
-def test_it_is_said_what_a_model_without_depth_means():
+def test_without_depth_note_states_start_on_plane():
     config = ReconstructorConfig()
     assert without_depth("auto", frozenset({"depth"}), config) is None
     said = without_depth("none", frozenset({"depth"}), config)
@@ -151,13 +151,13 @@ def test_it_is_said_what_a_model_without_depth_means():
         ("parallax", None, None),
     ],
 )
-def test_a_right_eye_that_the_frames_lack_is_noted(depth, eyes, asked):
+def test_without_right_eye_note_for_stereo_settings(depth, eyes, asked):
     found = without_right_eye(depth, eyes, frozenset({"pose"}), "clip.mp4")
     assert found == (None if asked is None else f"{asked}, but clip.mp4 has one eye, so that this has no effect")
     assert without_right_eye(depth, eyes, frozenset({"right_image"}), "clip.mp4") is None
 
 
-def test_a_scene_that_depth_by_light_starts_is_not_said_to_start_on_a_plane_for_certain():
+def test_without_depth_note_mentions_light_and_network_estimators():
     said = without_depth("light", frozenset(), ReconstructorConfig())
     assert "unless light and shade show how far away it is" in said
     said = without_depth("onnx:net.onnx", frozenset(), ReconstructorConfig())
@@ -166,7 +166,7 @@ def test_a_scene_that_depth_by_light_starts_is_not_said_to_start_on_a_plane_for_
 
 @pytest.mark.parametrize("has_time", [True, False])
 @pytest.mark.parametrize("fields", [{}, {"pose": np.eye(4)}], ids=["fixed", "with poses"])
-def test_no_default_finds_depth_by_light(frame, compute, monkeypatch, has_time, fields):
+def test_auto_depth_never_uses_light_estimator(frame, compute, monkeypatch, has_time, fields):
     by_light = Fixed(None)
     monkeypatch.setattr(maps, "DEPTHS", {**{name: DEPTHS[name] for name in DEPTHS}, "light": lambda: by_light})
     operator = DepthOp(None, choice="auto", camera=CAMERA, has_time=has_time)
@@ -179,9 +179,7 @@ def test_no_default_finds_depth_by_light(frame, compute, monkeypatch, has_time, 
 
 
 @pytest.mark.parametrize(("has_time", "asked"), [(True, [0, 2, 3]), (False, [])])
-def test_auto_asks_what_takes_long_where_there_is_time_and_never_about_held_out_frames(
-    frame, compute, monkeypatch, has_time, asked
-):
+def test_auto_depth_uses_slow_estimator_only_offline_and_not_for_heldout(frame, compute, monkeypatch, has_time, asked):
     slow = Fixed(None)
     monkeypatch.setattr(maps, "DEPTHS", {**{name: DEPTHS[name] for name in DEPTHS}, "parallax": lambda: slow})
     operator = DepthOp(None, choice="auto", camera=CAMERA, has_time=has_time, held_out=lambda given: given.seq == 1)
@@ -198,7 +196,7 @@ def finder(doubts=(), remarks=()):
     )
 
 
-def test_counts_of_depth_are_shares_and_sentences(frame):
+def test_depth_counts_contribute_shares_and_notes(frame):
     half = PLANE.copy()
     half[:8] = 0
     sure = np.full((16, 24), BELIEVED, np.float32)
@@ -226,7 +224,7 @@ def test_counts_of_depth_are_shares_and_sentences(frame):
         assert said in text
 
 
-def test_without_frames_there_is_nothing_to_say():
+def test_depth_counts_without_frames_add_no_note():
     outcome = OutcomeBuilder()
     DepthCounts().contribute(outcome, "auto", None)
     result = outcome.find(FoundDepth)
@@ -253,7 +251,7 @@ def test_without_frames_there_is_nothing_to_say():
         ("light", set(), False, "unless light and shade show"),
     ],
 )
-def test_a_note_names_the_ways_to_depth(choice, fields, motion, ways):
+def test_without_depth_note_lists_possible_estimators(choice, fields, motion, ways):
     config = SimpleNamespace(depth_of_recording="parallax" if motion else None, default_depth_mm=50.0)
     note = without_depth(choice, frozenset(fields), config)
     assert (note is None) if ways is None else (ways in note and "a plane 50 mm away" in note)

@@ -40,25 +40,25 @@ def screen(fake_time):
     return Screen(fake_time)
 
 
-def arrived(rendered, frame, fake_time, seq=0, age_ms=10.0):
+def picture_aged(rendered, frame, fake_time, seq=0, age_ms=10.0):
     """A picture of a frame that came so long ago."""
     return rendered(seq, frame=frame(seq, arrived_ns=fake_time.ns - round(age_ms * 1e6)))
 
 
-def of_height(height, rendered, frame, fake_time):
+def grey_picture(height, rendered, frame, fake_time):
     """An even grey picture of that height of a frame that arrived 10 ms ago."""
     image = np.full((height, 320, 3), 7, np.uint8)
     return rendered(0, frame=frame(0, arrived_ns=fake_time.ns - 10_000_000, image=image))
 
 
-def test_a_new_picture_is_shown_with_its_age(screen, rendered, frame, fake_time, compute_queued):
-    (shown,) = compute_queued(screen.operator, rendered=[arrived(rendered, frame, fake_time)])
+def test_display_shows_new_picture_with_age(screen, rendered, frame, fake_time, compute_queued):
+    (shown,) = compute_queued(screen.operator, rendered=[picture_aged(rendered, frame, fake_time)])
     assert shown.state is PictureState.LIVE
     assert shown.new
     assert shown.age_ns == 10_000_000
 
 
-def test_the_age_is_that_of_the_content_and_not_of_the_frame(screen, rendered, frame, fake_time, compute_queued):
+def test_display_age_is_age_of_content(screen, rendered, frame, fake_time, compute_queued):
     old = frame(0, arrived_ns=fake_time.ns - 500_000_000)
     picture = rendered(5, frame=frame(5, arrived_ns=fake_time.ns), content=old)
     (shown,) = compute_queued(screen.operator, rendered=[picture])
@@ -66,10 +66,8 @@ def test_the_age_is_that_of_the_content_and_not_of_the_frame(screen, rendered, f
     assert shown.state is PictureState.STALE
 
 
-def test_a_picture_that_is_not_renewed_becomes_stale_and_then_frozen(
-    screen, rendered, frame, fake_time, compute_queued
-):
-    compute_queued(screen.operator, rendered=[arrived(rendered, frame, fake_time)])
+def test_display_picture_becomes_stale_then_frozen(screen, rendered, frame, fake_time, compute_queued):
+    compute_queued(screen.operator, rendered=[picture_aged(rendered, frame, fake_time)])
     states = []
     for _ in range(30):
         fake_time.pass_ms(50)
@@ -78,40 +76,38 @@ def test_a_picture_that_is_not_renewed_becomes_stale_and_then_frozen(
     assert changes == [PictureState.STALE, PictureState.FROZEN]
 
 
-def test_a_lost_source_is_said_at_once_and_a_picture_that_comes_back_is_live(
+def test_display_shows_source_lost_immediately_and_live_after_recovery(
     screen, rendered, frame, fake_time, compute_queued
 ):
-    compute_queued(screen.operator, rendered=[arrived(rendered, frame, fake_time)])
+    compute_queued(screen.operator, rendered=[picture_aged(rendered, frame, fake_time)])
     screen.source = SourceState.RECONNECTING
     (shown,) = compute_queued(screen.operator)
     assert (shown.state, shown.new) == (PictureState.SOURCE_LOST, False)
     screen.source = SourceState.LIVE
-    (shown,) = compute_queued(screen.operator, rendered=[arrived(rendered, frame, fake_time, seq=1)])
+    (shown,) = compute_queued(screen.operator, rendered=[picture_aged(rendered, frame, fake_time, seq=1)])
     assert shown.state is PictureState.LIVE
 
 
-def test_an_unchanged_live_picture_is_not_sent_again(screen, rendered, frame, fake_time, compute_queued):
-    compute_queued(screen.operator, rendered=[arrived(rendered, frame, fake_time)])
+def test_display_does_not_resend_unchanged_live_picture(screen, rendered, frame, fake_time, compute_queued):
+    compute_queued(screen.operator, rendered=[picture_aged(rendered, frame, fake_time)])
     fake_time.pass_ms(20)
     assert compute_queued(screen.operator) == []
 
 
-def test_nothing_is_shown_before_the_first_picture(screen, compute_queued):
+def test_display_emits_nothing_before_first_picture(screen, compute_queued):
     screen.source = SourceState.STALLED
     assert compute_queued(screen.operator) == []
 
 
-def test_a_slow_camera_is_not_stale(fake_time):
+def test_picture_state_depends_on_frame_interval(fake_time):
     assert picture_state(300e6, interval_ns=200e6, source=SourceState.LIVE) is PictureState.LIVE
     assert picture_state(300e6, interval_ns=33e6, source=SourceState.LIVE) is PictureState.STALE
 
 
-def test_a_picture_that_is_not_live_is_labelled_even_where_labels_are_off(
-    fake_time, rendered, frame, compute_queued, monkeypatch
-):
+def test_display_labels_non_live_picture_below_minimum_height(fake_time, rendered, frame, compute_queued, monkeypatch):
     monkeypatch.setattr(display, "LEAST_LABELLED_PX", 10_000)
     screen = Screen(fake_time)
-    picture = arrived(rendered, frame, fake_time)
+    picture = picture_aged(rendered, frame, fake_time)
     (live,) = compute_queued(screen.operator, rendered=[picture])
     assert live.image is picture.image
     screen.source = SourceState.STALLED
@@ -120,8 +116,8 @@ def test_a_picture_that_is_not_live_is_labelled_even_where_labels_are_off(
 
 
 @pytest.mark.parametrize("state", [state for state in PictureState if state is not PictureState.BEHIND])
-def test_the_label_is_drawn_into_a_copy(screen, rendered, frame, fake_time, compute_queued, state):
-    picture = of_height(LEAST_LABELLED_PX, rendered, frame, fake_time)
+def test_display_draws_label_into_copy(screen, rendered, frame, fake_time, compute_queued, state):
+    picture = grey_picture(LEAST_LABELLED_PX, rendered, frame, fake_time)
     before = picture.image.copy()
     fake_time.pass_ms({PictureState.STALE: 500, PictureState.FROZEN: 5000}.get(state, 0))
     screen.source = SourceState.STALLED if state is PictureState.SOURCE_LOST else SourceState.LIVE
@@ -131,10 +127,10 @@ def test_the_label_is_drawn_into_a_copy(screen, rendered, frame, fake_time, comp
 
 
 @pytest.mark.parametrize(("height", "labelled"), [(120, False), (240, True)])
-def test_a_label_would_hide_much_of_a_small_live_picture(
+def test_display_does_not_label_small_live_picture(
     screen, rendered, frame, fake_time, compute_queued, height, labelled
 ):
-    picture = of_height(height, rendered, frame, fake_time)
+    picture = grey_picture(height, rendered, frame, fake_time)
     (live,) = compute_queued(screen.operator, rendered=[picture])
     assert (live.state, bool((live.image != picture.image).any())) == (PictureState.LIVE, labelled)
     fake_time.pass_ms(500)
@@ -143,7 +139,7 @@ def test_a_label_would_hide_much_of_a_small_live_picture(
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 40), (40, 1), (7, 5)])
-def test_tiny_pictures_can_be_labelled(size):
+def test_draw_label_on_tiny_picture(size):
     picture = np.zeros((*size, 3), np.uint8)
     draw_label(picture, PictureState.FROZEN, 3e9)
     assert picture.any()
@@ -156,9 +152,7 @@ def with_tool(frame, **fields):
     return frame(**{"mask": mask, **fields})
 
 
-def test_tissue_behind_a_tool_is_marked_and_tissue_that_is_seen_stays_as_it_is(
-    fake_time, rendered, frame, compute_queued, monkeypatch
-):
+def test_display_marks_tissue_behind_tool_only(fake_time, rendered, frame, compute_queued, monkeypatch):
     monkeypatch.setattr(display, "LEAST_LABELLED_PX", 10_000)
     picture = rendered(0, frame=with_tool(frame, arrived_ns=fake_time.ns))
     (shown,) = compute_queued(Screen(fake_time).operator, rendered=[picture])
@@ -168,9 +162,7 @@ def test_tissue_behind_a_tool_is_marked_and_tissue_that_is_seen_stays_as_it_is(
     assert (np.ptp(shown.image[~tissue], axis=-1) == 0).all()
 
 
-def test_is_outdated_a_picture_without_new_frames_or_whose_frames_show_nothing(
-    screen, rendered, frame, fake_time, compute_queued
-):
+def test_display_marks_whole_picture_as_remembered_if_outdated(screen, rendered, frame, fake_time, compute_queued):
     content = frame(0, arrived_ns=fake_time.ns)
     seen = rendered(0, frame=content, content=content)
     black = rendered(1, frame=frame(1, withheld="black"), content=content)
@@ -188,10 +180,10 @@ def test_is_outdated_a_picture_without_new_frames_or_whose_frames_show_nothing(
     assert lost.state is PictureState.SOURCE_LOST and lost.remembered.all()
 
 
-def test_the_outcome_counts_states_and_ages(screen, rendered, frame, fake_time, compute_queued):
-    compute_queued(screen.operator, rendered=[arrived(rendered, frame, fake_time, age_ms=40)])
+def test_display_outcome_counts_states_and_ages(screen, rendered, frame, fake_time, compute_queued):
+    compute_queued(screen.operator, rendered=[picture_aged(rendered, frame, fake_time, age_ms=40)])
     fake_time.pass_ms(100)
-    compute_queued(screen.operator, rendered=[arrived(rendered, frame, fake_time, seq=1, age_ms=10)])
+    compute_queued(screen.operator, rendered=[picture_aged(rendered, frame, fake_time, seq=1, age_ms=10)])
     outcome = OutcomeBuilder()
     screen.operator.contribute(outcome)
     result = outcome.find(LiveDisplayResult)
@@ -199,7 +191,7 @@ def test_the_outcome_counts_states_and_ages(screen, rendered, frame, fake_time, 
     assert result.age.max_ms == 40.0
 
 
-def test_ages_of_the_first_second_and_of_withheld_frames_are_told_apart(
+def test_display_outcome_separates_ages_of_first_second_and_withheld_frames(
     screen, rendered, frame, fake_time, compute_queued
 ):
     for time_s, age_ms, withheld in [(3.0, 200.0, None), (3.99, 100.0, None), (4.0, 20.0, None), (4.5, 90.0, "blur")]:
@@ -219,7 +211,7 @@ def test_ages_of_the_first_second_and_of_withheld_frames_are_told_apart(
     ("interval_ms", "stale_ms", "frozen_ms"),
     [(33.3, 150.0, 1000.0), (100.0, 300.0, 1000.0), (200.0, 600.0, 1200.0), (1000.0, 3000.0, 6000.0)],
 )
-def test_the_thresholds_follow_the_camera_and_a_picture_that_old_has_not_passed_them(interval_ms, stale_ms, frozen_ms):
+def test_picture_state_thresholds_by_frame_interval(interval_ms, stale_ms, frozen_ms):
     state = lambda age_ms: picture_state(age_ms * 1e6, interval_ms * 1e6, SourceState.LIVE)
     assert state(0) is state(stale_ms) is PictureState.LIVE
     assert state(stale_ms + 0.1) is state(frozen_ms) is PictureState.STALE
@@ -227,14 +219,12 @@ def test_the_thresholds_follow_the_camera_and_a_picture_that_old_has_not_passed_
 
 
 @pytest.mark.parametrize("source", [each for each in SourceState if each is not SourceState.LIVE])
-def test_a_source_that_is_not_live_is_lost_however_young_the_picture_is(source):
+def test_picture_state_is_source_lost_if_source_is_not_live(source):
     assert picture_state(0.0, 33e6, source) is PictureState.SOURCE_LOST
 
 
-def test_a_picture_that_is_not_live_is_sent_again_five_times_a_second(
-    screen, rendered, frame, fake_time, compute_queued
-):
-    compute_queued(screen.operator, rendered=[arrived(rendered, frame, fake_time, age_ms=0)])
+def test_display_resends_non_live_picture_every_200_ms(screen, rendered, frame, fake_time, compute_queued):
+    compute_queued(screen.operator, rendered=[picture_aged(rendered, frame, fake_time, age_ms=0)])
     sent_ms = []
     for now_ms in range(10, 1001, 10):
         fake_time.pass_ms(10)
@@ -244,23 +234,23 @@ def test_a_picture_that_is_not_live_is_sent_again_five_times_a_second(
     assert sent_ms == [160, 360, 560, 760, 960]
 
 
-def test_a_picture_of_the_future_has_no_age(screen, rendered, frame, fake_time, compute_queued):
+def test_display_age_of_future_picture_is_zero(screen, rendered, frame, fake_time, compute_queued):
     """Clocks of two processes may differ by a little."""
-    (shown,) = compute_queued(screen.operator, rendered=[arrived(rendered, frame, fake_time, age_ms=-5)])
+    (shown,) = compute_queued(screen.operator, rendered=[picture_aged(rendered, frame, fake_time, age_ms=-5)])
     assert (shown.age_ns, shown.state) == (0, PictureState.LIVE)
     assert screen.operator.age_p50_ms == 0
 
 
-def test_the_clock_learns_how_long_showing_takes(screen, rendered, frame, fake_time, compute_queued):
+def test_display_updates_display_time_of_frame_clock(screen, rendered, frame, fake_time, compute_queued):
     usual_ns = screen.operator.clock.display_ns
     picture = rendered(0, frame=frame(0, arrived_ns=fake_time.ns), published_ns=fake_time.ns - 6_000_000)
     compute_queued(screen.operator, rendered=[picture])
     assert usual_ns < screen.operator.clock.display_ns < 6_000_000
 
 
-def test_each_change_of_state_is_counted_once(screen, rendered, frame, fake_time, compute_queued):
+def test_display_counts_each_state_change_once(screen, rendered, frame, fake_time, compute_queued):
     for seq in range(2):
-        compute_queued(screen.operator, rendered=[arrived(rendered, frame, fake_time, seq=seq)])
+        compute_queued(screen.operator, rendered=[picture_aged(rendered, frame, fake_time, seq=seq)])
         for _ in range(40):
             fake_time.pass_ms(50)
             compute_queued(screen.operator)
@@ -268,11 +258,11 @@ def test_each_change_of_state_is_counted_once(screen, rendered, frame, fake_time
 
 
 @pytest.mark.parametrize(("age_ns", "said"), [(4_400_000, "4 ms"), (999_000_000, "999 ms"), (1_250_000_000, "1.2 s")])
-def test_ages_are_written_in_ms_or_s(age_ns, said):
+def test_age_text_is_in_ms_or_s(age_ns, said):
     assert _age_text(age_ns) == said
 
 
-def test_the_operator_looks_twenty_times_a_second_and_keeps_four_pictures(fake_time):
+def test_display_op_polls_every_50_ms_and_queues_four_pictures(fake_time):
     clock = FrameClock(ClockSettings(), 25, fake_time)
     operator = DisplayOp(None, clock=clock, source_state=lambda: SourceState.LIVE)
     (condition,) = operator.conditions
@@ -290,13 +280,13 @@ def test_the_operator_looks_twenty_times_a_second_and_keeps_four_pictures(fake_t
         (PictureState.SOURCE_LOST, False, True),
     ],
 )
-def test_a_picture_is_memory_where_nothing_of_it_was_seen_for_long(rendered, frame, state, unused, outdated):
+def test_is_outdated_by_state_and_frame_use(rendered, frame, state, unused, outdated):
     for fields in ({"withheld": "black"}, {"status": FrameStatus.DAMAGED, "damage": "torn"}) if unused else ({},):
         assert _is_outdated(rendered(frame=frame(**fields)), state) is outdated
 
 
 @pytest.mark.parametrize(("height", "edge"), [(64, 2), (160, 2), (240, 3)])
-def test_the_frame_of_a_picture_that_is_not_live_is_an_80th_of_its_height(height, edge):
+def test_draw_label_border_is_an_80th_of_picture_height(height, edge):
     picture = np.full((height, 320, 3), 7, np.uint8)
     draw_label(picture, PictureState.FROZEN, 0)
     column = (picture[:, 300] != 7).any(-1)
@@ -307,13 +297,13 @@ def test_the_frame_of_a_picture_that_is_not_live_is_an_80th_of_its_height(height
     assert (live[-1] == 7).all() and (live[:, -1] == 7).all() and (live[:8, :8] != 7).any()
 
 
-def test_before_it_starts_nothing_was_shown(fake_time):
+def test_display_op_initial_state(fake_time):
     operator = DisplayOp(None, clock=FrameClock(ClockSettings(), 25, fake_time), source_state=lambda: SourceState.LIVE)
     assert (operator.pictures, operator.state, operator.states, operator.age_p50_ms) == (0, None, {}, 0.0)
 
 
 @pytest.mark.parametrize("state", PictureState)
-def test_the_text_of_a_label_lies_in_its_box_in_the_colour_of_the_state(state):
+def test_draw_label_text_lies_inside_box(state):
     picture = np.full((200, 400, 3), 7, np.uint8)
     draw_label(picture, state, 120e6)
     inside = picture[5:-5, 5:-5]
@@ -324,7 +314,7 @@ def test_the_text_of_a_label_lies_in_its_box_in_the_colour_of_the_state(state):
     assert len(black[0]) > len(rows)
 
 
-def test_a_picture_that_the_previous_frame_would_beat_is_shown_as_behind(rendered, frame, fake_time, compute_queued):
+def test_display_shows_behind_if_previous_frame_is_better(rendered, frame, fake_time, compute_queued):
     guard = BehindGuard()
     guard.scene_begun(0)
     clock = FrameClock(ClockSettings(), 30.0, fake_time)

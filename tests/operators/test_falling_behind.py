@@ -46,7 +46,7 @@ def guard():
     return made
 
 
-def test_a_picture_worse_than_the_previous_frame_and_a_new_scene_is_behind(guard):
+def test_guard_judges_picture_worse_than_previous_frame_as_behind(guard):
     frames = [frame_at(seq, 0.2 * seq) for seq in range(1, 5)]
     assert not guard.judge(frames[0], blurred(frames[0].image, 0.6))
     assert guard.judge(frames[1], view(5)) and not guard.renewal_is_due()
@@ -56,7 +56,7 @@ def test_a_picture_worse_than_the_previous_frame_and_a_new_scene_is_behind(guard
     assert not guard.judge(frames[3], frames[3].image)
 
 
-def test_a_good_picture_between_bad_ones_defers_the_renewal(guard):
+def test_good_picture_between_bad_ones_defers_renewal(guard):
     for seq in range(1, 9):
         frame = frame_at(seq, 0.2 * seq)
         guard.judge(frame, view(5) if seq % RENEW_AFTER else frame.image)
@@ -64,7 +64,7 @@ def test_a_good_picture_between_bad_ones_defers_the_renewal(guard):
 
 
 @pytest.mark.parametrize("case", ["still", "jump", "withheld", "no tissue", "other scene", "other size"])
-def test_no_model_is_blamed_where_a_new_one_would_not_be_better_or_nothing_can_be_compared(guard, case):
+def test_guard_does_not_judge_incomparable_frames_as_behind(guard, case):
     """On a still picture the previous frame is perfect. A jump makes it useless."""
     for seq in range(1, 5):
         frame = frame_at(seq, 0.0)
@@ -84,7 +84,7 @@ def test_no_model_is_blamed_where_a_new_one_would_not_be_better_or_nothing_can_b
     assert not guard.renewal_is_due()
 
 
-def test_renewals_that_do_not_help_become_rare():
+def test_interval_between_useless_renewals_doubles():
     guard, renewed, previous = BehindGuard(), [], 0
     guard.scene_begun(0)
     for seq in range(100):
@@ -98,7 +98,7 @@ def test_renewals_that_do_not_help_become_rare():
     assert renewed == [3, 5, 9, 17, 33]
 
 
-def test_only_tissue_counts(guard):
+def test_guard_compares_only_tissue_pixels(guard):
     mask = np.ones((HEIGHT, WIDTH), np.uint8)
     mask[:, :30] = 0
     for seq in (1, 2, 3):
@@ -162,13 +162,13 @@ def journey(*speeds):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("steps", [4, 12])
-def test_a_moving_scope_is_shown_at_least_as_well_as_by_its_previous_frame(steps):
+def test_moving_scope_picture_is_at_most_1_db_below_previous_frame(steps):
     stream = Stream(steps, colour_relaxation=1.5)
     gains = [stream(frame) for frame in journey(*[5.0] * 6)]
     assert min(gains[1:]) > -1.0 and not stream.renewed
 
 
-def test_a_model_that_cannot_follow_is_good_again_within_five_frames():
+def test_guard_renewal_restores_model_within_five_frames():
     """The rates are far too small for the motion: only a new scene shows the frames after it."""
     frames = list(journey(3.0, 3.0, 3.0))[:13]
     slow = dict(first_rate=0.01, last_rate=0.01)

@@ -27,7 +27,7 @@ def entry(seq, db=30.0, trained=True, **more):
     }
 
 
-def test_each_entry_is_on_disk_when_write_returns(tmp_path):
+def test_frame_log_entry_is_on_disk_after_write(tmp_path):
     log = FrameLog(tmp_path / "frames.jsonl")
     log.open()
     for seq in range(3):
@@ -38,7 +38,7 @@ def test_each_entry_is_on_disk_when_write_returns(tmp_path):
     assert [json.loads(line) for line in log.path.read_text().splitlines()] == [entry(k) for k in range(3)]
 
 
-def test_a_file_that_was_cut_anywhere_gives_the_lines_before(tmp_path):
+def test_read_frames_of_truncated_file_returns_complete_lines(tmp_path):
     log = FrameLog(tmp_path / "frames.jsonl")
     log.open()
     for seq in range(3):
@@ -51,7 +51,7 @@ def test_a_file_that_was_cut_anywhere_gives_the_lines_before(tmp_path):
         assert len(list(read_frames(log.path))) == sum(end <= length for end in ends)
 
 
-def test_opening_again_begins_anew_and_a_link_is_replaced_not_followed(tmp_path):
+def test_frame_log_open_truncates_and_replaces_symlink(tmp_path):
     other = tmp_path / "precious.txt"
     other.write_text("mine")
     (tmp_path / "frames.jsonl").symlink_to(other)
@@ -65,13 +65,13 @@ def test_opening_again_begins_anew_and_a_link_is_replaced_not_followed(tmp_path)
     assert [each["seq"] for each in read_frames(log.path)] == [1]
 
 
-def test_without_a_file_there_are_no_entries_and_without_open_nothing_is_written(tmp_path):
+def test_frame_log_missing_file_is_empty_and_write_requires_open(tmp_path):
     assert list(read_frames(tmp_path / "frames.jsonl")) == []
     with pytest.raises(InvalidInput, match="is not open"):
         FrameLog(tmp_path / "frames.jsonl").write(entry(0))
 
 
-def test_a_full_disk_is_a_sentence(tmp_path):
+def test_frame_log_write_on_full_disk_raises_storage_full(tmp_path):
     log = FrameLog(tmp_path / "frames.jsonl", StorageReserve(tmp_path, lambda: 1 << 60))
     log.open()
     with pytest.raises(StorageFull, match="free some space"):
@@ -83,16 +83,16 @@ def test_a_full_disk_is_a_sentence(tmp_path):
 @pytest.mark.parametrize(
     ("frames", "most", "expected"), [(0, 10, 1), (1, 10, 1), (10, 10, 1), (11, 10, 2), (20, 10, 2), (21, 10, 3)]
 )
-def test_an_entry_sums_up_as_few_frames_as_the_limit_allows(frames, most, expected):
+def test_frames_per_entry_is_smallest_that_meets_limit(frames, most, expected):
     assert frames_per_entry(frames, most) == expected
 
 
-def test_a_short_run_keeps_every_entry_as_it_is():
+def test_series_of_one_frame_per_entry_is_unchanged():
     entries = [entry(k) for k in range(5)]
     assert list(series(iter(entries), 1)) == entries
 
 
-def test_a_long_run_is_summed_up_by_means_and_worst_frames():
+def test_series_entries_have_mean_and_worst_score():
     first, last = list(series([entry(3, 30.0), entry(7, 20.0), entry(8, None), entry(9, 36.0)], 3))
     assert first == entry(3, 25.0, frames=3, psnr_tissue_min_db=20.0), "a frame without tissue is left out of the means"
     assert last == entry(9, 36.0, frames=1, psnr_tissue_min_db=36.0)
@@ -100,7 +100,7 @@ def test_a_long_run_is_summed_up_by_means_and_worst_frames():
     assert nothing["psnr_tissue_db"] is None and nothing["psnr_tissue_min_db"] is None
 
 
-def test_held_out_frames_are_never_mixed_with_trained_ones():
+def test_series_separates_heldout_and_trained_frames():
     mixed = [entry(0, 30.0), entry(1, 10.0, trained=False), entry(2, 40.0), entry(3, 20.0)]
     binned = list(series(mixed, 3))
     assert [(each["seq"], each["trained"], each["frames"], each["psnr_tissue_db"]) for each in binned] == [
@@ -110,7 +110,7 @@ def test_held_out_frames_are_never_mixed_with_trained_ones():
     ]
 
 
-def test_every_frame_is_in_exactly_one_bin():
+def test_series_contains_every_frame_once():
     entries = [entry(k, 20.0 + k % 7, trained=k % 8 != 1) for k in range(1000)]
     binned = list(series(entries, frames_per_entry(1000, 100)))
     assert len(binned) <= 2 * 100
@@ -121,5 +121,5 @@ def test_every_frame_is_in_exactly_one_bin():
 
 
 @pytest.mark.parametrize(("frames", "per_entry"), [(0, 1), (1, 1), (4096, 1), (4097, 2), (8192, 2), (8193, 3)])
-def test_a_series_has_at_most_4096_bins(frames, per_entry):
+def test_series_has_at_most_4096_entries_per_kind(frames, per_entry):
     assert MAX_SERIES == 4096 and frames_per_entry(frames, MAX_SERIES) == per_entry

@@ -67,7 +67,7 @@ def result(app):
     return outcome.find(SourceResult)
 
 
-def test_every_frame_arrives_once_in_order_with_its_metadata(recording):
+def test_source_op_emits_every_frame_once_with_metadata(recording):
     app = Stream(RecordingSource(recording))
     run = app.run()
     assert [seq for seq, _ in app.sink.seen] == [0, 1, 2, 3, 4]
@@ -77,7 +77,7 @@ def test_every_frame_arrives_once_in_order_with_its_metadata(recording):
     assert result(app).description.name == recording.name
 
 
-def test_the_source_is_opened_after_all_operators_are_ready(camera, frame, monkeypatch):
+def test_source_op_opens_source_after_threads_are_prepared(camera, frame, monkeypatch):
     """The frames of a live source arrive from then on, so the first one would wait for the slowest operator."""
     events = []
     source = Scripted([frame(0)], camera)
@@ -90,21 +90,21 @@ def test_the_source_is_opened_after_all_operators_are_ready(camera, frame, monke
     assert [seq for seq, _ in app.sink.seen] == [0]
 
 
-def test_a_stop_ends_the_stream_and_what_is_on_its_way_arrives(recording):
+def test_source_op_stop_request_delivers_emitted_frames(recording):
     app = Stream(RecordingSource(recording), stop_requested=lambda: app.source.emitted >= 2)
     app.run()
     assert [seq for seq, _ in app.sink.seen] == [0, 1]
     assert (result(app).frames, result(app).reached_end) == (2, False)
 
 
-def test_a_recording_with_fewer_frames_than_stated_ends_without_an_error(recording, monkeypatch):
+def test_source_op_ends_if_recording_has_fewer_frames_than_stated(recording, monkeypatch):
     monkeypatch.setattr(type(recording), "frame_count", property(lambda self: 9))
     app = Stream(RecordingSource(recording))
     app.run()
     assert (result(app).frames, result(app).reached_end) == (5, True)
 
 
-def test_a_stall_is_waited_for_and_missing_numbers_are_no_error(camera, frame):
+def test_source_op_waits_for_stall_and_accepts_missing_numbers(camera, frame):
     source = Scripted([frame(0), None, None, frame(3), None, frame(9)], camera)
     app = Stream(source)
     app.run()
@@ -113,26 +113,26 @@ def test_a_stall_is_waited_for_and_missing_numbers_are_no_error(camera, frame):
     assert result(app).reached_end
 
 
-def test_a_source_that_gives_nothing_can_be_stopped(camera):
+def test_source_op_without_frames_ends_on_stop_request(camera):
     source = Scripted([None] * 10_000, camera)
     app = Stream(source, stop_requested=lambda: len(source.script) < 9_900)
     app.run()
     assert app.sink.seen == [] and not result(app).reached_end and source.closed == 1
 
 
-def test_the_stream_ends_when_its_time_is_over_whether_or_not_frames_come(camera, frame):
+def test_source_op_ends_after_time_limit_without_frames(camera, frame):
     app = Stream(Scripted([None] * 100_000, camera), seconds=0.05)
     app.run()
     assert app.sink.seen == [] and not result(app).reached_end
 
 
 @pytest.mark.parametrize("second", [0, 1])
-def test_numbers_that_do_not_increase_are_a_fault_of_the_source(camera, frame, second):
+def test_source_op_refuses_non_increasing_frame_numbers(camera, frame, second):
     with pytest.raises(OperatorFailed, match=f"frame {second} came after frame 1; a source's numbers must increase"):
         Stream(Scripted([frame(1), frame(second)], camera)).run()
 
 
-def test_an_error_names_the_operator_and_the_source_is_closed(camera, frame):
+def test_source_op_error_closes_source(camera, frame):
     source = Scripted([frame(0), ValueError("the file ends here")], camera)
     with pytest.raises(OperatorFailed, match=r"operator 'source' failed in compute.*the file ends here"):
         Stream(source).run()
@@ -163,7 +163,7 @@ class Reporting(Scripted):
         return step
 
 
-def test_states_and_counts_of_a_live_source_are_contributed(camera, frame):
+def test_source_op_contributes_states_and_counts(camera, frame):
     script = [frame(0), SourceState.STALLED, None, SourceState.RECONNECTING, None, frame(1), SourceState.LIVE, frame(2)]
     app = Stream(Reporting(script, camera))
     app.run()
@@ -177,7 +177,7 @@ def test_states_and_counts_of_a_live_source_are_contributed(camera, frame):
 
 
 @pytest.mark.parametrize("error", [None, ValueError("unplugged")])
-def test_the_display_takes_a_failure_for_a_loss_and_an_ordinary_end_not(camera, frame, error):
+def test_displayed_state_is_ended_only_after_source_failure(camera, frame, error):
     app = Stream(Scripted([frame(0), *([] if error is None else [error])], camera))
     try:
         app.run()
@@ -188,7 +188,7 @@ def test_the_display_takes_a_failure_for_a_loss_and_an_ordinary_end_not(camera, 
 
 
 @pytest.mark.parametrize("state", [SourceState.STALLED, SourceState.RECONNECTING])
-def test_the_display_sees_a_source_that_gives_nothing_for_a_while(camera, frame, state):
+def test_displayed_state_shows_stall_and_reconnection(camera, frame, state):
     app = Stream(Reporting([frame(0), state, None, frame(1)], camera))
     seen = []
     read = app.given.read

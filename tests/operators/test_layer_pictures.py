@@ -23,7 +23,7 @@ def rgb(colour: str) -> list[int]:
     return [int(colour[place : place + 2], 16) for place in (1, 3, 5)]
 
 
-def test_near_is_warm_and_the_legend_names_its_colours():
+def test_depth_colours_near_is_warm_and_legend_matches():
     image, legend = DepthColours().picture(RAMP, OPAQUE, metric=True)
     assert legend.unit == "mm" and 40 <= legend.low < 42 and 78 < legend.high <= 80
     red, _, blue = image[20, 1].astype(int)
@@ -34,13 +34,13 @@ def test_near_is_warm_and_the_legend_names_its_colours():
     assert np.abs(image[20, 30].astype(int) - rgb(middle)).max() <= 25
 
 
-def test_without_a_scale_depths_are_shares_of_the_median():
+def test_depth_colours_of_relative_depth_are_shares_of_median():
     _, legend = DepthColours().picture(RAMP, OPAQUE, metric=False)
     assert legend.unit == "relative" and legend.low == pytest.approx(41 / 60, abs=0.02)
     assert legend.said()["stops"] == list(legend.stops)
 
 
-def test_the_range_follows_slowly_and_another_scene_at_once():
+def test_depth_colours_range_follows_slowly_and_resets_for_new_scene():
     colours = DepthColours()
     colours.picture(RAMP, OPAQUE, metric=True)
     _, slow = colours.picture(RAMP + 10, OPAQUE, metric=True)
@@ -49,19 +49,19 @@ def test_the_range_follows_slowly_and_another_scene_at_once():
     assert other.low > 195
 
 
-def test_nearly_flat_tissue_does_not_fill_the_colours():
+def test_depth_colours_range_has_minimum_width():
     _, legend = DepthColours().picture(50 + RAMP * 1e-3, OPAQUE, metric=True)
     assert legend.high - legend.low == pytest.approx(0.05 * 50, rel=0.01)
 
 
 @pytest.mark.parametrize("nothing", [np.zeros_like(RAMP), np.full_like(RAMP, np.nan)])
-def test_a_picture_of_nothing_is_all_unobserved(nothing):
+def test_depth_colours_without_depth_are_all_unobserved(nothing):
     image, legend = DepthColours().picture(nothing, np.zeros_like(OPAQUE), metric=True)
     assert {tuple(colour) for colour in image.reshape(-1, 3).tolist()} == {UNOBSERVED, UNOBSERVED_LINE}
     assert np.isfinite([legend.low, legend.high]).all()
 
 
-def test_what_was_never_observed_is_marked_and_nothing_else():
+def test_mark_unobserved_changes_only_unobserved_pixels():
     alpha = OPAQUE.copy()
     alpha[:, :15] = 0.05
     alpha[0, 20] = np.nan
@@ -72,14 +72,14 @@ def test_what_was_never_observed_is_marked_and_nothing_else():
     assert not (image[:, :15] == 200).any() and not (image[0, 20] == 200).any()
 
 
-def test_confidence_has_the_colours_of_its_legend():
+def test_confidence_picture_matches_legend_colours():
     image, legend = confidence_picture(np.where(RAMP < 60, 0, 1).astype(np.float32), OPAQUE)
     assert (legend.unit, legend.low, legend.high) == ("confidence", 0, 1)
     assert image[0, 0].tolist() == rgb(legend.stops[0]) and image[0, 59].tolist() == rgb(legend.stops[-1])
 
 
 @pytest.mark.parametrize("size", [(2, 300), (300, 2), (256, 320)])
-def test_a_virtual_picture_has_a_frame_at_any_size(size):
+def test_mark_virtual_draws_border_at_any_size(size):
     image = np.zeros((*size, 3), np.uint8)
     mark_virtual(image, "VIRTUAL VIEW az +10")
     assert tuple(image[0, -1]) == VIRTUAL

@@ -119,14 +119,14 @@ def one_by_one(live, frame, compute_queued):
     return hand
 
 
-def test_a_withheld_frame_is_shown_with_what_was_learned_before(live, one_by_one):
+def test_withheld_frame_shows_earlier_content(live, one_by_one):
     shown = one_by_one((0, {}), (1, {"withheld": "smoke"}))
     assert [(each.trained, each.content.seq) for each in shown] == [(True, 0), (False, 0)]
     assert live.operator.counts.withheld == {"smoke": 1}
 
 
 @pytest.mark.parametrize("reason", ["blur", "cut in doubt"])
-def test_a_frame_that_may_mislead_is_followed_without_depth(live, one_by_one, reason):
+def test_doubtful_frame_is_trained_on_without_depth_or_growth(live, one_by_one, reason):
     shown = one_by_one((0, {}), (1, {}), (2, {"withheld": reason}), (3, {}))
     assert [(each.trained, each.content.seq) for each in shown] == [(True, 0), (True, 1), (True, 2), (True, 3)]
     assert live.fake.doubtful == {0: False, 1: False, 2: True, 3: False}
@@ -134,23 +134,23 @@ def test_a_frame_that_may_mislead_is_followed_without_depth(live, one_by_one, re
     assert live.operator.counts.withheld == {reason: 1}
 
 
-def test_a_damaged_frame_is_not_followed(live, one_by_one):
+def test_damaged_frame_is_not_trained_on(live, one_by_one):
     shown = one_by_one((0, {}), (1, {"withheld": "blur", "status": FrameStatus.DAMAGED}))
     assert [(each.trained, each.content.seq) for each in shown] == [(True, 0), (False, 0)]
 
 
-def test_no_scene_begins_with_a_withheld_frame(live, one_by_one):
+def test_withheld_frame_does_not_start_scene(live, one_by_one):
     assert one_by_one((0, {"withheld": "black"})) == []
     assert live.fake.calls == []
 
 
 @pytest.mark.parametrize("missed", [[], [(1, {"new_scene": "cut", "scene": 1, "withheld": "no tissue"})]])
-def test_a_scene_begins_though_its_first_frame_was_lost_or_withheld(live, one_by_one, missed):
+def test_scene_begins_with_first_usable_frame(live, one_by_one, missed):
     one_by_one((0, {}), *missed, (2, {"scene": 1}), (3, {"scene": 1}))
     assert live.fake.seqs("begin_scene") == [2]
 
 
-def test_a_model_that_fell_behind_is_started_anew_with_the_next_usable_frame(live, one_by_one, frame):
+def test_behind_model_is_renewed_at_next_usable_frame(live, one_by_one, frame):
     one_by_one((0, {}))
     for seq in range(3):
         live.guard.judge(frame(seq), frame(seq).image if seq == 0 else 255 - frame(seq).image)
@@ -161,17 +161,17 @@ def test_a_model_that_fell_behind_is_started_anew_with_the_next_usable_frame(liv
     assert live.operator.counts.renewed == 1 and len(shown) == 3
 
 
-def test_a_scene_that_goes_on_begins_once(live, one_by_one):
+def test_continuing_scene_begins_once(live, one_by_one):
     one_by_one((0, {}), (1, {"new_scene": "cut", "scene": 1}), (2, {"scene": 1}))
     assert live.fake.seqs("begin_scene") == [1]
 
 
-def test_the_scene_grows_in_time_that_is_left_but_not_by_the_frame_that_it_starts_from(live, one_by_one):
+def test_scene_grows_in_spare_time_except_on_first_frame(live, one_by_one):
     one_by_one((0, {}), (1, {}), (2, {}), (3, {"new_scene": "cut", "scene": 1}), (4, {"scene": 1}))
     assert live.fake.seqs("grow") == [1, 2, 4]
 
 
-def test_the_scene_grows_now_and_then_though_no_time_is_ever_left(live, frame, compute_queued):
+def test_scene_grows_periodically_without_spare_time(live, frame, compute_queued):
     for seq in range(3 * GROWN_AT_LATEST):
         live.time.pass_ms(33)
         compute_queued(live.operator, frame=[frame(seq, arrived_ns=live.time.ns - 100_000_000)])
@@ -179,7 +179,7 @@ def test_the_scene_grows_now_and_then_though_no_time_is_ever_left(live, frame, c
     assert not live.fake.seqs("rehearse")
 
 
-def test_the_listener_is_told_every_call_in_order(live, one_by_one):
+def test_recorder_receives_every_training_call_in_order(live, one_by_one):
     one_by_one((0, {}), (1, {"new_scene": "cut", "scene": 1}))
     kinds = [line.event for line in live.lines]
     made = [call[0] for call in live.fake.calls]
@@ -188,7 +188,7 @@ def test_the_listener_is_told_every_call_in_order(live, one_by_one):
     assert steps == sum(live.fake.seqs("rehearse")) == live.operator.counts.rehearsed > 0
 
 
-def test_the_whole_model_is_kept_when_the_run_is_over(live, one_by_one):
+def test_stop_keeps_whole_model(live, one_by_one):
     one_by_one((0, {}), (1, {}))
     assert live.operator.model is None
     live.operator.stop()
@@ -199,12 +199,12 @@ def test_the_whole_model_is_kept_when_the_run_is_over(live, one_by_one):
     assert live.operator.parameter_count == live.operator.model.parameter_count > 0
 
 
-def test_a_run_without_a_frame_has_no_model(live):
+def test_live_run_without_frames_has_no_model(live):
     live.operator.stop()
     assert live.operator.model is None and live.operator.parameter_count == 0
 
 
-def test_whoever_asks_for_the_whole_model_gets_it_after_the_next_frame(live, one_by_one):
+def test_request_model_is_answered_after_next_frame(live, one_by_one):
     request = live.operator.request_model()
     assert request.wait(0) is None
     shown = one_by_one((0, {}), (1, {}))
@@ -213,7 +213,7 @@ def test_whoever_asks_for_the_whole_model_gets_it_after_the_next_frame(live, one
     assert [each.model.version for each in shown] == [1, 2]
 
 
-def test_a_model_that_cannot_be_copied_does_not_end_the_stream(live, one_by_one):
+def test_request_model_failure_does_not_end_stream(live, one_by_one):
     def fails(shown):
         raise MemoryError("there is none")
 
@@ -227,12 +227,12 @@ def test_a_model_that_cannot_be_copied_does_not_end_the_stream(live, one_by_one)
     assert late.wait(0) is None and "ended" in late.refused
 
 
-def test_depth_is_looked_for_in_what_is_trained_on(live, one_by_one):
+def test_depth_is_estimated_only_for_trained_frames(live, one_by_one):
     one_by_one((0, {}), (1, {"withheld": "blur"}), (2, {"status": FrameStatus.DAMAGED}), (3, {}))
     assert live.depth.offered == [0, 3]
 
 
-def test_depth_that_comes_late_is_learned_after_the_next_picture_and_told(live, one_by_one, frame):
+def test_late_depth_is_trained_on_after_next_picture_and_recorded(live, one_by_one, frame):
     one_by_one((0, {}), (1, {}))
     found = arrived(frame, live, 0)
     live.depth.found = found, "ready"
@@ -248,7 +248,7 @@ def test_depth_that_comes_late_is_learned_after_the_next_picture_and_told(live, 
     assert any("the depth of 1 frames was used in training after they were shown" in note for note in outcome.notes)
 
 
-def test_depth_that_the_model_does_not_take_is_counted_and_not_told(live, one_by_one, frame):
+def test_rejected_late_depth_is_counted_and_not_recorded(live, one_by_one, frame):
     live.fake.gone = {0}
     one_by_one((0, {}), (1, {"new_scene": "cut", "scene": 1}))
     live.depth.found = arrived(frame, live, 0), "ready"
@@ -267,14 +267,14 @@ def waits(live):
     return live
 
 
-def test_a_picture_has_the_device_for_itself_until_it_is_shown(waits, frame, compute_queued):
+def test_training_waits_until_picture_is_shown(waits, frame, compute_queued):
     waits.time.pass_ms(33)
     compute_queued(waits.operator, frame=[arrived(frame, waits, 0)])
     kinds = [call[0] for call in waits.fake.calls]
     assert kinds[:2] == ["observe", "wait"] and kinds.count("wait") == 1
 
 
-def test_a_frame_that_waits_is_not_kept_waiting_by_a_picture_or_by_rehearsal(waits, frame, compute_queued):
+def test_queued_frame_is_trained_on_before_wait_and_rehearsal(waits, frame, compute_queued):
     waits.time.pass_ms(33)
     came = [arrived(frame, waits, seq) for seq in range(3)]
     for first in range(3):

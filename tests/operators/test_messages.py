@@ -9,17 +9,17 @@ from gsplat_core.errors import InvalidInput
 from operators.messages import DeformedScene, Reconstruction
 
 
-def test_a_held_out_frame_cannot_have_training_steps(frame, model):
+def test_reconstruction_refuses_training_steps_of_heldout_frame(frame, model):
     with pytest.raises(InvalidInput, match=r"frame 3: a held-out frame had 2 training steps"):
         Reconstruction(frame(3), model(), trained=False, steps=2)
 
 
-def test_steps_are_not_negative(frame, model):
+def test_reconstruction_refuses_negative_steps(frame, model):
     with pytest.raises(InvalidInput, match="steps is -1"):
         Reconstruction(frame(), model(), trained=True, steps=-1)
 
 
-def test_a_scene_is_seen_by_a_camera_of_the_frames_size(frame, model, camera):
+def test_deformed_scene_refuses_camera_of_other_size(frame, model, camera):
     with pytest.raises(InvalidInput, match=r"frame 0 is 24x16 px, its camera 48x32; scale the camera"):
         DeformedScene(frame(), model(), camera.scaled(2), True)
 
@@ -33,6 +33,6 @@ def test_a_scene_is_seen_by_a_camera_of_the_frames_size(frame, model, camera):
         ({"alpha": np.zeros((1, 1), np.float32)}, "alpha is"),
     ],
 )
-def test_a_rendered_frame_fits_its_frame(rendered, fields, message):
+def test_rendered_frame_refuses_wrong_shapes_and_dtypes(rendered, fields, message):
     with pytest.raises(InvalidInput, match=message):
         rendered(**fields)

@@ -27,7 +27,7 @@ def result(operator):
     return outcome.find(QualityResult), outcome.outputs
 
 
-def test_live_and_held_out_frames_are_scored_apart(rendered, compute, tmp_path):
+def test_metrics_score_trained_and_heldout_frames_separately(rendered, compute, tmp_path):
     operator = MetricsOp(None, log=FrameLog(tmp_path / "frames.jsonl"))
     score(operator, compute, [rendered(0, offset=2), rendered(1, offset=20, trained=False), rendered(2, offset=2)])
     exact = 20 * math.log10(255 / 2)
@@ -39,7 +39,7 @@ def test_live_and_held_out_frames_are_scored_apart(rendered, compute, tmp_path):
     assert quality.frames_per_entry == 1 and outputs == {"frames": tmp_path / "frames.jsonl"}
 
 
-def test_only_tissue_counts(rendered, frame, compute):
+def test_metrics_score_only_tissue_pixels(rendered, frame, compute):
     mask = np.ones((16, 24), np.uint8)
     mask[:, 12:] = 0
     shown = rendered(frame=frame(0, mask=mask))
@@ -50,7 +50,7 @@ def test_only_tissue_counts(rendered, frame, compute):
     assert scored.quality.psnr_tissue_db == pytest.approx(20 * math.log10(255 / 2), abs=1e-3)
 
 
-def test_held_out_frames_are_compared_with_the_mean_of_both_neighbours(rendered, frame, compute):
+def test_heldout_baseline_is_mean_of_neighbour_frames(rendered, frame, compute):
     """A withheld frame that cannot be shown is no neighbour, a blurred one is; the last held-out frame has no next one."""
     mask = np.ones((16, 24), np.uint8)
     mask[:, 12:] = 0
@@ -78,7 +78,7 @@ def test_held_out_frames_are_compared_with_the_mean_of_both_neighbours(rendered,
     assert result(operator)[0].heldout_between is None
 
 
-def test_the_baseline_is_the_previous_raw_frame(rendered, compute, tmp_path):
+def test_metrics_baseline_is_previous_raw_frame(rendered, compute, tmp_path):
     first, second = rendered(0), rendered(1)
     operator = MetricsOp(None, log=FrameLog(tmp_path / "frames.jsonl"))
     scored = score(operator, compute, [first, second])
@@ -88,7 +88,7 @@ def test_the_baseline_is_the_previous_raw_frame(rendered, compute, tmp_path):
     assert result(operator)[0].series[0]["previous_frame_db"] is None, "NaN is not JSON"
 
 
-def test_a_damaged_frame_is_shown_and_not_scored(rendered, frame, compute, tmp_path):
+def test_metrics_do_not_score_damaged_frame(rendered, frame, compute, tmp_path):
     damaged = frame(1, status=FrameStatus.DAMAGED)
     operator = MetricsOp(None, log=FrameLog(tmp_path / "frames.jsonl"))
     scored = score(operator, compute, [rendered(0), rendered(frame=damaged, trained=False), rendered(2)])
@@ -101,7 +101,7 @@ def test_a_damaged_frame_is_shown_and_not_scored(rendered, frame, compute, tmp_p
     assert quality.frames_sha256 == whole.frames_sha256, "what was displayed is the same"
 
 
-def test_the_baselines_are_of_the_frames_and_the_pixels_that_are_scored(rendered, frame, compute):
+def test_baselines_use_scored_frames_and_pixels(rendered, frame, compute):
     """A run's own tool masks and withheld frames count for its baseline as for its pictures."""
     mask = np.ones((16, 24), np.uint8)
     mask[:, 12:] = 0
@@ -118,7 +118,7 @@ def test_the_baselines_are_of_the_frames_and_the_pixels_that_are_scored(rendered
     assert quality.heldout_previous_frame_db == pytest.approx(scored[5].previous_frame_db)
 
 
-def test_without_a_frame_there_is_a_result_and_no_file_to_show(tmp_path, compute):
+def test_metrics_without_frames_have_result_and_no_output_file(tmp_path, compute):
     operator = MetricsOp(None, log=FrameLog(tmp_path / "frames.jsonl"))
     quality, outputs = result(operator)
     assert quality.frames == 0 and quality.series == () and outputs == {}
@@ -126,7 +126,7 @@ def test_without_a_frame_there_is_a_result_and_no_file_to_show(tmp_path, compute
     assert result(operator)[1] == {}
 
 
-def test_a_long_run_has_a_series_of_bounded_length(rendered, compute, tmp_path, monkeypatch):
+def test_metrics_series_has_bounded_length(rendered, compute, tmp_path, monkeypatch):
     monkeypatch.setattr("operators.frame_log.MAX_SERIES", 4)
     operator = MetricsOp(None, log=FrameLog(tmp_path / "frames.jsonl"))
     score(operator, compute, [rendered(k, offset=2) for k in range(10)])
@@ -135,7 +135,7 @@ def test_a_long_run_has_a_series_of_bounded_length(rendered, compute, tmp_path, 
     assert [(entry["seq"], entry["frames"]) for entry in quality.series] == [(0, 3), (3, 3), (6, 3), (9, 1)]
 
 
-def test_the_digest_depends_on_every_byte_and_on_the_order(rendered, compute):
+def test_metrics_digest_depends_on_every_byte_and_order(rendered, compute):
     def digest(*frames):
         operator = MetricsOp(None)
         score(operator, compute, frames)
@@ -152,9 +152,7 @@ def _decibels(grey_levels):
     return 20 * math.log10(255 / grey_levels)
 
 
-def test_predictions_are_compared_with_the_previous_frame_over_the_frames_that_have_both(
-    frame, rendered, compute, tmp_path
-):
+def test_next_frame_result_averages_frames_with_prediction_and_baseline(frame, rendered, compute, tmp_path):
     grey = [frame(k, image=np.full((16, 24, 3), 100 + level, np.uint8)) for k, level in enumerate((0, 4, 24, 25))]
     offsets = (9, 2, None, 8)
     operator = MetricsOp(None, log=FrameLog(tmp_path / "frames.jsonl"))
@@ -174,7 +172,7 @@ def test_predictions_are_compared_with_the_previous_frame_over_the_frames_that_h
     assert logged == [pytest.approx(_decibels(9)), pytest.approx(_decibels(2)), None, pytest.approx(_decibels(8))]
 
 
-def test_a_prediction_counts_over_tissue_only(frame, rendered, compute):
+def test_next_frame_score_uses_only_tissue_pixels(frame, rendered, compute):
     mask = np.ones((16, 24), np.uint8)
     mask[:, 12:] = 0
     source = frame(1, mask=mask)
@@ -187,7 +185,7 @@ def test_a_prediction_counts_over_tissue_only(frame, rendered, compute):
     assert scored.next_frame_db == pytest.approx(_decibels(5))
 
 
-def test_without_predictions_there_is_no_figure(rendered, compute):
+def test_next_frame_result_is_none_without_predictions(rendered, compute):
     operator = MetricsOp(None)
     (_, scored) = score(operator, compute, [rendered(0), rendered(1)])
     outcome = OutcomeBuilder()
@@ -196,20 +194,20 @@ def test_without_predictions_there_is_no_figure(rendered, compute):
     assert math.isnan(scored.next_frame_db) and scored.as_json()["next_frame_db"] is None
 
 
-def test_the_baseline_of_a_frame_is_the_one_that_came_before_it_however_that_was_shown(frame, rendered, compute):
+def test_previous_frame_baseline_is_independent_of_shown_pictures(frame, rendered, compute):
     """Kills a baseline from the displayed picture, from an older frame or over another mask."""
     levels = [frame(k, image=np.full((16, 24, 3), 100 + level, np.uint8)) for k, level in enumerate((0, 3, 10))]
     scored = score(MetricsOp(None), compute, [rendered(frame=each, offset=50) for each in levels])
     assert [each.previous_frame_db for each in scored[1:]] == [pytest.approx(_decibels(3)), pytest.approx(_decibels(7))]
 
 
-def test_a_frame_of_another_size_has_no_baseline(frame, rendered, compute):
+def test_frame_of_other_size_has_no_baseline(frame, rendered, compute):
     other = frame(1, image=np.zeros((8, 12, 3), np.uint8))
     scored = score(MetricsOp(None), compute, [rendered(0), rendered(frame=other, offset=2), rendered(frame=other)])
     assert [math.isnan(each.previous_frame_db) for each in scored] == [True, True, False]
 
 
-def test_each_run_begins_anew(rendered, compute):
+def test_metrics_start_resets_scores(rendered, compute):
     operator = MetricsOp(None)
     score(operator, compute, [rendered(0), rendered(1)])
     first = operator.frames_sha256

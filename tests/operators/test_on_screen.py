@@ -42,7 +42,7 @@ def score(operator, compute_queued, frames, pictures):
     return scored, outcome.find(OnScreenResult), outcome.find(QualityResult)
 
 
-def test_a_picture_in_time_is_scored_against_its_own_frame(stream, compute_queued, tmp_path):
+def test_on_screen_picture_in_time_is_scored_against_own_frame(stream, compute_queued, tmp_path):
     frames, pictures = stream(5)
     operator = MetricsOp(None, on_screen=True, log=FrameLog(tmp_path / "frames.jsonl"))
     _, result, quality = score(
@@ -53,7 +53,7 @@ def test_a_picture_in_time_is_scored_against_its_own_frame(stream, compute_queue
     assert [row["psnr_tissue_db"] for row in read_frames(operator.log.path)] == pytest.approx([expected] * 5)
 
 
-def test_a_picture_that_comes_after_the_next_frame_does_not_count_for_its_own(stream, compute_queued, tmp_path):
+def test_on_screen_late_picture_does_not_count_for_own_frame(stream, compute_queued, tmp_path):
     frames, pictures = stream(4)
     late = [shown(pictures[0], 10 * MS), shown(pictures[1], 2 * PERIOD + 1), shown(pictures[2], 2 * PERIOD + 10 * MS)]
     operator = MetricsOp(None, on_screen=True, log=FrameLog(tmp_path / "frames.jsonl"))
@@ -64,13 +64,13 @@ def test_a_picture_that_comes_after_the_next_frame_does_not_count_for_its_own(st
     assert rows[1]["psnr_tissue_db"] < rows[0]["psnr_tissue_db"]
 
 
-def test_frames_before_the_first_picture_are_not_scored(stream, compute_queued):
+def test_on_screen_does_not_score_frames_before_first_picture(stream, compute_queued):
     frames, pictures = stream(4)
     _, result, _ = score(MetricsOp(None, on_screen=True), compute_queued, frames, [shown(pictures[2], 2 * PERIOD + MS)])
     assert result.frames == 2
 
 
-def test_a_picture_that_is_only_sent_again_is_no_new_one(stream, compute_queued):
+def test_on_screen_digest_ignores_resent_picture(stream, compute_queued):
     frames, pictures = stream(3)
     again = [shown(pictures[0], MS), shown(pictures[0], PERIOD + MS, new=False)]
     operator = MetricsOp(None, on_screen=True)
@@ -79,7 +79,7 @@ def test_a_picture_that_is_only_sent_again_is_no_new_one(stream, compute_queued)
     assert quality.frames_sha256 == score(once, compute_queued, frames, again[:1])[2].frames_sha256
 
 
-def test_withheld_frames_are_shown_and_not_scored(stream, compute_queued):
+def test_on_screen_does_not_score_withheld_frames(stream, compute_queued):
     frames, pictures = stream(4)
     frames[1] = frames[1].with_fields(withheld="blur")
     _, result, quality = score(
@@ -91,7 +91,7 @@ def test_withheld_frames_are_shown_and_not_scored(stream, compute_queued):
     assert (result.frames, quality.trained.count) == (4, 3)
 
 
-def test_frames_that_were_passed_over_before_scoring_are_counted(stream, compute_queued):
+def test_on_screen_counts_skipped_frames_as_unscored(stream, compute_queued):
     frames, pictures = stream(6)
     _, result, _ = score(
         MetricsOp(None, on_screen=True), compute_queued, [frames[0], frames[3], frames[5]], [shown(pictures[0], MS)]
@@ -99,7 +99,7 @@ def test_frames_that_were_passed_over_before_scoring_are_counted(stream, compute
     assert result.unscored == 3
 
 
-def test_the_first_second_is_left_out_of_the_settled_figures(frame, rendered, compute_queued):
+def test_on_screen_settled_figures_exclude_first_second(frame, rendered, compute_queued):
     frames = [frame(k, arrived_ns=k * PERIOD) for k in range(40)]
     pictures = [rendered(k, frame=frames[k], offset=60 if k < 20 else 1) for k in range(40)]
     _, result, quality = score(
@@ -115,7 +115,7 @@ def test_the_first_second_is_left_out_of_the_settled_figures(frame, rendered, co
     assert result.previous_frame_db == pytest.approx(np.mean(before[24:]))
 
 
-def test_memory_does_not_grow_when_pictures_come_without_frames(stream, compute_queued):
+def test_on_screen_memory_is_bounded_without_frames(stream, compute_queued):
     _, pictures = stream(1)
     operator = MetricsOp(None, on_screen=True)
     operator.start()
@@ -134,7 +134,7 @@ def in_time(pictures):
 
 
 @pytest.mark.parametrize("worst_at", [25, 30, 39])
-def test_the_worst_frame_is_the_lowest_after_the_first_second(frame, rendered, compute_queued, worst_at):
+def test_on_screen_worst_frame_excludes_first_second(frame, rendered, compute_queued, worst_at):
     """The first second is worse still, and one frame is better than all the others."""
     offsets = {k: 60 for k in range(25)} | {worst_at: 30, 27: 1}
     frames = [frame(k, arrived_ns=k * PERIOD) for k in range(40)]
@@ -144,20 +144,20 @@ def test_the_worst_frame_is_the_lowest_after_the_first_second(frame, rendered, c
     assert result.worst_db == pytest.approx(decibels(30), abs=0.05)
 
 
-def test_the_first_frame_that_counts_is_that_of_a_whole_second(frame, rendered, compute_queued):
+def test_on_screen_settled_figures_include_frame_at_one_second(frame, rendered, compute_queued):
     frames = [frame(k, arrived_ns=k * PERIOD) for k in range(26)]
     pictures = [rendered(k, frame=frames[k], offset=9 if k < 25 else 3) for k in range(26)]
     _, result, _ = score(MetricsOp(None, on_screen=True), compute_queued, frames, in_time(pictures))
     assert result.settled_db == pytest.approx(decibels(3), abs=0.05), "frame 25 was taken at 1.00 s"
 
 
-def test_a_stream_that_ends_within_the_first_second_has_no_settled_figures(stream, compute_queued):
+def test_on_screen_settled_figures_are_none_for_short_stream(stream, compute_queued):
     frames, pictures = stream(6)
     _, result, _ = score(MetricsOp(None, on_screen=True), compute_queued, frames, in_time(pictures))
     assert (result.settled_db, result.worst_db, result.worst_seq, result.previous_frame_db) == (None,) * 4
 
 
-def test_frames_without_figures_are_neither_the_worst_nor_in_the_means(frame, rendered, compute_queued):
+def test_on_screen_unscored_frames_are_not_in_means_or_worst(frame, rendered, compute_queued):
     frames = [frame(k, arrived_ns=k * PERIOD) for k in range(40)]
     frames[30] = frames[30].with_fields(status=FrameStatus.DAMAGED)
     frames[31] = frames[31].with_fields(withheld="black")
@@ -170,7 +170,7 @@ def test_frames_without_figures_are_neither_the_worst_nor_in_the_means(frame, re
     assert result.not_on_screen == 0
 
 
-def test_what_is_on_the_screen_when_the_next_frame_arrives_counts_and_what_comes_after_does_not(stream, compute_queued):
+def test_on_screen_counts_picture_shown_exactly_at_next_frame(stream, compute_queued):
     frames, pictures = stream(3)
     exactly = [shown(pictures[0], MS), shown(pictures[1], 2 * PERIOD), shown(pictures[2], 3 * PERIOD)]
     assert score(MetricsOp(None, on_screen=True), compute_queued, frames, exactly)[1].not_on_screen == 0
@@ -178,21 +178,21 @@ def test_what_is_on_the_screen_when_the_next_frame_arrives_counts_and_what_comes
     assert score(MetricsOp(None, on_screen=True), compute_queued, frames, later)[1].not_on_screen == 1
 
 
-def test_a_picture_of_another_size_scores_nothing(stream, frame, rendered, compute_queued):
+def test_on_screen_does_not_score_picture_of_other_size(stream, frame, rendered, compute_queued):
     frames, pictures = stream(2)
     small = frame(2, image=np.zeros((8, 12, 3), np.uint8), arrived_ns=2 * PERIOD)
     _, result, _ = score(MetricsOp(None, on_screen=True), compute_queued, [*frames, small], in_time(pictures))
     assert result.frames == 2
 
 
-def test_similarity_is_measured_on_every_eighth_frame_from_the_first(stream, compute_queued, tmp_path):
+def test_on_screen_ssim_is_measured_every_eighth_frame(stream, compute_queued, tmp_path):
     frames, pictures = stream(20)
     operator = MetricsOp(None, on_screen=True, log=FrameLog(tmp_path / "frames.jsonl"))
     score(operator, compute_queued, frames, in_time(pictures))
     assert [row["seq"] for row in read_frames(operator.log.path) if row["ssim"] is not None] == [0, 8, 16]
 
 
-def test_the_log_says_what_was_on_the_screen_and_when(stream, rendered, compute_queued, tmp_path):
+def test_on_screen_log_contains_shown_picture_and_times(stream, rendered, compute_queued, tmp_path):
     frames, _ = stream(2)
     picture = rendered(
         0, frame=frames[0], content=frames[0], steps=7, taken_ns=3 * MS, published_ns=9 * MS, model_version=5
@@ -223,9 +223,7 @@ def predicted(frames, offsets):
 
 
 @pytest.mark.parametrize("late", [False, True])
-def test_predictions_are_scored_whenever_they_come_and_compared_over_the_same_frames(
-    frame, rendered, compute_queued, tmp_path, late
-):
+def test_on_screen_scores_early_and_late_predictions_over_same_frames(frame, rendered, compute_queued, tmp_path, late):
     levels = [100 + (k % 2) * 6 for k in range(40)]
     levels[33] = 130
     frames = [
@@ -249,7 +247,7 @@ def test_predictions_are_scored_whenever_they_come_and_compared_over_the_same_fr
     assert known == ({} if late else pytest.approx({10: decibels(90), 26: decibels(3), 33: decibels(5)}))
 
 
-def test_predictions_of_frames_that_never_come_take_no_memory(stream, compute_queued):
+def test_on_screen_limits_predictions_of_missing_frames(stream, compute_queued):
     frames, _ = stream(1)
     operator = MetricsOp(None, on_screen=True)
     operator.start()
@@ -259,7 +257,7 @@ def test_predictions_of_frames_that_never_come_take_no_memory(stream, compute_qu
     operator.stop()
 
 
-def test_frames_that_are_never_predicted_take_no_memory(frame, rendered, compute_queued):
+def test_on_screen_limits_frames_waiting_for_prediction(frame, rendered, compute_queued):
     frames = [frame(k, arrived_ns=k * PERIOD) for k in range(30 + 2 * PREDICTIONS_KEPT)]
     pictures = [rendered(k, frame=frames[k]) for k in range(len(frames))]
     operator = MetricsOp(None, on_screen=True)
@@ -267,7 +265,7 @@ def test_frames_that_are_never_predicted_take_no_memory(frame, rendered, compute
     assert 0 < len(operator._waiting_db) <= PREDICTIONS_KEPT
 
 
-def test_a_run_without_a_report_measures_nothing_that_only_a_report_shows(stream, compute_queued, monkeypatch):
+def test_on_screen_without_report_skips_ssim_and_digest(stream, compute_queued, monkeypatch):
     frames, pictures = stream(10)
     operator = MetricsOp(None, on_screen=True, report=False)
     scored, result, quality = score(operator, compute_queued, frames, in_time(pictures))
@@ -276,7 +274,7 @@ def test_a_run_without_a_report_measures_nothing_that_only_a_report_shows(stream
     assert operator._digest.hexdigest() == MetricsOp(None, on_screen=True)._digest.hexdigest(), "no picture was hashed"
 
 
-def test_the_digest_is_over_every_new_picture_and_all_of_its_bytes(stream, rendered, compute_queued):
+def test_on_screen_digest_depends_on_every_new_picture_byte(stream, rendered, compute_queued):
     frames, pictures = stream(3)
     digest = lambda shown_ones: (
         score(MetricsOp(None, on_screen=True), compute_queued, frames, shown_ones)[2].frames_sha256
@@ -289,7 +287,7 @@ def test_the_digest_is_over_every_new_picture_and_all_of_its_bytes(stream, rende
     assert digest(all_of_them) == digest(in_time(pictures))
 
 
-def test_the_first_second_begins_with_the_stream_and_not_at_zero(frame, rendered, compute_queued):
+def test_on_screen_first_second_starts_at_first_frame(frame, rendered, compute_queued):
     start_ns = 3_600_000_000_000
     frames = [frame(k, pts_ns=start_ns + k * PERIOD, arrived_ns=k * PERIOD) for k in range(30)]
     pictures = [rendered(k, frame=frames[k], offset=9 if k < 25 else 3) for k in range(30)]

@@ -29,7 +29,7 @@ def test_each_numeric_option_has_a_range():
 
 
 @pytest.mark.parametrize("name", RANGES)
-def test_a_numeric_option_is_accepted_in_its_range(name):
+def test_numeric_option_accepts_only_values_in_range(name):
     each = EVERY[name]
     below, least, most, above = (each.plain(value) for value in RANGES[name])
     for value in (least, most):

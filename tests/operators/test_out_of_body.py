@@ -52,7 +52,7 @@ def full(frame, index):
     )
 
 
-def test_nothing_of_a_withheld_picture_goes_on(frame, compute):
+def test_withheld_frame_contains_no_picture_content(frame, compute):
     ((passed,), outcome) = run(FakeGate("too dark"), [full(frame, 4)], compute)
     assert passed.withheld == WITHHELD
     assert (passed.seq, passed.pts_ns, passed.arrived_ns) == (4, 160_000_000, 17)
@@ -66,7 +66,7 @@ def test_nothing_of_a_withheld_picture_goes_on(frame, compute):
     assert outcome.find(OutOfBodyFrames) == OutOfBodyFrames("withhold", 0, {"too dark": 1})
 
 
-def test_the_frame_that_came_is_not_written_to(frame, compute):
+def test_gate_does_not_modify_source_frame(frame, compute):
     source = full(frame, 0)
     before = source.image.copy()
     run(FakeGate("too dark"), [source], compute)
@@ -74,7 +74,7 @@ def test_the_frame_that_came_is_not_written_to(frame, compute):
     assert source.withheld is None
 
 
-def test_a_frame_from_inside_passes_as_it_is_and_all_are_counted(frame, compute):
+def test_gate_passes_inside_frame_unchanged_and_counts_all(frame, compute):
     frames = [full(frame, k) for k in range(4)]
     passed, outcome = run(FakeGate(None, "too dark", "one colour everywhere", "too dark"), frames, compute)
     assert passed[0] is frames[0]
@@ -84,7 +84,7 @@ def test_a_frame_from_inside_passes_as_it_is_and_all_are_counted(frame, compute)
     )
 
 
-def test_what_cannot_be_examined_is_withheld_and_the_stream_goes_on(frame, compute, caplog):
+def test_gate_withholds_frame_that_cannot_be_examined(frame, compute, caplog):
     gate = FakeGate(None, ValueError("broken"), MemoryError(), None)
     with caplog.at_level(logging.WARNING):
         passed, outcome = run(gate, [frame(k) for k in range(4)], compute)
@@ -94,7 +94,7 @@ def test_what_cannot_be_examined_is_withheld_and_the_stream_goes_on(frame, compu
     assert len(caplog.records) == 1 and "frame 1 could not be examined and is withheld" in caplog.text
 
 
-def test_off_lets_everything_pass_and_says_so(frame, compute):
+def test_gate_policy_off_passes_all_frames_with_note(frame, compute):
     frames = [full(frame, k) for k in range(2)]
     passed, outcome = run(FakeGate(), frames, compute, policy="off")
     assert passed[0] is frames[0] and passed[1] is frames[1]
@@ -102,14 +102,14 @@ def test_off_lets_everything_pass_and_says_so(frame, compute):
     assert outcome.notes == ("no picture was examined for showing the outside of the body: the gate was off",)
 
 
-def test_by_default_it_withholds_what_holds_evidence_and_nothing_else(frame, compute):
+def test_default_gate_withholds_only_frames_with_evidence(frame, compute):
     grey, pale = np.full((120, 160, 3), 120, np.uint8), np.full((120, 160, 3), (210, 180, 150), np.uint8)
     passed, outcome = run(None, [frame(0, image=pale), *(frame(k, image=grey) for k in range(1, 4))], compute)
     assert [one.withheld for one in passed] == [None] + [WITHHELD] * 3
     assert outcome.find(OutOfBodyFrames).withheld == {"even light, no red": 3}
 
 
-def test_a_start_forgets_the_stream_before(frame, compute):
+def test_gate_start_resets_stream_state(frame, compute):
     red = np.full((120, 160, 3), (180, 70, 60), np.uint8)
     red[:60] = (200, 140, 110)
     operator = OutOfBodyGateOp(None)
@@ -121,6 +121,6 @@ def test_a_start_forgets_the_stream_before(frame, compute):
         assert compute(operator, frame=frame(2, image=red))[0].withheld == WITHHELD
 
 
-def test_another_policy_is_refused():
+def test_gate_refuses_unknown_policy():
     with pytest.raises(InvalidSetting, match="out-of-body policy is 'maybe'; choose withhold or off"):
         OutOfBodyGateOp(None, policy="maybe")

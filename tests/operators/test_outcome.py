@@ -16,7 +16,7 @@ class Drops:
     count: int
 
 
-def test_parts_outputs_and_notes_come_back():
+def test_outcome_returns_parts_outputs_and_notes():
     outcome = OutcomeBuilder()
     outcome.add(Drops(3))
     outcome.output("video", Path("v.mp4"))
@@ -27,14 +27,14 @@ def test_parts_outputs_and_notes_come_back():
     assert outcome.outputs == {"video": Path("v.mp4")} and outcome.notes == ("one", "two")
 
 
-def test_two_parts_of_one_type_are_refused_even_when_they_are_equal():
+def test_outcome_refuses_two_parts_of_one_type():
     outcome = OutcomeBuilder()
     outcome.add(Drops(3))
     with pytest.raises(InvalidInput, match="two operators of one run contribute a Drops"):
         outcome.add(Drops(3))
 
 
-def test_one_name_is_one_output():
+def test_outcome_refuses_two_outputs_of_one_name():
     outcome = OutcomeBuilder()
     outcome.output("video", Path("a.mp4"))
     outcome.output("video", Path("a.mp4"))
@@ -42,13 +42,13 @@ def test_one_name_is_one_output():
         outcome.output("video", Path("b.mp4"))
 
 
-def test_what_was_handed_out_does_not_change_the_outcome():
+def test_outcome_outputs_returns_copy():
     outcome = OutcomeBuilder()
     outcome.outputs["video"] = Path("v.mp4")
     assert outcome.outputs == {}
 
 
-def test_only_what_can_contribute_is_a_contributor():
+def test_contributor_protocol_requires_contribute():
     class Silent:
         pass
 

@@ -25,19 +25,19 @@ def deliver(folder, made_by="replay", **files):
         output.publish()
 
 
-def holds(folder):
+def contents_of(folder):
     return {path.name: path.read_text() for path in folder.iterdir() if path.name != MARKER}
 
 
-def test_a_new_and_an_empty_folder_become_ours(tmp_path):
+def test_output_folder_accepts_new_and_empty_folder(tmp_path):
     (tmp_path / "empty").mkdir()
     for folder in (tmp_path / "a" / "b", tmp_path / "empty"):
         deliver(folder, report_json="1")
-        assert check_output_folder(folder) and holds(folder) == {"report.json": "1"}
+        assert check_output_folder(folder) and contents_of(folder) == {"report.json": "1"}
 
 
 @pytest.mark.parametrize("existed", [False, True])
-def test_a_run_that_delivers_nothing_leaves_nothing(tmp_path, existed):
+def test_output_folder_of_failed_run_leaves_no_files(tmp_path, existed):
     folder = tmp_path / "a" / "b"
     if existed:
         folder.mkdir(parents=True)
@@ -48,26 +48,26 @@ def test_a_run_that_delivers_nothing_leaves_nothing(tmp_path, existed):
     assert (tmp_path / "a").exists() == existed
 
 
-def test_checking_changes_nothing(tmp_path):
+def test_check_output_folder_creates_nothing(tmp_path):
     assert check_output_folder(tmp_path / "new") is False
     assert not (tmp_path / "new").exists()
 
 
-def test_a_run_replaces_all_of_the_earlier_one_and_nothing_of_the_users(tmp_path):
+def test_output_folder_replaces_earlier_run_and_keeps_user_files(tmp_path):
     deliver(tmp_path / "out", report_json="1", **{"000000_png": "1", "000001_png": "1"})
     (tmp_path / "out" / "notes.txt").write_text("mine")
     deliver(tmp_path / "out", **{"000000_png": "2"})
-    assert holds(tmp_path / "out") == {"000000.png": "2", "notes.txt": "mine"}
+    assert contents_of(tmp_path / "out") == {"000000.png": "2", "notes.txt": "mine"}
 
 
-def test_the_earlier_results_stay_until_the_new_ones_are_complete(tmp_path):
+def test_output_folder_keeps_earlier_results_until_publish(tmp_path):
     deliver(tmp_path / "out", report_json="1")
     with OutputFolder(tmp_path / "out", "replay") as output:
         assert output.earlier
         (output.path / "report.json").write_text("2")
         assert (tmp_path / "out" / "report.json").read_text() == "1"
         output.publish()
-    assert holds(tmp_path / "out") == {"report.json": "2"}
+    assert contents_of(tmp_path / "out") == {"report.json": "2"}
 
 
 class Killed(BaseException):
@@ -93,7 +93,7 @@ def kill_at(monkeypatch, step):
 
 
 @pytest.mark.parametrize("step", range(1, 16))
-def test_a_run_killed_while_it_delivers_leaves_one_run_and_the_next_one_finishes_it(tmp_path, monkeypatch, step):
+def test_output_folder_kill_during_publish_leaves_one_consistent_run(tmp_path, monkeypatch, step):
     deliver(tmp_path / "out", report_json="1", report_html="1", model="1")
     with monkeypatch.context() as patch:
         output = OutputFolder(tmp_path / "out", "replay")
@@ -117,7 +117,7 @@ def test_a_run_killed_while_it_delivers_leaves_one_run_and_the_next_one_finishes
         dict.fromkeys(("report.json", "report.html", "model"), "1"),
         dict.fromkeys(("report.json", "report.html", "extra"), "2"),
     )
-    assert holds(tmp_path / "out") == (old if step <= 2 and killed else new)
+    assert contents_of(tmp_path / "out") == (old if step <= 2 and killed else new)
 
 
 def holds_files(folder):
@@ -125,7 +125,7 @@ def holds_files(folder):
 
 
 @pytest.mark.parametrize("marker", [None, "not json", "[]", '{"format": "something else"}', "[" * 100_000])
-def test_a_folder_of_somebody_else_is_refused_and_untouched(tmp_path, marker):
+def test_output_folder_refuses_foreign_folder_unchanged(tmp_path, marker):
     (tmp_path / "thesis.tex").write_text("years of work")
     if marker is not None:
         (tmp_path / MARKER).write_text(marker)
@@ -136,16 +136,16 @@ def test_a_folder_of_somebody_else_is_refused_and_untouched(tmp_path, marker):
 
 
 @pytest.mark.parametrize("name", ["report.html", "model", "000007.png"])
-def test_a_file_that_no_run_wrote_is_not_replaced(tmp_path, name):
+def test_output_folder_does_not_replace_user_file(tmp_path, name):
     deliver(tmp_path / "out", report_json="1")
     (tmp_path / "out" / name).write_text("mine")
     with pytest.raises(OutputFolderInUse, match=f"holds {name}, which no run of intrasplat wrote"):
         deliver(tmp_path / "out", report_json="2")
-    assert holds(tmp_path / "out") == {"report.json": "1", name: "mine"}
+    assert contents_of(tmp_path / "out") == {"report.json": "1", name: "mine"}
 
 
 @pytest.mark.parametrize("files", [["../diary"], ["/etc/passwd"], [".ssh"], ["", 7, None], "report.json", [".."]])
-def test_a_marker_that_was_tampered_with_reaches_nothing_outside(tmp_path, files):
+def test_tampered_output_folder_marker_deletes_nothing_outside(tmp_path, files):
     deliver(tmp_path / "out")
     (tmp_path / "diary").write_text("mine")
     (tmp_path / "out").mkdir()
@@ -155,7 +155,7 @@ def test_a_marker_that_was_tampered_with_reaches_nothing_outside(tmp_path, files
     assert (tmp_path / "diary").read_text() == "mine" and (tmp_path / "out" / ".ssh").read_text() == "mine"
 
 
-def test_a_file_and_a_link_to_nowhere_are_not_folders(tmp_path):
+def test_output_folder_refuses_file_and_dangling_link(tmp_path):
     (tmp_path / "file").write_text("x")
     (tmp_path / "link").symlink_to(tmp_path / "nowhere")
     with pytest.raises(OutputFolderInUse, match="is a file"):
@@ -165,7 +165,7 @@ def test_a_file_and_a_link_to_nowhere_are_not_folders(tmp_path):
     assert not (tmp_path / "nowhere").exists()
 
 
-def test_planted_links_and_pipes_are_not_followed(tmp_path):
+def test_output_folder_does_not_follow_planted_links_or_pipes(tmp_path):
     (tmp_path / "diary").write_text("mine")
     deliver(tmp_path / "out", report_json="1")
     (tmp_path / "out" / LOCK).symlink_to(tmp_path / "diary")
@@ -187,17 +187,17 @@ def test_planted_links_and_pipes_are_not_followed(tmp_path):
         deliver(tmp_path / "out", report_json="3")
 
 
-def test_two_runs_do_not_share_a_folder(tmp_path):
+def test_output_folder_refuses_second_concurrent_run(tmp_path):
     with OutputFolder(tmp_path / "out", "replay") as output:
         (output.path / "report.json").write_text("first")
         with pytest.raises(OutputFolderInUse, match=rf"another run writes into .*process {os.getpid()}"):
             deliver(tmp_path / "out", report_json="second")
         output.publish()
-    assert holds(tmp_path / "out") == {"report.json": "first"}
+    assert contents_of(tmp_path / "out") == {"report.json": "first"}
 
 
 @pytest.mark.slow
-def test_a_lock_ends_with_its_process_however_that_ends(tmp_path):
+def test_output_folder_lock_ends_with_killed_process(tmp_path):
     code = (
         "import os, sys; from pathlib import Path; from operators.output_folder import OutputFolder\n"
         "output = OutputFolder(Path(sys.argv[1]), 'replay').__enter__()\n"
@@ -206,16 +206,16 @@ def test_a_lock_ends_with_its_process_however_that_ends(tmp_path):
     subprocess.run([sys.executable, "-c", code, str(tmp_path / "out")], check=False)
     assert (tmp_path / "out" / LOCK).exists()
     deliver(tmp_path / "out", report_json="2")
-    assert holds(tmp_path / "out") == {"report.json": "2"}
+    assert contents_of(tmp_path / "out") == {"report.json": "2"}
 
 
-def test_a_folder_that_is_deleted_meanwhile_is_said_in_a_sentence(tmp_path):
+def test_output_folder_deleted_before_publish_raises_output_error(tmp_path):
     with pytest.raises(OutputError, match="out is not there"), OutputFolder(tmp_path / "out", "replay") as output:
         shutil.rmtree(tmp_path / "out")
         output.publish()
 
 
-def test_a_file_system_without_locks_is_refused(tmp_path, monkeypatch):
+def test_output_folder_refuses_file_system_without_locks(tmp_path, monkeypatch):
     def refuse(*_):
         raise OSError(errno.ENOLCK, "No locks available")
 

@@ -21,7 +21,7 @@ def take(tmp_path) -> Path:
 
 
 @pytest.mark.parametrize("name", ["", ".", "./", "..", "/", "~", "//"])
-def test_the_places_where_a_user_lives_are_refused(tmp_path, monkeypatch, name):
+def test_check_folder_path_refuses_root_home_and_current_folder(tmp_path, monkeypatch, name):
     (tmp_path / "home" / "work").mkdir(parents=True)
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     monkeypatch.chdir(tmp_path / "home" / "work")
@@ -29,7 +29,7 @@ def test_the_places_where_a_user_lives_are_refused(tmp_path, monkeypatch, name):
         check_folder_path(Path(os.path.expanduser(name)))
 
 
-def test_links_to_such_places_are_refused_too(tmp_path, monkeypatch):
+def test_check_folder_path_refuses_links_to_protected_folders(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "link").symlink_to("/")
     (tmp_path / "here").symlink_to(tmp_path)
@@ -40,14 +40,14 @@ def test_links_to_such_places_are_refused_too(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("inside", ["masks", "depth", "images", "images_right", "depth/new", "results", "."])
 @pytest.mark.parametrize("link", [False, True])
-def test_a_run_does_not_write_into_its_own_recording(take, tmp_path, inside, link):
+def test_output_into_own_recording_is_refused(take, tmp_path, inside, link):
     (tmp_path / "link").symlink_to(take)
     with pytest.raises(OutputError, match=r"which the run reads|lies inside --out|belongs to the recording"):
         check_folder_path((tmp_path / "link" if link else take) / inside, [take])
 
 
 @pytest.mark.parametrize("inside", ["depth", "masks", "images_right", "Depth", "depth/a/b"])
-def test_nor_among_the_files_of_another_recording(take, inside):
+def test_output_into_other_recording_is_refused(take, inside):
     with pytest.raises(OutputError, match="belongs to the recording"):
         check_folder_path(take / inside)
     with pytest.raises(OutputError, match=r"belongs to the recording|is a recording's folder"):
@@ -55,14 +55,14 @@ def test_nor_among_the_files_of_another_recording(take, inside):
 
 
 @pytest.mark.parametrize("beside", ["video.mp4", "0001.png", "cameras.json", "recording.json", "poses_bounds.npy"])
-def test_every_layout_is_recognised(tmp_path, beside):
+def test_check_folder_path_recognises_every_recording_layout(tmp_path, beside):
     (tmp_path / beside).touch()
     for name in ("depth", "masks", "images_right"):
         with pytest.raises(OutputError, match="belongs to the recording"):
             check_folder_path(tmp_path / name)
 
 
-def test_a_recording_inside_the_output_folder_is_refused(tmp_path):
+def test_recording_inside_output_folder_is_refused(tmp_path):
     (tmp_path / "out" / "take").mkdir(parents=True)
     (tmp_path / "link").symlink_to(tmp_path / "out" / "take")
     for source in (tmp_path / "out" / "take", tmp_path / "link"):
@@ -70,7 +70,7 @@ def test_a_recording_inside_the_output_folder_is_refused(tmp_path):
             check_folder_path(tmp_path / "out", [source])
 
 
-def test_a_film_is_not_written_over_its_model_or_into_a_recording(take, tmp_path):
+def test_video_over_own_model_or_into_recording_is_refused(take, tmp_path):
     (tmp_path / "model").mkdir()
     (tmp_path / "model.mp4").touch()
     os.link(tmp_path / "model.mp4", tmp_path / "same.mp4")
@@ -82,7 +82,7 @@ def test_a_film_is_not_written_over_its_model_or_into_a_recording(take, tmp_path
         check_file_path(take / "film.mp4")
 
 
-def test_folders_of_our_own_results_are_no_recordings(tmp_path, monkeypatch):
+def test_output_path_checks_accept_folders_of_own_results(tmp_path, monkeypatch):
     """A run's folder holds a video, and a rendering may be called images: neither makes the place a recording."""
     monkeypatch.chdir("/")
     for name in ("run", "images"):
@@ -107,7 +107,7 @@ def refused(said, out, *inputs, **options):
         check_file_path(out, inputs, **options)
 
 
-def test_a_file_replaces_only_what_this_program_wrote_and_only_when_asked(tmp_path):
+def test_check_file_path_overwrites_only_own_files_if_requested(tmp_path):
     out = tmp_path / "a.json"
     check_file_path(out)
     out.write_text(REPORT)
@@ -126,12 +126,12 @@ def test_a_file_replaces_only_what_this_program_wrote_and_only_when_asked(tmp_pa
     refused("is not a plain file", tmp_path / "pipe.json", overwrite=True)
 
 
-def test_a_file_is_no_folder_and_lies_in_one(tmp_path):
+def test_check_file_path_refuses_folder_and_missing_parent(tmp_path):
     refused("is a folder", tmp_path)
     refused("there is no folder .*none to write a.json into", tmp_path / "none" / "a.json")
 
 
-def test_an_input_is_never_written_over(tmp_path):
+def test_check_file_path_refuses_input_file(tmp_path):
     source = tmp_path / "model.json"
     source.write_text(REPORT)
     refused("is what the command reads", source, source, overwrite=True)
@@ -151,14 +151,14 @@ def test_an_input_is_never_written_over(tmp_path):
 @pytest.mark.parametrize(
     "description", ["recording.json", "cameras.json", "poses_bounds.npy", "valid_mask.png", "session.json"]
 )
-def test_nothing_is_put_beside_a_recordings_description(tmp_path, description):
+def test_check_file_path_refuses_recording_folder_by_description_file(tmp_path, description):
     (tmp_path / description).write_text("")
     refused(f"is a recording's folder .it holds {description}", tmp_path / "a.ply")
     check_file_path(tmp_path / "a.ply", into_recording=True)
 
 
 @pytest.mark.parametrize("sidecar", ["images", "masks", "depth", "images_right", "flow"])
-def test_a_folder_of_pictures_belongs_to_a_recording(tmp_path, sidecar):
+def test_check_file_path_refuses_recording_folder_by_picture_subfolder(tmp_path, sidecar):
     (tmp_path / sidecar).mkdir()
     check_file_path(tmp_path / "a.ply")
     (tmp_path / sidecar / "notes.txt").write_text("")
@@ -169,7 +169,7 @@ def test_a_folder_of_pictures_belongs_to_a_recording(tmp_path, sidecar):
     check_file_path(tmp_path / "a.ply")
 
 
-def test_a_folder_among_a_recordings_pictures_is_refused(tmp_path):
+def test_check_folder_path_refuses_subfolder_of_recording(tmp_path):
     for name in ("views", "masks"):
         (tmp_path / name).mkdir()
         check_folder_path(tmp_path / name / "run")
@@ -189,7 +189,7 @@ def path_of(count):
     return Path(("/" + "x" * 99) * 40 + "/" + "y" * (count - 4001))
 
 
-def test_a_path_has_at_most_4095_bytes(tmp_path):
+def test_output_path_is_limited_to_4095_bytes(tmp_path):
     refused("there is no folder", path_of(4095))
     refused("is no name that a file can have", path_of(4096))
     check_folder_path(path_of(4095))
@@ -199,7 +199,7 @@ def test_a_path_has_at_most_4095_bytes(tmp_path):
     refused("cannot be used: File name too long", tmp_path / ("y" * 300))
 
 
-def test_results_do_not_go_into_the_home_folder_the_root_or_around_an_input(tmp_path, monkeypatch):
+def test_check_folder_path_refuses_home_root_and_parent_of_input(tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     (tmp_path / "home").mkdir()
     for place, said in (

@@ -33,7 +33,7 @@ def field(*vector: float) -> np.ndarray:
         ((0, 0, 0), (0, 0, 0)),
     ],
 )
-def test_normals_have_the_usual_colours(normal, colour):
+def test_normal_colours_map_directions_to_rgb(normal, colour):
     assert normal_colours(field(*normal))[1, 1].tolist() == list(colour)
 
 
@@ -41,21 +41,21 @@ def test_normals_have_the_usual_colours(normal, colour):
     ("flow", "colour"),
     [((0, 0), (255, 255, 255)), ((2, 0), (255, 0, 0)), ((-2, 0), (0, 255, 255)), ((1, 0), (255, 128, 128))],
 )
-def test_flow_has_the_hue_of_its_direction(flow, colour):
+def test_flow_colours_hue_follows_direction(flow, colour):
     assert flow_colours(field(*flow), 2.0)[0, 0].tolist() == list(colour)
 
 
-def test_a_still_scene_stays_pale():
+def test_flow_colours_of_small_flow_are_pale():
     assert flow_colours(field(0.02, 0), 0.02).min() > 230
 
 
-def test_a_class_has_one_colour():
+def test_class_colours_use_palette_of_largest_score():
     assert class_colours(field(0.0, 3.0, 1.0))[0, 0].tolist() == CLASS_COLOURS[1].tolist()
     with pytest.raises(InvalidSetting, match="train with --losses semantics"):
         class_colours(np.zeros((2, 3, 0), np.float32))
 
 
-def test_a_pixel_without_a_class_or_a_depth_is_not_drawn_as_one():
+def test_pixels_without_class_or_depth_have_marker_colour():
     assert class_colours(np.zeros((2, 3, 4), np.float32))[0, 0].tolist() == list(UNDECIDED)
     depth = np.full((30, 40), 50, np.float32)
     depth[:, 20:] = 0
@@ -64,7 +64,7 @@ def test_a_pixel_without_a_class_or_a_depth_is_not_drawn_as_one():
 
 
 @pytest.mark.parametrize("name", ["depth", *OUTPUTS])
-def test_unobserved_pixels_look_unobserved_in_every_output(name):
+def test_every_output_picture_marks_unobserved_pixels(name):
     channels = {"semantics": 4}.get(name) or OUTPUTS[name].channels if name != "depth" else 1
     values = np.full((30, 40) if channels == 1 else (30, 40, channels), 0.5, np.float32)
     alpha = np.ones((30, 40), np.float32)
@@ -75,13 +75,13 @@ def test_unobserved_pixels_look_unobserved_in_every_output(name):
     assert not (image[:, :20] == UNOBSERVED).all(-1).any()
 
 
-def test_near_surfaces_are_warm():
+def test_ray_depth_picture_shows_near_surfaces_warm():
     depth = np.broadcast_to(np.linspace(50, 80, 32, dtype=np.float32), (8, 32)).copy()
     image = OutputPictures().picture("ray_depth", depth, np.ones_like(depth)).astype(int)
     assert image[0, 1, 0] > image[0, 1, 2] and image[0, -2, 2] > image[0, -2, 0]
 
 
-def test_spread_keeps_its_range_over_the_pictures():
+def test_spread_picture_keeps_range_across_pictures():
     pictures = OutputPictures()
     first = pictures.picture("spread", SEEN, SEEN)
     second = pictures.picture("spread", 0.5 * SEEN, SEEN)

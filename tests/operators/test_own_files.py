@@ -50,7 +50,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_a_mark_is_recognised_where_it_belongs(tmp_path, name):
+def test_is_own_file_by_mark_in_each_format(tmp_path, name):
     own, others = CASES[name]
     path = tmp_path / name
     assert not is_own_file(path)
@@ -63,7 +63,7 @@ def test_a_mark_is_recognised_where_it_belongs(tmp_path, name):
     ("names", "ours"),
     [([TIMES_FILE, "0000.ply"], True), ([TIMES_FILE, "0000.ply", "0001.ply"], True), ([TIMES_FILE], False), (["0000.ply", TIMES_FILE], False)],
 )  # fmt: skip
-def test_a_sequence_begins_with_its_times(tmp_path, names, ours):
+def test_is_own_file_for_ply_sequence_requires_times_first(tmp_path, names, ours):
     with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
         for name in names:
             archive.writestr(name, "")
@@ -71,7 +71,7 @@ def test_a_sequence_begins_with_its_times(tmp_path, names, ours):
 
 
 @pytest.mark.parametrize(("first", "ours"), [("manifest.json", True), ("other.json", False)])
-def test_a_packed_model_begins_with_its_manifest(tmp_path, first, ours):
+def test_is_own_file_for_packed_model_requires_manifest_first(tmp_path, first, ours):
     (tmp_path / "file").write_text("{}")
     with tarfile.open(tmp_path / "a.isplat", "w", format=tarfile.USTAR_FORMAT) as archive:
         archive.add(tmp_path / "file", first)
@@ -80,7 +80,7 @@ def test_a_packed_model_begins_with_its_manifest(tmp_path, first, ours):
     assert not is_own_file(tmp_path / "b.isplat")
 
 
-def test_a_video_is_recognised_by_its_comment(tmp_path):
+def test_is_own_file_for_video_by_comment(tmp_path):
     import av
 
     with VideoFile(tmp_path / "own.mp4", 16, 16, 25.0) as video:
@@ -97,6 +97,6 @@ def test_a_video_is_recognised_by_its_comment(tmp_path):
     assert not is_own_file(tmp_path / "none.mp4")
 
 
-def test_a_link_or_a_folder_is_no_file_of_ours(tmp_path):
+def test_is_own_file_is_false_for_folder(tmp_path):
     (tmp_path / "folder.json").mkdir()
     assert not is_own_file(tmp_path / "folder.json")

@@ -26,16 +26,16 @@ CLOCK = FrameClock(ClockSettings(), 30.0)
         (Pace(clock=CLOCK), "cuda", MultiThreadScheduler),
     ],
 )
-def test_a_live_stream_has_one_thread_per_operator_on_every_device(pace, device, scheduler):
+def test_scheduler_by_pace_and_device(pace, device, scheduler):
     assert type(pace.scheduler(device, Application())) is scheduler
 
 
-def test_only_the_queues_of_a_live_stream_drop_frames():
+def test_queues_drop_frames_only_with_clock():
     assert Pace().queue(3) == {}
     assert Pace(clock=CLOCK).queue(3) == {"policy": "drop_oldest", "capacity": 3}
 
 
-def test_the_clock_decides_on_training_before_a_session_and_a_session_before_the_frames():
+def test_training_policy_prefers_clock_then_session():
     session = SimpleNamespace(schedule=list, late_depths=lambda: iter(()))
     depth = SimpleNamespace(background=None)
     paces = Pace(clock=CLOCK, session=session), Pace(session=session), Pace()
@@ -48,7 +48,7 @@ def device_of_tools(analysis):
 
 
 @pytest.mark.parametrize("device", ["cpu", "cuda"])
-def test_the_tool_network_runs_on_the_device_of_the_run(recording, tmp_path, device):
+def test_tool_network_runs_on_device_of_run(recording, tmp_path, device):
     settings = ReplaySettings(tmp_path, tmp_path, device=device)
     graph = Pipeline(
         RecordingSource(recording), settings, tmp_path, name="replay", pace=Pace(), make_reconstructor=lambda: None

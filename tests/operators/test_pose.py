@@ -36,7 +36,7 @@ def outcome_of(operator: PoseOp) -> OutcomeBuilder:
     return outcome
 
 
-def test_each_frame_gets_a_pose_and_nothing_else(frames, compute):
+def test_pose_op_adds_pose_and_changes_nothing_else(frames, compute):
     operator = started()
     for frame in frames:
         (given,) = compute(operator, frame=frame)
@@ -48,7 +48,7 @@ def test_each_frame_gets_a_pose_and_nothing_else(frames, compute):
     assert found.explained > 0.95
 
 
-def test_a_pose_that_a_frame_came_with_plays_no_part(frames, compute):
+def test_pose_op_ignores_recorded_pose(frames, compute):
     wrong = np.eye(4)
     wrong[:3, 3] = 7
     plain, misled = started(), started()
@@ -60,14 +60,14 @@ def test_a_pose_that_a_frame_came_with_plays_no_part(frames, compute):
         assert np.array_equal(first.pose, second.pose)
 
 
-def test_every_start_begins_anew(frames, compute):
+def test_pose_op_start_resets_odometry(frames, compute):
     operator = started()
     first = [compute(operator, frame=frame)[0].pose for frame in frames[:4]]
     operator.start()
     assert np.array_equal(first, [compute(operator, frame=frame)[0].pose for frame in frames[:4]])
 
 
-def test_the_report_says_that_poses_are_relative(frames, compute):
+def test_pose_op_notes_that_poses_are_relative(frames, compute):
     operator = started()
     for frame in frames:
         compute(operator, frame=frame)
@@ -76,7 +76,7 @@ def test_the_report_says_that_poses_are_relative(frames, compute):
 
 
 @pytest.mark.parametrize("measured", [True, False])
-def test_depth_of_the_frames_gives_lengths_their_unit_where_it_may_be_used(frames, compute, measured):
+def test_pose_op_takes_unit_from_measured_depth(frames, compute, measured):
     plane = np.full((HEIGHT, WIDTH), 75, np.float32)
     operator = started(measured=measured)
     compute(operator, frame=frames[0].with_fields(depth=plane, depth_origin=DEPTH_ORIGINS["measured"]))
@@ -85,7 +85,7 @@ def test_depth_of_the_frames_gives_lengths_their_unit_where_it_may_be_used(frame
     assert ("the unit of the depth" in outcome.notes[0]) == measured
 
 
-def test_what_could_not_be_placed_and_what_is_explained_badly_is_said(frames, compute, monkeypatch):
+def test_pose_op_notes_unplaced_and_poorly_explained_frames(frames, compute, monkeypatch):
     monkeypatch.setattr(LiveOdometry, "explained", 0.5)
     operator = started()
     grey = np.full_like(frames[0].image, 90)
@@ -96,18 +96,18 @@ def test_what_could_not_be_placed_and_what_is_explained_badly_is_said(frames, co
     assert any("the scope may be at rest" in note for note in notes)
 
 
-def test_a_run_without_a_frame_has_nothing_to_say():
+def test_pose_op_without_frames_adds_no_note():
     outcome = outcome_of(started())
     assert outcome.notes == () and outcome.find(EstimatedPoses).frames == 0
 
 
-def test_given_poses_need_no_operator():
+def test_pose_operators_by_setting():
     assert list(pose_operators(None, "given", FIRST, "auto")) == []
     (operator,) = pose_operators(None, "estimated", FIRST, "none")
     assert not operator.measured
 
 
-def test_what_cannot_be_estimated_is_refused_before_the_run():
+def test_check_poses_refuses_fisheye_and_unknown_setting():
     fisheye = Camera(np.array([[100.0, 0, 40], [0, 100, 32], [0, 0, 1]]), 80, 64, model="fisheye")
     check_poses("given", fisheye)
     with pytest.raises(InvalidSetting, match="this one is fisheye"):
@@ -127,7 +127,7 @@ def test_what_cannot_be_estimated_is_refused_before_the_run():
         ({"frames": 0, "begun": 9}, []),
     ],
 )
-def test_what_a_reader_must_know_of_estimated_poses_is_said(fields, said):
+def test_pose_op_notes_by_odometry_result(fields, said):
     values = {"frames": 9, "not_placed": 0, "begun": 1, "returned": 3, "explained": 1.0, "is_measured": False}
     operator = PoseOp(None, camera=Camera.from_focal(300.0, WIDTH, HEIGHT))
     operator._odometry = SimpleNamespace(**(values | fields))

@@ -17,7 +17,7 @@ from operators.messages import DeformedScene
 from operators.rasterize import RasterizeOp, displayed
 
 
-def test_a_scene_made_from_a_frame_looks_like_it(frame, model, camera, compute):
+def test_rasterize_scene_initialised_from_frame_matches_frame(frame, model, camera, compute):
     scene = DeformedScene(frame(), model(4), camera, True)
     (shown,) = compute(RasterizeOp(None), scene=scene)
     assert shown.image.dtype == np.uint8 and shown.image.shape == frame().image.shape
@@ -30,7 +30,7 @@ def test_a_scene_made_from_a_frame_looks_like_it(frame, model, camera, compute):
     assert error < 14
 
 
-def test_further_outputs_are_those_of_the_renderer(frame, model, camera, compute):
+def test_rasterize_further_outputs_do_not_change_image_or_depth(frame, model, camera, compute):
     scene = DeformedScene(frame(), model(4), camera, True)
     (shown,) = compute(RasterizeOp(None, outputs=("depth", "normals", "ray_depth")), scene=scene)
     (plain,) = compute(RasterizeOp(None), scene=scene)
@@ -40,7 +40,7 @@ def test_further_outputs_are_those_of_the_renderer(frame, model, camera, compute
     np.testing.assert_array_equal(shown.depth, plain.depth)
 
 
-def test_pictures_are_black_where_nothing_is_trained(frame, model, camera, compute):
+def test_rasterize_is_black_outside_loss_mask(frame, model, camera, compute):
     kept = np.ones(frame().image.shape[:2], np.uint8)
     kept[:, :6] = 0
     plain, limited, unseen = (
@@ -57,7 +57,7 @@ def test_displayed_clips_and_rounds_to_nearest():
     np.testing.assert_array_equal(displayed(image), [[[0, 0, 1], [255, 255, 0]]])
 
 
-def test_a_snapshot_is_shown_as_its_model_is(frame, model, camera, compute):
+def test_rasterize_snapshot_matches_model(frame, model, camera, compute):
     published = model(4)
     snapshot = SnapshotSlots("cpu").publish(
         published.gaussians, None, version=4, camera=camera, time_window_s=(0.0, 1.0)
@@ -70,7 +70,7 @@ def test_a_snapshot_is_shown_as_its_model_is(frame, model, camera, compute):
     assert torch.equal(scenes[1].gaussians.means, scenes[0].gaussians.means)
 
 
-def test_a_renderer_that_reads_no_snapshots_is_given_models(frame, model, camera, compute):
+def test_rasterize_passes_model_to_renderer_without_snapshot_support(frame, model, camera, compute):
     prepared = []
 
     class Grey:
@@ -103,7 +103,7 @@ def _run(operator, compute, scenes):
     return [compute(operator, scene=scene) for scene in scenes]
 
 
-def test_a_frame_is_predicted_by_the_model_that_has_not_seen_it_at_the_frames_own_time(frame, camera, model, compute):
+def test_prediction_uses_previous_model_at_frame_time(frame, camera, model, compute):
     asked = []
 
     class Moving(Model):
@@ -129,7 +129,7 @@ def test_a_frame_is_predicted_by_the_model_that_has_not_seen_it_at_the_frames_ow
     assert (third.image != outputs[2][0].image).any()
 
 
-def test_a_prediction_is_taken_from_the_pose_of_its_frame(frame, model, camera, compute):
+def test_prediction_uses_pose_of_frame(frame, model, camera, compute):
     pose = np.eye(4)
     pose[0, 3] = 8.0
     shown = [model(1), model(2)]
@@ -143,7 +143,7 @@ def test_a_prediction_is_taken_from_the_pose_of_its_frame(frame, model, camera, 
 @pytest.mark.parametrize(
     "unlike", [{"status": FrameStatus.DAMAGED}, {"withheld": "blur"}, {"scene": 1}, {"new_scene": "cut"}]
 )
-def test_a_frame_that_cannot_be_scored_or_begins_a_scene_is_not_predicted(frame, model, camera, compute, unlike):
+def test_no_prediction_for_unscored_frame_or_new_scene(frame, model, camera, compute, unlike):
     scenes = [
         DeformedScene(frame(0), model(1), camera, True),
         DeformedScene(frame(1, **unlike), model(2), camera, True),
@@ -152,7 +152,7 @@ def test_a_frame_that_cannot_be_scored_or_begins_a_scene_is_not_predicted(frame,
     assert predicted.image is None
 
 
-def test_a_frame_of_another_size_is_not_predicted(frame, model, camera, compute):
+def test_no_prediction_for_frame_of_other_size(frame, model, camera, compute):
     small, half = frame(0), camera.scaled(0.5)
     other = frame(1, image=np.ascontiguousarray(frame(1).image[::2, ::2]))
     scenes = [DeformedScene(small, model(1), camera, True), DeformedScene(other, model(2), half, True)]
@@ -160,7 +160,7 @@ def test_a_frame_of_another_size_is_not_predicted(frame, model, camera, compute)
     assert predicted.image is None
 
 
-def test_every_third_frame_is_predicted_and_the_model_is_kept_no_longer_than_the_run(frame, model, camera, compute):
+def test_predict_every_third_frame_and_release_model_on_stop(frame, model, camera, compute):
     operator = RasterizeOp(None, predict_every=3)
     scenes = [DeformedScene(frame(k), model(k + 1), camera, True) for k in range(7)]
     predicted = [each[1].image is not None for each in _run(operator, compute, scenes)]
@@ -172,6 +172,6 @@ def test_every_third_frame_is_predicted_and_the_model_is_kept_no_longer_than_the
     assert held() is None
 
 
-def test_without_being_asked_nothing_is_predicted(frame, model, camera, compute):
+def test_no_prediction_by_default(frame, model, camera, compute):
     scenes = [DeformedScene(frame(k), model(k + 1), camera, True) for k in range(2)]
     assert [len(each) for each in _run(RasterizeOp(None), compute, scenes)] == [1, 1]

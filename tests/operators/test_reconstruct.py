@@ -51,7 +51,7 @@ class FakeReconstructor:
         return model
 
 
-def test_each_frame_is_trained_on_before_its_snapshot(frame, model, compute):
+def test_reconstruct_trains_on_frame_before_snapshot(frame, model, compute):
     fake = FakeReconstructor(model)
     operator = ReconstructOp(None, make_reconstructor=lambda: fake, training=EveryFrame())
     operator.start()
@@ -64,7 +64,7 @@ def test_each_frame_is_trained_on_before_its_snapshot(frame, model, compute):
     assert operator.newest is messages[-1].model
 
 
-def test_held_out_frames_are_passed_on_and_never_trained_on(frame, model, compute):
+def test_reconstruct_passes_heldout_frames_without_training(frame, model, compute):
     fake = FakeReconstructor(model)
     operator = ReconstructOp(None, make_reconstructor=lambda: fake, training=EveryFrame(lambda f: f.seq == 1))
     operator.start()
@@ -78,7 +78,7 @@ def test_held_out_frames_are_passed_on_and_never_trained_on(frame, model, comput
     assert (messages[1].steps, messages[1].loss) == (0, None)
 
 
-def test_withheld_frames_are_shown_and_a_cut_begins_a_scene_without_a_clock(frame, model, compute):
+def test_reconstruct_without_clock_shows_withheld_frames_and_starts_scene(frame, model, compute):
     fake = FakeReconstructor(model)
     operator = ReconstructOp(None, make_reconstructor=lambda: fake, training=EveryFrame())
     operator.start()
@@ -107,7 +107,7 @@ def test_withheld_frames_are_shown_and_a_cut_begins_a_scene_without_a_clock(fram
     )
 
 
-def test_the_first_frame_is_trained_on_even_when_it_is_held_out(frame, model, compute):
+def test_reconstruct_trains_on_first_frame_even_if_held_out(frame, model, compute):
     operator = ReconstructOp(
         None, make_reconstructor=lambda: FakeReconstructor(model), training=EveryFrame(lambda f: True)
     )
@@ -115,7 +115,7 @@ def test_the_first_frame_is_trained_on_even_when_it_is_held_out(frame, model, co
     assert [compute(operator, frame=frame(k))[0].trained for k in range(2)] == [True, False]
 
 
-def test_the_heavy_work_begins_at_start_and_the_last_model_survives_stop(frame, model, compute):
+def test_reconstruct_creates_reconstructor_at_start_and_keeps_model(frame, model, compute):
     made = []
 
     def make():
@@ -130,7 +130,7 @@ def test_the_heavy_work_begins_at_start_and_the_last_model_survives_stop(frame, 
     assert len(made) == 1 and operator.model.version == 1
 
 
-def test_a_snapshot_becomes_a_model_when_it_is_asked_for(frame, model, camera, compute):
+def test_reconstruct_model_copies_snapshot_and_releases_slots(frame, model, camera, compute):
     slots = SnapshotSlots("cpu")
 
     def publish(version):

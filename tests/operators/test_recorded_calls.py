@@ -78,7 +78,7 @@ def repeated(
     return learner.calls, results, training.missing
 
 
-def test_calls_are_repeated_in_the_order_of_the_schedule() -> None:
+def test_recorded_calls_follow_schedule_order() -> None:
     lines = [
         MADE, SceneBegun(seq=1), observed(1), Grown(seq=1), Rehearsed(steps=7), taken(1), observed(2, steps=4),
         SceneBegun(seq=3, anew=True), MADE, observed(3),
@@ -92,32 +92,32 @@ def test_calls_are_repeated_in_the_order_of_the_schedule() -> None:
     assert results == ["result 1", "result 2", "result 3"] and missing is None
 
 
-def test_frames_that_were_not_observed_are_passed_over_and_calls_wait_for_their_frame() -> None:
+def test_recorded_calls_skip_unobserved_frames() -> None:
     calls, results, missing = repeated([MADE, SceneBegun(seq=5), observed(5)], [3, 4, 5, 6])
     assert results == [None, None, "result 5", None] and missing is None
     assert calls == [("scene", 5, False), ("observe", 5, 3, True)]
 
 
-def test_the_first_frame_that_the_recording_lacks_is_named() -> None:
+def test_recorded_calls_report_first_missing_frame() -> None:
     calls, results, missing = repeated([MADE, observed(1), observed(2), observed(3), observed(4)], [1, 4])
     assert results == ["result 1", "result 4"] and missing == 2
     assert [call[1] for call in calls] == [1, 4]
 
 
 @pytest.mark.parametrize("lost", [LostLine(seq=1, what="depth", why="slow"), taken(1)])
-def test_depth_that_the_recording_lacks_is_missing(lost: Any) -> None:
+def test_recorded_calls_report_frame_of_missing_depth(lost: Any) -> None:
     calls, _, missing = repeated([MADE, observed(1), lost, observed(2)], [1, 2], [None])
     assert missing == 1 and [call[0] for call in calls] == ["observe", "observe"]
 
 
-def test_depth_of_a_frame_that_was_not_observed_is_missing() -> None:
+def test_recorded_calls_report_depth_of_unobserved_frame_as_missing() -> None:
     depth = {"depth": np.full((4, 4), 50, np.float32)}
     assert repeated([MADE, observed(2), taken(1), observed(3)], [2, 3], [depth])[2] == 1
     assert repeated([taken(2), MADE, observed(3)], [2, 3], [depth])[2] == 2, "before there is a reconstructor"
 
 
 @pytest.mark.parametrize(("age", "is_kept"), [(MOST_LATE - 1, True), (MOST_LATE, False)])
-def test_depth_may_be_as_late_as_live(age: int, is_kept: bool) -> None:
+def test_recorded_calls_accept_depth_up_to_most_late(age: int, is_kept: bool) -> None:
     frames = list(range(1, age + 2))
     lines = [MADE, *map(observed, frames), taken(1), observed(age + 2)]
     depth = {"depth": np.full((4, 4), 50, np.float32)}
@@ -125,7 +125,7 @@ def test_depth_may_be_as_late_as_live(age: int, is_kept: bool) -> None:
     assert (("depth", 1, True) in calls, missing is None) == (is_kept, is_kept)
 
 
-def test_only_the_newest_frame_grows_and_only_a_scene_is_rehearsed() -> None:
+def test_recorded_calls_grow_newest_frame_and_rehearse_nonempty_scene() -> None:
     lines = [MADE, observed(1), observed(2), Grown(seq=1), observed(3), Grown(seq=3), observed(4)]
     assert [call for call in repeated(lines, [1, 2, 3, 4])[0] if call[0] == "grow"] == [("grow", 3)]
     empty = Learner(gaussians=0)
@@ -133,7 +133,7 @@ def test_only_the_newest_frame_grows_and_only_a_scene_is_rehearsed() -> None:
     assert calls == [("observe", 1, 3, True)]
 
 
-def test_nothing_is_repeated_before_there_is_a_reconstructor() -> None:
+def test_recorded_calls_before_reconstructor_are_skipped() -> None:
     calls, results, _ = repeated([Rehearsed(steps=2), SceneBegun(seq=1), observed(1), MADE, observed(2)], [1, 2])
     assert calls == [("observe", 2, 3, True)] and results == [None, "result 2"]
 
@@ -148,7 +148,9 @@ def test_nothing_is_repeated_before_there_is_a_reconstructor() -> None:
     ],
     ids=["good", "held out", "damaged", "unusable"],
 )
-def test_frames_that_are_not_trained_on_are_accepted(given: Frame, train: bool, accepted: bool, trained: bool) -> None:
+def test_recorded_calls_accept_frames_without_training(
+    given: Frame, train: bool, accepted: bool, trained: bool
+) -> None:
     calls, results, _ = repeated([MADE, observed(1, train=train)], [given])
     assert calls == [("accepts", 1)] * accepted + [("observe", 1, 3, trained)] and results == ["result 1"]
     nothing = Learner()
@@ -157,7 +159,7 @@ def test_frames_that_are_not_trained_on_are_accepted(given: Frame, train: bool, 
     assert results == (["result 1"] if trained else [None])
 
 
-def test_an_ended_session_is_repeated_from_its_begin() -> None:
+def test_recorded_calls_restart_from_beginning() -> None:
     learner = Learner()
     training = RecordedCalls(lambda: iter([MADE, observed(1), observed(2)]), lambda: iter(()))
     for _ in range(2):

@@ -29,7 +29,7 @@ def picture_of(rng, size, **fields):
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 40), (40, 1), (7, 5), (48, 64), (333, 90), (700, 640)])
 @pytest.mark.parametrize("masks", [("mask",), ("loss_mask",), ("mask", "loss_mask"), ()])
-def test_what_the_frame_does_not_show_is_remembered_and_all_else_stays(rng, size, masks):
+def test_mark_changes_only_covered_pixels_outside_visible_tissue(rng, size, masks):
     tissue = RememberedTissue()
     for _ in range(2):
         rendered = picture_of(rng, size, **{name: blobs(rng, size) for name in masks})
@@ -49,7 +49,7 @@ def test_what_the_frame_does_not_show_is_remembered_and_all_else_stays(rng, size
         assert np.array_equal(marked(rendered), picture)
 
 
-def test_remembered_tissue_is_darker_with_a_light_line_along_tissue_and_none_along_the_borders():
+def test_remembered_tissue_is_darker_with_line_along_tissue_only():
     size = (400, 500)
     mask, view = np.ones(size, np.uint8), np.ones(size, np.uint8)
     mask[100:200, 300:] = 0
@@ -66,7 +66,7 @@ def test_remembered_tissue_is_darker_with_a_light_line_along_tissue_and_none_alo
     assert (picture[120:180, -1] == inside[0, 0]).all(), "nor at that of the picture"
 
 
-def test_what_a_tool_uncovers_is_live_at_once(rng):
+def test_tissue_uncovered_by_tool_is_live_immediately(rng):
     tissue, size = RememberedTissue(), (48, 64)
     before, after = np.ones(size, np.uint8), np.ones(size, np.uint8)
     before[:, :30], after[:, 20:50] = 0, 0
@@ -77,7 +77,7 @@ def test_what_a_tool_uncovers_is_live_at_once(rng):
         assert np.array_equal(tissue.layer(rendered), np.where(mask, 0, 255))
 
 
-def test_the_frame_whose_content_is_shown_counts():
+def test_remembered_layer_uses_mask_of_content_frame():
     size = make_frame().image.shape[:2]
     tool = np.ones(size, np.uint8)
     tool[2:9] = 0
@@ -85,7 +85,7 @@ def test_the_frame_whose_content_is_shown_counts():
     assert np.array_equal(RememberedTissue().layer(rendered), np.where(tool, 0, 255))
 
 
-def test_all_of_a_picture_can_be_remembered_but_not_what_it_does_not_cover(rng):
+def test_whole_remembered_layer_excludes_uncovered_pixels(rng):
     rendered = picture_of(rng, (20, 30))
     layer = RememberedTissue().layer(rendered, whole=True)
     assert np.array_equal(layer > 0, rendered.alpha >= COVERED)
@@ -93,7 +93,7 @@ def test_all_of_a_picture_can_be_remembered_but_not_what_it_does_not_cover(rng):
     assert RememberedTissue().layer(other).all(), "nothing of another size is in it"
 
 
-def test_the_marking_survives_video_coding(tmp_path):
+def test_remembered_marking_survives_video_coding(tmp_path):
     """Code the picture as the recorder does: 4:2:0, lossy."""
     size = (256, 320)
     rng = np.random.default_rng(3)

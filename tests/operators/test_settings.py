@@ -35,7 +35,7 @@ WRONG = {float: (True, "1", "nan", float("nan"), float("inf"), [], {}), int: (Tr
 
 
 @pytest.mark.parametrize("name", EVERY)
-def test_a_description_is_one_phrase_and_a_default_is_in_range(name):
+def test_option_description_is_one_phrase_and_default_is_valid(name):
     each = EVERY[name]
     assert each.option.description[0].isupper() and not each.option.description.endswith(".")
     assert set(each.option.commands) <= set(get_args(Command)) and each.option.commands
@@ -44,7 +44,7 @@ def test_a_description_is_one_phrase_and_a_default_is_in_range(name):
 
 
 @pytest.mark.parametrize("name", EVERY)
-def test_values_of_another_type_are_refused_with_the_name_and_not_converted(name):
+def test_option_refuses_values_of_other_type(name):
     each = EVERY[name]
     for value in WRONG.get(each.plain, ()):
         if each.kind is tuple or (isinstance(each.default, tuple) and value == ""):
@@ -56,7 +56,7 @@ def test_values_of_another_type_are_refused_with_the_name_and_not_converted(name
 
 
 @pytest.mark.parametrize("name", [name for name, each in EVERY.items() if each.plain in (int, float)])
-def test_limits_are_refused_and_said(name):
+def test_option_error_states_range_beyond_limits(name):
     each = EVERY[name]
     schema = TypeAdapter(each.hint).json_schema()
     (limits,) = [kind for kind in schema.get("anyOf", [schema]) if kind["type"] != "null"]
@@ -72,7 +72,7 @@ def test_limits_are_refused_and_said(name):
 @pytest.mark.parametrize(
     ("kind", "arguments"), [(ReplaySettings, ("a", Path("out"))), (LiveSettings, ("a", Path("out")))]
 )
-def test_settings_of_a_run_have_the_options_and_check_them(kind, arguments):
+def test_run_settings_have_options_and_validate(kind, arguments):
     settings = kind(*arguments, eyes="both", scale=2, seed=3)
     assert (settings.eyes, settings.given_scale, settings.seed) == ("both", 2.0, 3)
     assert settings.reconstructor_config(10_000).eyes == "both"
@@ -83,14 +83,14 @@ def test_settings_of_a_run_have_the_options_and_check_them(kind, arguments):
         settings.seed = 4
 
 
-def test_callers_have_lower_limits():
+def test_caller_job_options_have_lower_limits():
     assert JobOptions(seed=2**40, steps_per_frame=20_000, scale=8).seed == 2**40
     for name, value in (("seed", 2**40), ("steps_per_frame", 20_000), ("scale", 8)):
         with pytest.raises(InvalidSetting, match=f"{name} is {value}"):
             CallerJobOptions(**{name: value})
 
 
-def test_chosen_options_are_those_that_differ_and_survive_json():
+def test_chosen_returns_non_default_options_as_json():
     assert JobOptions().chosen() == {}
     chosen = JobOptions(seed=0, scale=0.5, sinks=("video",)).chosen()
     assert chosen == {"scale": 0.5, "sinks": ["video"]}
@@ -112,7 +112,7 @@ def test_options_of_jobs_stored_by_earlier_versions_load(stored):
     assert {name: getattr(settings, name) for name in stored} == stored
 
 
-def test_requests_are_documents_of_the_schema():
+def test_caller_job_options_validate_as_pydantic_model():
     class Wanted(BaseModel):
         options: CallerJobOptions = CallerJobOptions()
 
@@ -123,7 +123,7 @@ def test_requests_are_documents_of_the_schema():
         assert refused.value.errors()[0]["loc"] == ("options", *wrong)
 
 
-def test_a_stream_takes_each_of_its_options_and_null():
+def test_check_stream_options_accepts_defaults_and_null():
     for name, schema in stream_options_schema()["properties"].items():
         check_stream_options({name: None})
         check_stream_options({name: schema["default"]})
@@ -131,7 +131,7 @@ def test_a_stream_takes_each_of_its_options_and_null():
         check_stream_options({"sead": 1})
 
 
-def test_importing_the_declarations_loads_nothing_heavy():
+def test_importing_operators_settings_loads_no_heavy_module():
     code = "import sys, operators.settings; print({'torch', 'cv2', 'numpy', 'pydantic'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
     assert done.stdout == "set()\n"

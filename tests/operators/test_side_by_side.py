@@ -38,7 +38,7 @@ class Changes(Operator):
         outcome.note(self.name)
 
 
-def test_parts_are_initialised_before_a_source_starts_and_once_for_all_restarts():
+def test_side_by_side_initializes_parts_once_for_all_restarts():
     calls = []
 
     class Watched(Changes):
@@ -86,7 +86,7 @@ def half(frame, value):
     return plane
 
 
-def test_what_both_chains_find_goes_on(make, frame, compute):
+def test_side_by_side_combines_results_of_both_chains(make, frame, compute):
     one = frame()
     operator = make([fields(loss_mask=half(one, 0))], [fields(mask=half(one, 1), loss_mask=half(one, 1))])
     (out,) = compute(operator, frame=one)
@@ -94,7 +94,7 @@ def test_what_both_chains_find_goes_on(make, frame, compute):
     assert not out.loss_mask.any()
 
 
-def test_nothing_of_a_frame_goes_on_that_the_gate_withholds(make, frame, compute):
+def test_side_by_side_gate_removes_results_of_withheld_frame(make, frame, compute):
     one = frame()
     black = fields(image=np.zeros_like(one.image), withheld="out of body")
     operator = make([fields(new_scene="cut")], [fields(mask=half(one, 1))], gate=[black])
@@ -103,12 +103,12 @@ def test_nothing_of_a_frame_goes_on_that_the_gate_withholds(make, frame, compute
     assert not out.image.any()
 
 
-def test_a_time_that_was_repaired_stays_so_behind_the_gate(make, frame, compute):
+def test_side_by_side_keeps_repaired_time_of_withheld_frame(make, frame, compute):
     operator = make([fields(pts_ns=77)], gate=[fields(withheld="out of body")])
     assert compute(operator, frame=frame())[0].pts_ns == 77
 
 
-def test_the_third_chain_sees_what_both_found(make, frame, compute):
+def test_side_by_side_third_chain_gets_combined_frame(make, frame, compute):
     one = frame()
     seen = []
     operator = make([fields(new_scene="cut")], [fields(mask=half(one, 0))], [lambda f: seen.append(f) or f])
@@ -116,7 +116,7 @@ def test_the_third_chain_sees_what_both_found(make, frame, compute):
     assert (seen[0].new_scene, seen[0].mask.sum()) == ("cut", half(one, 0).sum())
 
 
-def test_the_chains_run_at_the_same_time(make, frame, compute):
+def test_side_by_side_chains_run_concurrently(make, frame, compute):
     meet = threading.Barrier(2, timeout=300)
 
     def wait(found):
@@ -127,7 +127,7 @@ def test_the_chains_run_at_the_same_time(make, frame, compute):
 
 
 @pytest.mark.parametrize("failing", ["first", "second"])
-def test_an_error_of_either_chain_is_raised_and_the_next_frame_goes_through(make, frame, compute, failing):
+def test_side_by_side_raises_chain_error_and_continues(make, frame, compute, failing):
     calls = []
 
     def fails_once(found):
@@ -143,7 +143,7 @@ def test_an_error_of_either_chain_is_raised_and_the_next_frame_goes_through(make
     assert out.seq == 1
 
 
-def test_its_parts_are_started_stopped_and_contribute(make):
+def test_side_by_side_starts_stops_and_contributes_parts(make):
     operator = make([fields()], [fields()], [fields()])
     assert all(part.running for part in operator.parts)
     outcome = OutcomeBuilder()

@@ -21,7 +21,7 @@ def in_a_thread(work):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="priorities of threads are those of Linux")
-def test_a_thread_steps_back_alone():
+def test_step_back_changes_niceness_of_own_thread_only():
     def stepped():
         step_back()
         return os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
@@ -31,5 +31,5 @@ def test_a_thread_steps_back_alone():
     assert os.getpriority(os.PRIO_PROCESS, threading.get_native_id()) == before
 
 
-def test_a_process_may_use_at_least_one_core():
+def test_usable_cores_is_between_one_and_cpu_count():
     assert 1 <= usable_cores() <= (os.cpu_count() or 1)

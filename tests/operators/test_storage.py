@@ -13,7 +13,7 @@ from operators.errors import OutputError, StorageFull
 from operators.storage import StorageReserve, mebibytes, shown, storage_errors, write_whole
 
 
-def test_the_reserve_is_asked_for_anew_each_time(tmp_path):
+def test_storage_reserve_evaluates_size_at_each_check(tmp_path):
     needed = 0
     reserve = StorageReserve(tmp_path, lambda: needed)
     reserve.require(100)
@@ -33,26 +33,26 @@ def test_the_reserve_is_asked_for_anew_each_time(tmp_path):
         (errno.EIO, OutputError, "check the path, its permissions and its disk"),
     ],
 )
-def test_what_the_system_says_becomes_a_sentence(tmp_path, number, kind, match):
+def test_storage_errors_map_errno_to_error_and_advice(tmp_path, number, kind, match):
     with pytest.raises(kind, match=match) as caught, storage_errors(tmp_path):
         raise OSError(number, os.strerror(number))
     assert type(caught.value) is kind and str(tmp_path) in str(caught.value)
 
 
-def test_a_folder_that_is_gone_is_named(tmp_path):
+def test_missing_folder_error_names_folder(tmp_path):
     with pytest.raises(OutputError, match="gone is not there; it must exist, and stay"):
         write_whole(tmp_path / "gone" / "report.json", b"x")
     with pytest.raises(OutputError, match="gone is not there"):
         StorageReserve(tmp_path / "gone", lambda: 0).require()
 
 
-def test_the_user_reads_the_name_of_their_own_folder(tmp_path):
+def test_storage_error_names_output_folder_not_run_folder(tmp_path):
     with pytest.raises(StorageFull) as caught, storage_errors(tmp_path / ".run-0123"):
         raise OSError(errno.ENOSPC, "No space left on device")
     assert ".run-" not in str(caught.value) and str(tmp_path) in str(caught.value)
 
 
-def test_a_write_that_fails_leaves_the_earlier_file(tmp_path, monkeypatch):
+def test_write_whole_failure_keeps_earlier_file(tmp_path, monkeypatch):
     path = tmp_path / "report.json"
     write_whole(path, b"earlier")
 
@@ -70,16 +70,16 @@ def test_a_write_that_fails_leaves_the_earlier_file(tmp_path, monkeypatch):
     ("count", "text"),
     [(0, "0.0 MiB"), (3 * 2**19, "1.5 MiB"), (2**30 - 1, "1024.0 MiB"), (2**30, "1.0 GiB"), (5 * 2**29, "2.5 GiB")],
 )
-def test_bytes_are_told_in_mebibytes_and_from_one_gibibyte_on_in_gibibytes(count, text):
+def test_mebibytes_text_uses_gib_from_one_gibibyte(count, text):
     assert mebibytes(count) == text
 
 
-def test_a_folder_of_a_run_under_way_has_the_name_of_the_output_folder(tmp_path):
+def test_shown_replaces_run_folder_by_output_folder(tmp_path):
     assert shown(tmp_path / ".run-1234") == tmp_path
     assert shown(tmp_path / "run-1234") == tmp_path / "run-1234"
 
 
-def test_a_reserve_is_kept_to_the_byte(tmp_path, monkeypatch):
+def test_storage_reserve_limit_is_exact_to_the_byte(tmp_path, monkeypatch):
     monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=30 * 2**20))
     reserve = StorageReserve(tmp_path, lambda: 20 * 2**20)
     reserve.require()
@@ -103,20 +103,20 @@ def test_a_reserve_is_kept_to_the_byte(tmp_path, monkeypatch):
         (errno.EACCES, OutputError, r"cannot write to .*\(Permission denied\)"),
     ],
 )
-def test_errors_of_the_system_become_sentences(tmp_path, number, kind, said):
+def test_storage_errors_message_by_errno(tmp_path, number, kind, said):
     with pytest.raises(kind, match=said) as raised, storage_errors(tmp_path):
         raise OSError(number, os.strerror(number))
     assert type(raised.value) is kind and str(tmp_path) in str(raised.value)
 
 
 @pytest.mark.parametrize(("number", "gone"), [(errno.ENOENT, True), (errno.ENOTDIR, True), (errno.EACCES, False)])
-def test_a_folder_that_is_gone_is_told_from_one_that_is_closed(tmp_path, number, gone):
+def test_storage_errors_distinguish_missing_and_inaccessible_folder(tmp_path, number, gone):
     said = "is not there" if gone else "check the path"
     with pytest.raises(OutputError, match=said) as raised, storage_errors(tmp_path / "gone"):
         raise OSError(number, "said by the system")
     assert isinstance(raised.value.__cause__, OSError)
 
 
-def test_an_error_without_a_number_is_told_in_its_own_words(tmp_path):
+def test_storage_error_without_errno_keeps_message(tmp_path):
     with pytest.raises(OutputError, match="something odd"), storage_errors(tmp_path):
         raise OSError("something odd")

@@ -33,7 +33,7 @@ def notes(operator):
     return outcome.notes
 
 
-def test_a_recorded_mask_stays_as_it_is(frame, compute):
+def test_recorded_tool_mask_is_unchanged(frame, compute):
     mask = np.zeros((16, 24), np.uint8)
     operator = RecordedToolMaskOp(None)
     operator.start()
@@ -42,7 +42,7 @@ def test_a_recorded_mask_stays_as_it_is(frame, compute):
     assert notes(operator) == ()
 
 
-def test_without_a_mask_every_pixel_is_tissue_and_it_is_stated_once(frame, compute, caplog):
+def test_missing_recorded_mask_counts_all_pixels_as_tissue_with_one_note(frame, compute, caplog):
     operator = RecordedToolMaskOp(None)
     operator.start()
     with caplog.at_level(logging.WARNING):
@@ -75,7 +75,7 @@ def found_masks(operator):
     return outcome.find(FoundMasks)
 
 
-def test_a_frame_that_comes_with_a_mask_keeps_it_and_others_get_what_is_found(frame, compute):
+def test_found_tool_mask_keeps_recorded_mask(frame, compute):
     finder = FakeFinder()
     operator = FoundToolMaskOp(None, make_finder=lambda: finder, method="fake")
     operator.start()
@@ -88,7 +88,7 @@ def test_a_frame_that_comes_with_a_mask_keeps_it_and_others_get_what_is_found(fr
     assert found_masks(operator) == FoundMasks("fake", found=1, recorded=1, tool_share=0.5)
 
 
-def test_the_stream_is_forgotten_where_another_scene_begins_and_at_each_start(frame, compute):
+def test_tool_finder_resets_at_new_scene_and_start(frame, compute):
     finder = FakeFinder()
     operator = FoundToolMaskOp(None, make_finder=lambda: finder, method="fake")
     operator.start()
@@ -99,13 +99,13 @@ def test_the_stream_is_forgotten_where_another_scene_begins_and_at_each_start(fr
     assert found_masks(operator) == FoundMasks("fake", 0, 0, 0.0)
 
 
-def test_without_masks_every_pixel_is_tissue_whatever_was_recorded(frame, compute):
+def test_tool_mask_none_ignores_recorded_mask(frame, compute):
     (passed,) = compute(new_tool_mask(None, "none"), frame=frame(0, mask=np.zeros((16, 24), np.uint8)))
     assert passed.mask.all()
 
 
 @pytest.mark.parametrize("method", ["builtin", "classical"])
-def test_the_detectors_find_a_grey_tool(frame, compute, method):
+def test_tool_detectors_find_grey_tool(frame, compute, method):
     image = np.full((128, 160, 3), (190, 90, 70), np.uint8)
     image[50:90, 60:] = (120, 124, 128)
     operator = new_tool_mask(None, method)
@@ -115,7 +115,7 @@ def test_the_detectors_find_a_grey_tool(frame, compute, method):
     assert found_masks(operator).method == method
 
 
-def test_without_its_network_the_built_in_mask_is_found_by_colour(frame, compute, monkeypatch, caplog):
+def test_builtin_tool_mask_falls_back_to_colour_without_network(frame, compute, monkeypatch, caplog):
     monkeypatch.setattr("gsplat_core.endoscope.tools.NETWORK", Path("missing.onnx"))
     operator = new_tool_mask(None, "builtin")
     with caplog.at_level(logging.WARNING):
@@ -128,7 +128,7 @@ def test_without_its_network_the_built_in_mask_is_found_by_colour(frame, compute
 @pytest.mark.parametrize(
     "error", [RuntimeError("CUDA error: out of memory"), InvalidSetting("its operator Mish is not supported")]
 )
-def test_if_the_gpu_cannot_run_the_network_the_cpu_does(frame, compute, monkeypatch, caplog, error):
+def test_tool_network_falls_back_to_cpu_on_gpu_error(frame, compute, monkeypatch, caplog, error):
     asked = []
 
     def fail(path, device):
@@ -146,7 +146,7 @@ def test_if_the_gpu_cannot_run_the_network_the_cpu_does(frame, compute, monkeypa
     assert (found.mask == NetworkToolFinder().find(image)).all() and not found.mask.all()
 
 
-def test_the_network_is_loaded_before_a_source_starts_and_anew_at_a_restart():
+def test_tool_network_is_loaded_at_initialize_and_reloaded_at_restart():
     made = []
     operator = FoundToolMaskOp(
         None, name="tool_mask", make_finder=lambda: made.append(FakeFinder()) or made[-1], method="fake"
@@ -160,7 +160,7 @@ def test_the_network_is_loaded_before_a_source_starts_and_anew_at_a_restart():
     assert len(made) == 2 and operator._finder is made[1]
 
 
-def test_other_errors_are_raised(monkeypatch):
+def test_tool_network_programming_error_is_raised(monkeypatch):
     def fail(path, device):
         raise TypeError("a bug")
 
@@ -169,7 +169,7 @@ def test_other_errors_are_raised(monkeypatch):
         new_tool_mask(None, "builtin", device="cuda").start()
 
 
-def test_the_network_runs_on_the_cpu_unless_another_device_is_named(monkeypatch):
+def test_tool_network_runs_on_cpu_by_default(monkeypatch):
     devices = []
 
     def made(*, device):
@@ -193,13 +193,13 @@ def test_the_network_runs_on_the_cpu_unless_another_device_is_named(monkeypatch)
         ("builtin:fast", "tool mask 'builtin' takes nothing after its name, got 'fast'"),
     ],
 )
-def test_a_choice_that_names_nothing_is_refused(choice, sentence):
+def test_tool_mask_refuses_unknown_choice(choice, sentence):
     for refuse in (check_tool_mask, lambda choice: new_tool_mask(None, choice)):
         with pytest.raises(InvalidSetting, match=sentence):
             refuse(choice)
 
 
-def test_each_way_is_an_operator_of_frames():
+def test_every_tool_mask_operator_has_frame_ports():
     for choice in TOOL_MASKS:
         if choice != "onnx":
             operator = new_tool_mask(None, choice, "mask")
@@ -216,7 +216,7 @@ def network(path: Path, *nodes: Any) -> Path:
     return path
 
 
-def test_a_users_network_is_named_by_its_path(frame, compute, tmp_path):
+def test_onnx_tool_mask_loads_network_from_path(frame, compute, tmp_path):
     """The network marks the pixels that are brightest in blue as tool."""
     path = network(tmp_path / "my:net.onnx", helper.make_node("Softmax", ["image"], ["mask"], axis=1))
     check_tool_mask(f"onnx:{path}")
@@ -232,7 +232,7 @@ def test_a_users_network_is_named_by_its_path(frame, compute, tmp_path):
     assert found_masks(operator).found == 0
 
 
-def test_what_a_network_could_not_say_is_stated(frame, compute, tmp_path):
+def test_onnx_tool_mask_notes_nan_frames(frame, compute, tmp_path):
     """Log gives NaN for a negative number, which the picture's values less one are."""
     path = tmp_path / "net.onnx"
     (tmp_path / "net.onnx.json").write_text('{"mean": [1.5, 1.5, 1.5]}')
@@ -267,20 +267,20 @@ def tissue_shares(frame, compute, *shares, **fields):
     return found, operator
 
 
-def test_a_stream_in_which_everything_looks_like_a_tool_is_tissue(frame, compute):
+def test_all_tool_mask_is_disbelieved_from_start_of_stream(frame, compute):
     found, operator = tissue_shares(frame, compute, *[0.0] * 5, 0.01)
     assert found == [1.0] * 6
     assert found_masks(operator) == FoundMasks("fake", 6, 0, 0.0, 6)
     assert "in 6 frames everything looked like a tool" in " ".join(notes(operator))
 
 
-def test_a_tool_before_the_lens_is_believed_for_a_while(frame, compute):
+def test_all_tool_mask_after_tissue_is_believed_for_limited_frames(frame, compute):
     found, operator = tissue_shares(frame, compute, 0.5, *[0.0] * BELIEVED_FRAMES, 0.0, 0.0, 0.02, 0.0)
     assert found == [0.5] + [0.0] * BELIEVED_FRAMES + [1.0, 1.0, 0.02, 0.0]
     assert found_masks(operator).disbelieved == 2
 
 
-def test_another_scene_has_shown_no_tissue_yet_and_withheld_frames_say_nothing(frame, compute):
+def test_new_scene_resets_tool_mask_belief_and_withheld_frames_are_ignored(frame, compute):
     found, _ = tissue_shares(frame, compute, 0.5, 0.0, 0.0, 0.0, **{"2": {"new_scene": "cut"}})
     assert found == [0.5, 0.0, 1.0, 1.0]
     found, operator = tissue_shares(frame, compute, 0.0, 0.0, **{"0": {"withheld": "out of body"}})
@@ -314,7 +314,7 @@ def tissue(operator, compute, frame, **fields):
     return int(given.mask.sum())
 
 
-def test_a_picture_that_is_all_tool_is_believed_for_ten_frames_after_tissue(frame, compute):
+def test_all_tool_mask_is_believed_for_ten_frames_after_tissue(frame, compute):
     operator, finder = doubting()
     assert BELIEVED_FRAMES == 10
     assert tissue(operator, compute, frame) == 384  # nothing showed tissue before
@@ -337,7 +337,7 @@ def test_a_picture_that_is_all_tool_is_believed_for_ten_frames_after_tissue(fram
     assert note.startswith("in 4 frames everything looked like a tool")
 
 
-def test_the_least_tissue_is_believed_and_a_finder_without_doubts_always(frame, compute):
+def test_tool_mask_with_least_tissue_is_believed(frame, compute):
     least = int(np.ceil(LEAST_TISSUE * 384))
     operator, finder = doubting()
     finder.tissue = least

@@ -62,7 +62,7 @@ def decibels(grey_levels):
     return 20 * np.log10(255 / grey_levels)
 
 
-def test_a_place_that_was_seen_before_is_scored_beside_its_baselines(frame, rendered, compute):
+def test_tissue_seen_before_is_scored_with_baselines(frame, rendered, compute):
     known = Known(100)
     # Seen at level 90, then hidden; the tissue around the tool is at 108 by then.
     frames = [(90, 0, tool(0, 0), {})] * 3 + [(95, 0, tool(30, 40), {}), (108, 104, tool(10, 20), {})]
@@ -74,13 +74,13 @@ def test_a_place_that_was_seen_before_is_scored_beside_its_baselines(frame, rend
     assert found.behind_tools.inpainted_db == pytest.approx(decibels(8), abs=0.5)
 
 
-def test_a_place_that_no_frame_has_shown_is_not_scored(frame, rendered, compute):
+def test_never_seen_tissue_is_not_scored(frame, rendered, compute):
     frames = [(100, 100, tool(10, 20), {})] * 9
     found = run(frames, Known(), frame, rendered, compute)
     assert found.behind_tools is None and found.depth is not None and found.depth_behind_tools is None
 
 
-def test_frames_without_a_mask_and_damaged_ones_are_left_out(frame, rendered, compute):
+def test_truth_skips_damaged_and_unmasked_frames(frame, rendered, compute):
     known = Known()
     damaged = {"status": FrameStatus.DAMAGED}
     frames = [(90, 0, None, {}), (90, 0, tool(0, 0), damaged), (90, 0, tool(0, 0), damaged), (90, 0, None, {})]
@@ -90,7 +90,7 @@ def test_frames_without_a_mask_and_damaged_ones_are_left_out(frame, rendered, co
     assert known.asked == [4]
 
 
-def test_depth_is_compared_with_planes_that_know_the_truth(frame, rendered, compute):
+def test_truth_depth_is_compared_with_plane_baselines(frame, rendered, compute):
     found = run([(90, 90, tool(0, 0), {})] + [(90, 90, tool(10, 20), {})] * 4, Known(), frame, rendered, compute)
     for share in (found.depth, found.depth_behind_tools):
         assert share.rmse_share == pytest.approx(0.02, abs=0.002)
@@ -98,7 +98,7 @@ def test_depth_is_compared_with_planes_that_know_the_truth(frame, rendered, comp
     assert found.depth.level_rmse_share > 2 * share.level_rmse_share, "behind the tool the slope is short"
 
 
-def test_long_recordings_are_scored_at_a_bounded_number_of_frames(frame, rendered, compute):
+def test_truth_scores_bounded_number_of_frames(frame, rendered, compute):
     for count, expected in ((9, SCORED_EVERY), (6400, 100)):
         camera = Camera.from_focal(40.0, WIDTH, HEIGHT)
         assert TruthOp(None, behind=Known(), camera=camera, frame_count=count).every == expected
@@ -110,7 +110,7 @@ def recorded(tmp_path_factory):
     return synthesize(folder, frames=3, width_px=96, height_px=80, stereo=False, extras=Extras(behind=True))
 
 
-def test_the_generator_writes_what_is_seen_through_the_tool(recorded):
+def test_synthesize_writes_tissue_behind_tool(recorded):
     behind, truth = open_behind(recorded, 3), open_truth(recorded, 3)
     assert truth.behind is not None
     for frame in open_recording(recorded):
@@ -125,7 +125,7 @@ def test_the_generator_writes_what_is_seen_through_the_tool(recorded):
     assert behind.of(frame.with_fields(seq=3)) is None
 
 
-def test_it_is_read_at_the_frames_size_and_is_no_part_of_the_recording(recorded, tmp_path):
+def test_behind_is_scaled_to_frame_and_not_part_of_recording(recorded, tmp_path):
     plain = synthesize(tmp_path / "plain", frames=3, width_px=96, height_px=80, stereo=False)
     small = next(iter(open_recording(recorded, scale=0.5)))
     image, depth = open_behind(recorded, 3).of(small)
@@ -135,7 +135,7 @@ def test_it_is_read_at_the_frames_size_and_is_no_part_of_the_recording(recorded,
     assert open_behind(plain, 3) is None and open_truth(plain, 3).behind is None
 
 
-def test_a_truth_that_cannot_be_read_is_an_error_that_names_the_file(recorded, tmp_path):
+def test_unreadable_truth_error_names_file(recorded, tmp_path):
     import shutil
 
     copy = tmp_path / "copy"
@@ -149,7 +149,7 @@ def test_a_truth_that_cannot_be_read_is_an_error_that_names_the_file(recorded, t
         open_behind(copy, 3)
 
 
-def test_a_replay_of_such_a_recording_measures_it(recorded, tmp_path):
+def test_replay_reports_truth_of_synthetic_recording(recorded, tmp_path):
     from operators.applications.replay import ReplaySettings, replay
     from services.reports.build import write_reports
 

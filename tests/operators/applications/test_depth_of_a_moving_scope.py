@@ -1,4 +1,4 @@
-"""A moving scope without depth, run as a user runs it: who looks for parallax when nothing is asked for, and in which frames."""
+"""Depth by parallax for a moving scope without recorded depth: in which runs and in which frames."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def settings(clip, tmp_path):
 
 
 @pytest.fixture
-def asked(monkeypatch):
+def parallax_frames(monkeypatch):
     """Numbers of the frames in which parallax was looked for while the run went on."""
     numbers = []
 
@@ -64,31 +64,34 @@ def depth_of(outcome: RunOutcome) -> FoundDepth:
     return found
 
 
-def test_replay_finds_it_by_parallax_unless_something_else_is_asked_for(settings, asked):
+def test_replay_estimates_depth_by_parallax_by_default(settings, parallax_frames):
     outcome = replay(settings)
     found = depth_of(outcome)
     assert set(found.frames) == {"parallax"} and found.frames["parallax"] >= 1
     assert found.known_share > 0.5 and not found.metric
-    assert asked == list(range(COUNT))
+    assert parallax_frames == list(range(COUNT))
     assert any("depth was estimated" in note and "its unit is not known" in note for note in outcome.notes)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("depth", ["recorded", "none", "stereo"])
-def test_replay_looks_for_none_where_something_else_is_asked_for(settings, asked, depth):
+def test_replay_skips_parallax_depth_for_other_depth_settings(settings, parallax_frames, depth):
     assert depth_of(replay(replace(settings, depth=depth))).frames == {}
-    assert asked == []
+    assert parallax_frames == []
 
 
-def test_held_out_frames_take_no_part(settings, asked):
+def test_parallax_depth_skips_heldout_frames(settings, parallax_frames):
     found = depth_of(replay(replace(settings, heldout=True)))
-    assert asked == [number for number in range(COUNT) if not is_heldout(number)] and len(asked) < COUNT
+    assert (
+        parallax_frames == [number for number in range(COUNT) if not is_heldout(number)]
+        and len(parallax_frames) < COUNT
+    )
     assert found.frames["parallax"] >= 1
 
 
 @pytest.mark.slow
-def test_showing_a_finished_model_looks_for_none(settings, asked):
+def test_offline_reconstruction_skips_live_parallax_depth(settings, parallax_frames):
     """Offline, training has found it before, in all frames at once."""
     outcome = reconstruct(settings, steps=2)
     assert depth_of(outcome).frames == {} and not any("interrupted" in note for note in outcome.notes)
-    assert asked == []
+    assert parallax_frames == []

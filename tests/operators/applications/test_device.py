@@ -11,7 +11,7 @@ from operators.errors import DeviceMissing
 from operators.graph import Application, GreedyScheduler, MultiThreadScheduler
 
 
-def test_a_gpu_needs_torch_to_see_it_and_its_kernels(monkeypatch):
+def test_check_device_requires_cuda_in_torch_and_built_kernels(monkeypatch):
     check_device("cpu")
     with pytest.raises(DeviceMissing, match="'tpu' is not known; use --device cpu or cuda"):
         check_device("tpu")
@@ -28,13 +28,13 @@ def test_a_gpu_needs_torch_to_see_it_and_its_kernels(monkeypatch):
     check_device("cuda")
 
 
-def test_the_host_computes_in_one_thread_where_it_trains_and_in_many_beside_a_gpu():
+def test_scheduler_is_greedy_on_cpu_and_multithreaded_on_cuda():
     app = Application()
     assert isinstance(scheduler_for("cpu", app), GreedyScheduler)
     assert isinstance(scheduler_for("cuda", app), MultiThreadScheduler)
 
 
-def test_random_numbers_are_the_same_inside_and_untouched_outside():
+def test_seeded_repeats_random_numbers_and_restores_global_state():
     def drawn() -> torch.Tensor:
         with seeded(7, "cpu"):
             return torch.rand(3)

@@ -43,7 +43,7 @@ def run(clip, tmp_path):  # noqa: F811
 
 
 @pytest.mark.slow
-def test_replay_estimates_them_when_asked_to_and_the_same_each_time(run):
+def test_replay_with_estimated_poses_is_deterministic(run):
     given, first, again = run(), run(poses="estimated"), run(poses="estimated")
     assert given.find(EstimatedPoses) is None and first.find(EstimatedPoses).explained > 0.9
     assert any("the scope's poses were estimated" in note for note in first.notes)
@@ -72,7 +72,7 @@ class _Scope(ThreadedSource):
 
 
 @pytest.mark.slow
-def test_a_session_with_estimated_poses_comes_out_again(tmp_path):
+def test_session_replay_reproduces_recorded_estimated_poses(tmp_path):
     recording = render_recording(RenderSettings(FRAMES, 160, 128, fps=20, seed=1, camera="moving"))
     settings = LiveSettings(
         source="scope", out=tmp_path / "live", record=tmp_path / "session", depth="none", poses="estimated"

@@ -34,7 +34,7 @@ def model(start_s: float, end_s: float):
     return SimpleNamespace(time_window_s=(start_s, end_s))
 
 
-def test_times_of_the_first_round_and_of_later_ones():
+def test_playback_times_offset_by_round_and_stretch():
     once = Playback(0.9)
     first = frame(3)
     assert once.times(first, 0, 10) is first
@@ -56,14 +56,14 @@ def seen(monkeypatch):
     return run
 
 
-def test_frames_within_a_time_range(seen):
+def test_evaluated_frames_are_limited_to_time_range(seen):
     assert seen(-math.inf, 0.35) == ([0, 1, 2, 3], [1, 2, 3, 4])
     assert seen(0.25, 0.55) == ([3, 4, 5], [1, 2, 3, 4, 5, 6]), "frames before the range are read, too"
     assert seen(0.0, 99.0)[0] == list(range(10)), "a recording that is not looped ends"
     assert seen(0.0, 99.0, stop=lambda: True) == ([], [])
 
 
-def test_the_last_frame_of_a_variable_frame_rate_is_at_its_time_in_the_file(tmp_path):
+def test_playback_ends_at_last_timestamp_of_variable_frame_rate_file(tmp_path):
     times_ms = [0, 33, 99, 132, 232, 265, 331, 364]
     path = videos.write_timed(tmp_path / "v.mkv", times_ms, 30, Fraction(1, 1000))
     source = RecordingSource(open_recording(path))
@@ -74,7 +74,7 @@ def test_the_last_frame_of_a_variable_frame_rate_is_at_its_time_in_the_file(tmp_
     assert playback.last_s == pytest.approx(0.364) and notes == []
 
 
-def test_frames_of_later_rounds_of_a_looped_recording(seen):
+def test_evaluated_frames_of_looped_recording_include_later_rounds(seen):
     looped = Playback(0.9, round_s=1.0)
     assert seen(1.75, 2.15, looped) == ([18, 19, 20, 21], list(range(1, 13))), "reading begins with the second round"
     assert seen(1.0, 1.05, looped)[0] == [10]
@@ -84,12 +84,12 @@ def test_frames_of_later_rounds_of_a_looped_recording(seen):
 @pytest.mark.parametrize(
     ("run_scale", "scale"), [(None, 0.5), (0.5, 0.5), (0.25, 0.5)], ids=["unknown", "the run's", "another"]
 )
-def test_the_scale_that_gives_the_size_of_the_model(run_scale, scale):
+def test_scale_of_model_maps_recording_size_to_model_size(run_scale, scale):
     assert evaluated._scale_of_model(CAMERA.scaled(0.5), CAMERA, run_scale) == scale
     assert evaluated._scale_of_model(CAMERA, CAMERA, run_scale) == 1.0
 
 
-def test_the_run_s_scale_is_taken_where_rounding_leaves_several():
+def test_scale_of_model_prefers_run_scale_within_rounding():
     made = CAMERA.scaled(0.51)
     assert evaluated._scale_of_model(made, CAMERA, 0.51) == 0.51
     assert made.width_px / CAMERA.width_px != 0.51
@@ -102,7 +102,7 @@ def moved(focal=0.0, x=0.0) -> Camera:
     return SimpleNamespace(model="pinhole", width_px=64, height_px=48, K=K, scaled=lambda ratio: CAMERA.scaled(ratio))
 
 
-def test_cameras_that_differ_by_more_than_rounding_are_refused():
+def test_check_camera_refuses_differences_beyond_rounding():
     check = lambda made, seen: evaluated._check_camera(made, seen, "clip")
     check(CAMERA, CAMERA)
     check(CAMERA, moved(focal=0.05))
@@ -120,7 +120,7 @@ def test_cameras_that_differ_by_more_than_rounding_are_refused():
     check(CAMERA, SimpleNamespace(model="pinhole", width_px=64, height_px=49, K=CAMERA.K))
 
 
-def test_a_run_at_the_recording_s_own_rate():
+def test_playback_of_run_at_recording_rate():
     playback, notes = evaluated._playback(model(0.0, 0.9), about(), None, False)
     assert (playback.last_s, playback.stretch, playback.round_s, notes) == (0.9, 1.0, math.inf, [])
     _, notes = evaluated._playback(model(0.0, 0.55), about(), None, False)
@@ -133,7 +133,7 @@ def test_a_run_at_the_recording_s_own_rate():
     evaluated._playback(model(1.05, 3.0), about(), None, False)
 
 
-def test_a_run_at_another_rate_and_one_that_looped():
+def test_playback_of_run_at_other_rate_or_looped():
     playback, notes = evaluated._playback(model(0.0, 0.45), about(), 20.0, False)
     assert (playback.last_s, playback.stretch, playback.round_s) == (0.45, 0.5, math.inf)
     assert notes == ["the run played the recording at 20 frames/s; times are the run's"]
@@ -146,7 +146,7 @@ def test_a_run_at_another_rate_and_one_that_looped():
     assert math.isinf(evaluated._playback(model(0.0, 1.05), about(), 10.0, False)[0].round_s), "within the tolerance"
 
 
-def test_a_recorded_session_has_the_run_s_own_times(monkeypatch, tmp_path):
+def test_session_playback_uses_timestamps_of_run(monkeypatch, tmp_path):
     lines = [SimpleNamespace(pts_ns=k * 100_000_000) for k in (0, 2, 1, 50)]
     monkeypatch.setattr(evaluated, "SessionReader", lambda folder: SimpleNamespace(frame_lines=lambda: iter(lines)))
     playback, notes = evaluated._session_playback(model(0.0, 0.2), tmp_path, about(count=3))
@@ -154,7 +154,7 @@ def test_a_recorded_session_has_the_run_s_own_times(monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize("made", ["file", "none", "damaged", "no run", "own poses"])
-def test_poses_that_the_run_estimated_are_those_of_its_frames(tmp_path, made):
+def test_with_poses_of_run_applies_poses_file_by_frame(tmp_path, made):
     """Frames beyond the last pose, of a recording that was read longer, have the last one."""
     poses = np.eye(4)[None].repeat(3, 0)
     poses[:, 0, 3] = 1, 2, 3

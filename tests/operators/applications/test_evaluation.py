@@ -27,7 +27,7 @@ from operators.applications.evaluated import EvaluatedRun
         ("max_frames", [None, 1], [0]),
     ],
 )
-def test_settings_of_an_evaluation_have_ranges(name, possible, impossible):
+def test_evaluation_settings_refuse_values_out_of_range(name, possible, impossible):
     for value in possible:
         assert getattr(EvaluationSettings("clip.mp4", **{name: value}), name) == value
     for value in impossible:
@@ -53,7 +53,7 @@ def work(tmp_path: Path, run: EvaluatedRun | None = None, **settings: Any) -> ev
         ("no run", 30, 30, "the settings of the model's training are not known"), ("no run", None, None, "training are not known"),
     ],
 )  # fmt: skip
-def test_the_causal_protocol_learns_as_the_run_did(
+def test_causal_protocol_uses_training_settings_of_run(
     tmp_path: Path, run_steps: Any, asked: int | None, steps: int | None, note: str | None
 ) -> None:
     run = None if run_steps == "no run" else run_of(tmp_path, steps_per_frame=run_steps)
@@ -65,7 +65,7 @@ def test_the_causal_protocol_learns_as_the_run_did(
 
 
 @pytest.mark.parametrize("has_camera", [True, False])
-def test_a_second_eye_whose_place_is_unknown_is_noted(
+def test_second_eye_without_camera_pose_adds_note(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, has_camera: bool
 ) -> None:
     made = work(tmp_path)
@@ -84,7 +84,7 @@ def test_a_second_eye_whose_place_is_unknown_is_noted(
 
 
 @pytest.mark.parametrize("stops_after", [0, 1, 2, 99])
-def test_an_interrupted_evaluation_has_what_was_reached(
+def test_interrupted_evaluation_keeps_measured_protocols(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stops_after: int
 ) -> None:
     made, measured = work(tmp_path), []
@@ -112,7 +112,7 @@ def test_an_interrupted_evaluation_has_what_was_reached(
         ("geometry", {}, None), ("geometry", {"model": "fisheye"}, "this one is fisheye"), ("retention", {"run": None}, None),
     ],
 )  # fmt: skip
-def test_protocols_that_cannot_be_measured(
+def test_unmeasurable_protocol_is_refused_if_requested_and_noted_otherwise(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, given: dict[str, Any], reason: str | None
 ) -> None:
     """They are refused if asked for, noted if usual, and passed over silently for a recording with one eye."""
@@ -133,7 +133,7 @@ def test_protocols_that_cannot_be_measured(
         assert any("it is not known whether" in note for note in made.notes) == (name == "heldout" and run is None)
 
 
-def test_learning_protocols_are_measured_only_if_asked_for(tmp_path: Path) -> None:
+def test_causal_and_retention_protocols_run_only_if_requested(tmp_path: Path) -> None:
     assert not work(tmp_path)._is_wanted("causal")
     assert not work(tmp_path, protocols=("retention",))._is_wanted("causal")
     assert work(tmp_path, protocols=("causal",))._is_wanted("causal")
@@ -142,7 +142,7 @@ def test_learning_protocols_are_measured_only_if_asked_for(tmp_path: Path) -> No
 
 @pytest.mark.parametrize(("device", "is_checked"), [("cpu", True), ("cuda", False)])
 @pytest.mark.parametrize("prior", [None, "learned"])
-def test_the_causal_protocol_learns_with_as_many_gaussians_as_the_run(
+def test_causal_protocol_uses_gaussian_count_of_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, device: str, is_checked: bool, prior: str | None
 ) -> None:
     made, checked, sizes = work(tmp_path, run_of(tmp_path), device=device, motion_prior=prior), [], []

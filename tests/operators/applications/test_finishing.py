@@ -51,7 +51,7 @@ def session(**fields):
         ([], 1, []),
     ],
 )
-def test_the_first_frames_are_read_each_time_from_the_beginning(given, count, frames):
+def test_first_frames_reopens_source_for_each_iteration(given, count, frames):
     source = Scripted(given)
     first = FirstFrames(source, count)
     assert list(first) == frames and list(first) == frames
@@ -60,7 +60,7 @@ def test_the_first_frames_are_read_each_time_from_the_beginning(given, count, fr
 
 @pytest.mark.parametrize("reached_its_own", [True, False])
 @pytest.mark.parametrize("has_fitted", [True, False])
-def test_the_newest_model_is_saved(tmp_path, monkeypatch, reached_its_own, has_fitted):
+def test_saves_model_prefers_trained_over_fitted_model(tmp_path, monkeypatch, reached_its_own, has_fitted):
     saved = []
     monkeypatch.setattr(session_module, "save_bundle", lambda model, folder: saved.append((model, folder)))
     run = session()
@@ -74,7 +74,7 @@ def test_the_newest_model_is_saved(tmp_path, monkeypatch, reached_its_own, has_f
     assert (None if result is None else result.model) == model
 
 
-def test_the_search_for_the_field_of_view_ends_at_a_stop_request(monkeypatch, frame):
+def test_field_of_view_search_ends_on_stop_request(monkeypatch, frame):
     monkeypatch.setattr(session_module, "seen_in_recording", lambda pictures: looked.extend(pictures))
     source = Scripted([frame(k) for k in range(12)])
     source.description.frame_count = 12

@@ -58,12 +58,12 @@ IMPOSSIBLE = [
 
 
 @pytest.mark.parametrize(("check", "given"), POSSIBLE)
-def test_values_up_to_the_border_are_taken(check, given):
+def test_limit_checks_accept_boundary_values(check, given):
     check(*given)
 
 
 @pytest.mark.parametrize(("check", "given", "said"), IMPOSSIBLE)
-def test_values_beyond_the_border_are_refused(check, given, said):
+def test_limit_checks_refuse_values_beyond_boundary(check, given, said):
     with pytest.raises(InvalidSetting, match=said):
         check(*given)
 
@@ -72,23 +72,23 @@ def test_values_beyond_the_border_are_refused(check, given, said):
     ("window_s", "fps", "frames"),
     [((0.0, 0.0), 25, 1), ((1.0, 2.0), 25, 26), ((0.0, 0.1), 30, 4), ((0.0, 0.999), 1, 1), ((0.0, 0.5), 1000, 501)],
 )
-def test_a_window_is_shown_from_end_to_end(window_s, fps, frames):
+def test_frames_to_render_includes_both_ends_of_window(window_s, fps, frames):
     assert limits.frames_to_render(window_s, fps) == frames
 
 
 @pytest.mark.parametrize("fps", [0, -1, 1000.5, math.inf, math.nan])
-def test_a_rate_out_of_range_is_refused(fps):
+def test_frames_to_render_refuses_fps_out_of_range(fps):
     with pytest.raises(InvalidSetting, match=r"it must be at least 0\.001 and at most 1000"):
         limits.frames_to_render((0.0, 1.0), fps)
 
 
-def test_too_many_frames_are_refused():
+def test_frames_to_render_refuses_more_than_a_million_frames():
     assert limits.frames_to_render((5.0, 1004.999), 1000) == 1_000_000
     with pytest.raises(InvalidSetting, match=r"from 5 to 1005 s is 1e\+06 frames at fps 1000; at most 1000000"):
         limits.frames_to_render((5.0, 1005.0), 1000)
 
 
-def test_the_memory_of_a_replay_is_the_sum_of_its_parts():
+def test_replay_bytes_sums_frames_gaussians_and_field():
     """Frames, Gaussians and the field: each of them counts, and only up to the window except offline."""
     size = {"width_px": 640, "height_px": 512}
     config = ReconstructorConfig(gaussians=10_000, max_gaussians=30_000, window_frames=60, motion_spacing_s=0.1)
@@ -111,5 +111,5 @@ def test_the_memory_of_a_replay_is_the_sum_of_its_parts():
     )
 
 
-def test_the_memory_of_a_render():
+def test_render_bytes_counts_pixels_and_gaussians():
     assert limits.render_bytes(640, 512, 1000) == 16 * 2**20 + 640 * 512 * 60 + 12_000

@@ -69,23 +69,23 @@ def watched(tmp_path, monkeypatch) -> Callable[..., Watched]:
     return run
 
 
-def everything_came(watch: Watched) -> None:
+def all_frames_arrived(watch: Watched) -> None:
     assert watch.part(SourceResult).frames == len(watch.script.frames)
     assert watch.part(SourceResult).reached_end
 
 
-def test_the_end_of_a_stream_is_no_loss_of_its_source(watched):
+def test_end_of_stream_does_not_show_source_lost_state(watched):
     script = Script()
     script.good(12)
     watch = watched(script)
-    everything_came(watch)
+    all_frames_arrived(watch)
     assert watch.part(LiveDisplayResult).states["live"] >= 1
     assert "source lost" not in watch.part(LiveDisplayResult).states
     assert all(picture.state is not PictureState.SOURCE_LOST for picture in watch.shown)
 
 
 @pytest.mark.slow
-def test_pictures_that_are_none(watched):
+def test_live_withholds_black_frozen_torn_and_damaged_frames(watched):
     """Black, duplicated, frozen, torn and damaged."""
     script = Script()
     script.good(20)
@@ -100,7 +100,7 @@ def test_pictures_that_are_none(watched):
     script.fault(*[{"status": FrameStatus.DAMAGED, "damage": "lost packets"}] * 3)
     after.append(script.good(15))
     watch = watched(script)
-    everything_came(watch)
+    all_frames_arrived(watch)
     found = watch.part(SequenceCounts).found
     assert (found["black"], found["torn"], found["duplicate"] + found["frozen"]) == (5, 1, 26)
     assert found["frozen"] >= 15 and watch.part(SourceResult).damaged == 3
@@ -116,7 +116,7 @@ def test_pictures_that_are_none(watched):
 
 
 @pytest.mark.slow
-def test_late_frames_and_a_clock_that_is_set(watched):
+def test_live_keeps_model_time_monotonic_on_late_frames_and_clock_jumps(watched):
     """Forwards by an hour, backwards by two: the model's time goes on as it did."""
     script = Script()
     script.good(20)
@@ -127,7 +127,7 @@ def test_late_frames_and_a_clock_that_is_set(watched):
     script.pts_ns -= 7200 * SECOND_NS
     after.append(script.good(25))
     watch = watched(script)
-    everything_came(watch)
+    all_frames_arrived(watch)
     found = watch.part(SequenceCounts).found
     # Before it is clear that the clock was set back, three frames look late.
     assert (found["out of order"], found["clock jump"]) == (5, 2)
@@ -141,7 +141,7 @@ def test_late_frames_and_a_clock_that_is_set(watched):
 
 
 @pytest.mark.slow
-def test_frames_that_a_sender_mixes_up(watched):
+def test_live_drops_duplicate_and_out_of_order_sequence_numbers(watched):
     """Numbers that come twice, late, or begin anew are put right or dropped where the frames come in."""
     script = Script()
     script.good(20)
@@ -161,7 +161,7 @@ def test_frames_that_a_sender_mixes_up(watched):
 
 
 @pytest.mark.slow
-def test_a_stream_that_changes_its_size_and_back(watched):
+def test_live_starts_new_scene_at_each_frame_size_change(watched):
     """Each size begins a new scene, also where its first pictures are black."""
     script = Script()
     script.good(20)
@@ -174,7 +174,7 @@ def test_a_stream_that_changes_its_size_and_back(watched):
             script.good(1, image=scope_picture(k, width, height))
         after.append(range(first, first + 20))
     watch = watched(script)
-    everything_came(watch)
+    all_frames_arrived(watch)
     assert watch.part(CutCounts).found["resized"] == 3
     assert watch.part(TrainingCounts).scenes == {"resized": 3}
     for frames in after:
@@ -185,7 +185,7 @@ def test_a_stream_that_changes_its_size_and_back(watched):
 
 
 @pytest.mark.slow
-def test_masks_and_depth_that_cannot_be(watched):
+def test_live_rejects_impossible_masks_and_unusable_depth(watched):
     """A mask that is all tool, for a moment and for a second; one that is all tissue at once; depth of NaN, infinity and nonsense."""
     tool = np.ones((HEIGHT, WIDTH), np.uint8)
     tool[:, : WIDTH // 4] = 0
@@ -204,7 +204,7 @@ def test_masks_and_depth_that_cannot_be(watched):
     hidden = script.fault(*[{"mask": np.zeros_like(tool)}] * 28)
     after.append(script.good(12))
     watch = watched(script)
-    everything_came(watch)
+    all_frames_arrived(watch)
     found = watch.part(MaskAndDepthCounts).found
     assert (found["no tissue"], found["tool mask lost"]) == (4 + 28, 4)
     assert found["depth not usable"] == 48 and found["depth repaired"] == 12
@@ -220,12 +220,12 @@ def test_masks_and_depth_that_cannot_be(watched):
 
 
 @pytest.mark.slow
-def test_a_source_that_is_gone_for_five_seconds(watched):
+def test_live_shows_source_lost_during_five_second_gap_and_recovers(watched):
     script = Script()
     script.good(20)
     after = script.good(25, pause_s=5.0)
     watch = watched(script)
-    everything_came(watch)
+    all_frames_arrived(watch)
     source, states = watch.part(SourceResult), watch.part(LiveDisplayResult).states
     assert source.state_s["stalled"] > 4 and source.counts["stalls"] == 1
     assert states["live"] >= 2 and states["source lost"] == 1, "the end of the script is none"
@@ -243,7 +243,7 @@ def test_a_source_that_is_gone_for_five_seconds(watched):
 
 
 @pytest.mark.slow
-def test_behind_the_gate_that_keeps_the_outside_of_the_body_away(watched):
+def test_live_neither_trains_on_nor_shows_out_of_body_frames(watched):
     """No out-of-body picture is trained on or shown, and the stream is trusted again after ten frames from inside."""
     room = np.full((HEIGHT, WIDTH, 3), (90, 140, 200), np.uint8) + np.arange(WIDTH, dtype=np.uint8)[:, None] // 2
     script = Script()
@@ -252,7 +252,7 @@ def test_behind_the_gate_that_keeps_the_outside_of_the_body_away(watched):
     script.fault(*[{}] * 9)
     after = script.good(25)
     watch = watched(script, out_of_body="withhold")
-    everything_came(watch)
+    all_frames_arrived(watch)
     gate = watch.part(OutOfBodyFrames)
     assert sum(gate.withheld.values()) >= 15 and gate.passed >= 20
     assert watch.part(TrainingCounts).withheld["out of body"] >= 1
@@ -265,7 +265,7 @@ def test_behind_the_gate_that_keeps_the_outside_of_the_body_away(watched):
 
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.slow
-def test_faults_one_upon_the_other(watched, seed):
+def test_live_recovers_from_random_mixture_of_faults(watched, seed):
     """Any mixture, from the first frame on."""
     rng = np.random.default_rng(seed)
     script = Script(mask=lambda seq: None, depth=lambda seq: None)
@@ -287,12 +287,12 @@ def test_faults_one_upon_the_other(watched, seed):
         script.good(int(rng.integers(0, 3)))
     after = script.good(40)
     watch = watched(script)
-    everything_came(watch)
+    all_frames_arrived(watch)
     watch.recovers_in(after)
     watch.learned_nothing_bad()
 
 
-def test_a_run_without_a_log_scores_its_pictures_all_the_same(watched):
+def test_live_run_without_log_still_scores_pictures(watched):
     script = Script()
     script.good(15)
     watch = watched(script, report=False)

@@ -45,7 +45,7 @@ def log(tmp_path):
     return write
 
 
-def test_frames_and_the_pictures_that_were_on_the_screen(log):
+def test_read_live_log_scores_frames_against_pictures_on_screen(log):
     entries = []
     path = log(line(0), line(1, 20.0, shown_seq=0), line(2, 40.0, after_ms=30, state="stale"), line(3, 90.0))
     assert is_live_log(path)
@@ -61,22 +61,22 @@ def test_frames_and_the_pictures_that_were_on_the_screen(log):
     assert [entry["behind"] for entry in entries] == [0, 1, 0]
 
 
-def test_what_has_no_figure_is_counted_by_reason(log):
+def test_live_log_counts_unscored_frames_by_reason(log):
     found = read_live_log(log(line(0), line(1, None, withheld="blur"), line(2, None), line(7), line(8)))
     assert found.score.left_out == {NO_FIGURE: 1, NOT_SCORED: 4, "withheld": 1} and found.score.frames == 2
 
 
-def test_frames_before_the_first_picture_are_counted(log):
+def test_live_log_counts_frames_before_first_picture(log):
     found = read_live_log(log(line(4), line(5)))
     assert found.score.left_out == {NOTHING_SHOWN: 4} and found.score.frames == 1
 
 
-def test_the_first_second_is_left_out_of_the_settled_figures(log):
+def test_live_log_settled_figures_exclude_first_second(log):
     found = read_live_log(log(*(line(k, 10.0 if k < 25 else 30.0) for k in range(51))))
     assert (found.settled.frames, found.settled.worst_db) == (25, 30.0)
 
 
-def test_the_log_of_a_replay_is_not_one_of_a_live_run(log, tmp_path):
+def test_is_live_log_rejects_replay_log_and_missing_file(log, tmp_path):
     assert not is_live_log(log({"seq": 0, "time_s": 0.0, "psnr_tissue_db": 30.0}))
     assert not is_live_log(tmp_path / "missing.jsonl") and not is_live_log(log())
 
@@ -98,12 +98,12 @@ def test_the_log_of_a_replay_is_not_one_of_a_live_run(log, tmp_path):
         "[" * 100_000,
     ],
 )
-def test_a_log_that_was_changed_is_one_sentence(log, bad):
+def test_read_live_log_refuses_invalid_line_with_file_name(log, bad):
     with pytest.raises(InvalidSetting, match=r"frames\.jsonl"):
         read_live_log(log(line(0), bad, line(9)))
 
 
-def test_a_last_line_that_was_cut_off_is_left_out(log):
+def test_read_live_log_ignores_truncated_last_line(log):
     path = log(line(0), line(1))
     path.write_bytes(path.read_bytes() + b'{"seq": 2, "ti')
     assert read_live_log(path).score.frames == 1

@@ -16,7 +16,7 @@ def chosen(device: str, **asked: object) -> ClockSettings:
 
 
 @pytest.mark.parametrize("device", ["cpu", "cuda"])
-def test_everything_that_suits_a_device_is_chosen(device: str) -> None:
+def test_clock_defaults_are_set_for_each_device(device: str) -> None:
     clock = chosen(device)
     assert None not in (
         clock.auto_share, clock.auto_most_ms, clock.at_least_steps, clock.fewest_steps, clock.first_at_least_steps,
@@ -25,24 +25,24 @@ def test_everything_that_suits_a_device_is_chosen(device: str) -> None:
 
 
 @pytest.mark.parametrize("device", ["cpu", "cuda"])
-def test_what_was_asked_for_wins(device: str) -> None:
+def test_explicit_clock_settings_override_device_defaults(device: str) -> None:
     asked = {"auto_share": 0.5, "auto_most_ms": 7.0, "at_least_steps": 3, "fewest_steps": 2, "catch_up_intervals": 1.5}
     clock = chosen(device, **asked, first_at_least_steps=9)
     assert {name: getattr(clock, name) for name in asked} == asked
     assert clock.first_at_least_steps == 9
 
 
-def test_fewer_steps_asked_for_than_usual_hold_for_frames_that_others_wait_behind_as_well() -> None:
+def test_fewest_steps_is_limited_by_requested_at_least_steps() -> None:
     assert chosen("cuda", at_least_steps=2).fewest_steps == 2
 
 
-def test_a_cpu_keeps_frames_waiting_for_less_long_and_uses_more_of_their_time() -> None:
+def test_cpu_default_has_shorter_queue_and_larger_training_share_than_cuda() -> None:
     cpu, cuda = chosen("cpu"), chosen("cuda")
     assert (cpu.catch_up_intervals or 0) < (cuda.catch_up_intervals or 0)
     assert (cpu.auto_share or 0) > (cuda.auto_share or 0)
 
 
-def test_a_gpu_limits_the_time_guaranteed_for_training_and_a_cpu_does_not() -> None:
+def test_least_most_ms_defaults_to_13_on_cuda_and_none_on_cpu() -> None:
     assert (chosen("cpu").least_most_ms, chosen("cuda").least_most_ms) == (None, 13.0)
     assert (chosen("cpu", least_most_ms=9.0).least_most_ms, chosen("cuda", least_most_ms=9.0).least_most_ms) == (
         9.0,
@@ -58,6 +58,6 @@ def test_a_gpu_limits_the_time_guaranteed_for_training_and_a_cpu_does_not() -> N
         ("cuda", 1920 * 1080, 100_000), ("cpu", 100, 64), ("cuda", 100, 64),
     ],
 )  # fmt: skip
-def test_large_pictures_get_more_gaussians_on_a_gpu_and_small_ones_fewer_on_both(device, pixels, gaussians) -> None:
+def test_default_gaussian_count_by_device_and_picture_size(device, pixels, gaussians) -> None:
     config = LiveSettings("source", Path("out"), device=device).reconstructor_config(pixels)
     assert (config.gaussians, config.max_gaussians) == (gaussians, 2 * gaussians)

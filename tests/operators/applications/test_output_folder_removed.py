@@ -20,7 +20,7 @@ def recording(tmp_path_factory):
 
 @pytest.mark.parametrize("frame", [1, 3])
 @pytest.mark.parametrize("what", ["the folder", "the folder of the run", "the folder around it"])
-def test_it_ends_with_one_sentence(recording, tmp_path, caplog, what, frame):
+def test_replay_reports_output_folder_deleted_during_run_without_traceback(recording, tmp_path, caplog, what, frame):
     out = tmp_path / "around" / "out"
 
     def remove(progress):

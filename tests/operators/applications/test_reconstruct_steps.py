@@ -23,7 +23,7 @@ def settings(tmp_path):
     return ReconstructSettings(recording=folder, out=tmp_path / "out", sinks=(), minutes=1.0)
 
 
-def test_the_chosen_steps_and_their_reason_are_reported(settings, monkeypatch):
+def test_report_has_step_trials_and_reason_of_choice(settings, monkeypatch):
     monkeypatch.setattr(offline, "FIRST_STEPS", 2)
     monkeypatch.setattr(offline, "MOST_STEPS", 4)
     reconstruct(settings, clock=lambda: 0.0, report=write_reports)
@@ -33,7 +33,7 @@ def test_the_chosen_steps_and_their_reason_are_reported(settings, monkeypatch):
     assert run["steps"] in (2, 4) and run["reason"] in ("best", "most")
 
 
-def test_the_time_limit_ends_the_search(settings, monkeypatch):
+def test_time_limit_ends_step_search(settings, monkeypatch):
     monkeypatch.setattr(offline, "FIRST_STEPS", 2)
     seconds = iter(range(0, 10_000, 25))
     trained = set()

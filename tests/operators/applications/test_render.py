@@ -27,14 +27,14 @@ def bundle(model, tmp_path):
     return tmp_path / "model"
 
 
-def test_the_time_window_is_covered_from_end_to_end(bundle, tmp_path):
+def test_render_model_covers_whole_time_window(bundle, tmp_path):
     events = []
     assert render_model(bundle, tmp_path / "images", fps=4, progress=events.append) == 5, "0, 0.25, 0.5, 0.75 and 1 s"
     assert len(list((tmp_path / "images").glob("*.png"))) == 5
     assert [event.done for event in events] == [1, 2, 3, 4, 5]
 
 
-def test_a_stop_leaves_whole_frames(bundle, tmp_path):
+def test_render_model_keeps_complete_frames_on_stop_request(bundle, tmp_path):
     shown = []
     written = render_model(
         bundle, tmp_path / "v.mp4", fps=10, progress=shown.append, stop_requested=lambda: len(shown) == 3
@@ -42,7 +42,7 @@ def test_a_stop_leaves_whole_frames(bundle, tmp_path):
     assert written == 3 and (tmp_path / "v.mp4").stat().st_size > 0
 
 
-def test_outputs_are_side_by_side(bundle, model, tmp_path):
+def test_render_model_places_outputs_side_by_side(bundle, model, tmp_path):
     camera = model().camera
     render_model(bundle, tmp_path / "images", fps=1, outputs=("image", "normals", "ray_depth"))
     shown = cv2.imread(str(tmp_path / "images" / "000000.png"))
@@ -60,14 +60,14 @@ def test_outputs_are_side_by_side(bundle, model, tmp_path):
         ({"outputs": ("semantics",)}, "train with --losses semantics"),
     ],
 )
-def test_outputs_that_cannot_be_shown_are_refused(bundle, tmp_path, wanted, message):
+def test_render_model_refuses_unavailable_outputs(bundle, tmp_path, wanted, message):
     with pytest.raises(InvalidSetting, match=message):
         render_model(bundle, tmp_path / "images", **wanted)
     assert not (tmp_path / "images").exists()
 
 
 @pytest.mark.cuda
-def test_a_gpu_renders_the_same_pictures(gpu, bundle, tmp_path):
+def test_render_model_on_cuda_matches_cpu(gpu, bundle, tmp_path):
     for device in ("cpu", "cuda"):
         assert render_model(bundle, tmp_path / device, fps=4, device=device) == 5
     for name in (path.name for path in (tmp_path / "cpu").glob("*.png")):
@@ -75,7 +75,7 @@ def test_a_gpu_renders_the_same_pictures(gpu, bundle, tmp_path):
         assert np.abs(seen - expected).max() <= 1
 
 
-def test_a_device_that_is_not_there_is_refused_before_anything_is_written(bundle, tmp_path, monkeypatch):
+def test_render_model_refuses_missing_device_before_output(bundle, tmp_path, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(DeviceMissing, match="finds no GPU"):
         render_model(bundle, tmp_path / "images", device="cuda")
@@ -83,12 +83,12 @@ def test_a_device_that_is_not_there_is_refused_before_anything_is_written(bundle
 
 
 @pytest.mark.parametrize("fps", [0, -1, math.nan, math.inf, 1e6])
-def test_a_rate_that_makes_no_sense_is_refused(bundle, tmp_path, fps):
+def test_render_model_refuses_invalid_fps(bundle, tmp_path, fps):
     with pytest.raises(InvalidSetting, match="fps is"):
         render_model(bundle, tmp_path / "v.mp4", fps=fps)
 
 
-def test_nothing_is_written_where_it_does_not_belong(bundle, tmp_path):
+def test_render_model_refuses_invalid_output_paths(bundle, tmp_path):
     with pytest.raises(OutputError, match="there is no folder"):
         render_model(bundle, tmp_path / "missing" / "v.mp4")
     with pytest.raises(OutputError, match="lies inside --out"):
@@ -105,7 +105,7 @@ def test_nothing_is_written_where_it_does_not_belong(bundle, tmp_path):
     assert not (tmp_path / "v.AVI").exists()
 
 
-def test_an_unknown_renderer_is_refused_before_the_model_is_read(tmp_path):
+def test_render_refuses_unknown_renderer_before_reading_model(tmp_path):
     with pytest.raises(InvalidSetting, match="sculptor"):
         render_model(tmp_path / "missing", tmp_path / "images", renderer="sculptor")
     assert not (tmp_path / "images").exists()
@@ -113,7 +113,7 @@ def test_an_unknown_renderer_is_refused_before_the_model_is_read(tmp_path):
         render_picture(tmp_path / "missing", renderer="sculptor")
 
 
-def test_an_option_that_a_renderer_does_not_have_is_refused_before_the_model_is_read(tmp_path):
+def test_render_refuses_unsupported_renderer_option_before_reading_model(tmp_path):
     with pytest.raises(InvalidSetting, match="'alpha' has no option samples; choose stochastic or points"):
         render_model(tmp_path / "none", tmp_path / "out", options=RendererOptions(samples=4))
     assert not (tmp_path / "out").exists()
@@ -133,7 +133,7 @@ def frames_of(path):
     return frames
 
 
-def test_after_an_error_the_pictures_so_far_are_kept_where_no_video_was(tmp_path):
+def test_write_video_keeps_partial_video_after_error(tmp_path):
     out = tmp_path / "view.mp4"
     with pytest.raises(OutputError, match="no space is left"):
         write_video(pictures_until_an_error(3), out, (64, 48), 30.0, overwrite=False)
@@ -141,7 +141,7 @@ def test_after_an_error_the_pictures_so_far_are_kept_where_no_video_was(tmp_path
     assert [path.name for path in tmp_path.iterdir()] == ["view.mp4"]
 
 
-def test_after_an_error_an_earlier_video_is_kept(tmp_path):
+def test_write_video_keeps_earlier_video_after_error(tmp_path):
     out = tmp_path / "view.mp4"
     out.write_bytes(b"earlier")
     with pytest.raises(OutputError, match="no space is left"):
@@ -150,7 +150,7 @@ def test_after_an_error_an_earlier_video_is_kept(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["view.mp4"]
 
 
-def test_a_video_that_cannot_be_finished_is_not_left(tmp_path):
+def test_write_video_removes_video_that_cannot_be_finished(tmp_path):
     """The encoder holds back the frames until the end, which exceeds the largest size of a file."""
     script = (
         "import resource, sys, pathlib, numpy as np\n"
@@ -164,7 +164,7 @@ def test_a_video_that_cannot_be_finished_is_not_left(tmp_path):
 
 
 @pytest.mark.parametrize("was_there", [False, True])
-def test_an_error_before_the_first_picture_leaves_no_video(tmp_path, was_there):
+def test_write_video_error_before_first_picture_creates_no_video(tmp_path, was_there):
     out = tmp_path / "view.mp4"
     if was_there:
         out.write_bytes(b"earlier")
@@ -173,7 +173,7 @@ def test_an_error_before_the_first_picture_leaves_no_video(tmp_path, was_there):
     assert out.exists() == was_there
 
 
-def test_the_depth_of_a_very_large_scene_is_the_median_of_what_is_before_the_camera(model, monkeypatch):
+def test_typical_depth_of_large_scene_is_median_of_sampled_visible_gaussians(model, monkeypatch):
     """A scene with three times `MOST_PICTURED` Gaussians is measured by every third one."""
     scene = replace(model(), field=None)
     count = scene.gaussians.count
@@ -194,7 +194,7 @@ def test_the_depth_of_a_very_large_scene_is_the_median_of_what_is_before_the_cam
 @pytest.mark.parametrize(
     ("digest", "own", "is_refused"), [("a", "a", True), ("a", "b", False), ("a", None, False), (None, "a", False)]
 )
-def test_the_recording_that_a_model_was_trained_on_is_not_replaced(tmp_path, monkeypatch, digest, own, is_refused):
+def test_render_refuses_to_overwrite_training_recording(tmp_path, monkeypatch, digest, own, is_refused):
     def opened(path):
         if digest is None:
             raise RecordingError("no recording")

@@ -55,7 +55,7 @@ def settings(tiny, tmp_path):
     return ReplaySettings(recording=tiny, out=tmp_path / "out", steps_per_frame=1)
 
 
-def test_progress_tells_each_displayed_frame(settings):
+def test_replay_reports_progress_for_each_displayed_frame(settings):
     events = []
     outcome = replay(settings, events.append)
     assert [(e.stage, e.done, e.total) for e in events] == [("replay", k, 4) for k in (0, 1, 2, 3, 4)]
@@ -65,12 +65,12 @@ def test_progress_tells_each_displayed_frame(settings):
     assert model(outcome).version == 4
 
 
-def test_each_frame_is_shown_with_the_model_that_has_just_seen_it(settings):
+def test_replay_shows_each_frame_with_model_trained_on_that_frame(settings):
     outcome = replay(settings)
     assert [entry["model_version"] for entry in series(outcome)] == [1, 2, 3, 4]
 
 
-def test_a_stop_request_ends_cleanly(settings):
+def test_replay_writes_outputs_on_stop_request(settings):
     shown = []
     outcome = replay(settings, shown.append, stop_requested=lambda: len(shown) > 2)
     assert outcome.interrupted and outcome.stop_reason == "interrupted"
@@ -78,7 +78,7 @@ def test_a_stop_request_ends_cleanly(settings):
     assert set(outcome.outputs) == {"video", "model", "frames"}
 
 
-def test_a_stop_request_ends_the_training_of_the_first_frame(settings, monkeypatch):
+def test_stop_request_ends_training_of_first_frame(settings, monkeypatch):
     made = []
     make_step = TrainingStep.__call__
     monkeypatch.setattr(TrainingStep, "__call__", lambda *args: (made.append(1), make_step(*args))[1])
@@ -87,7 +87,7 @@ def test_a_stop_request_ends_the_training_of_the_first_frame(settings, monkeypat
     assert set(outcome.outputs) == {"video", "model", "frames"}
 
 
-def test_a_failure_carries_what_was_reached(settings):
+def test_replay_failure_carries_partial_outcome(settings):
     def fail_on_the_third(progress):
         if progress.done == 3:
             raise StorageFull("no room for progress")
@@ -100,7 +100,7 @@ def test_a_failure_carries_what_was_reached(settings):
     assert (settings.out / "reconstruction.mp4").exists() and (settings.out / "model").is_dir()
 
 
-def test_threads_give_the_same_bytes_as_one(settings, monkeypatch):
+def test_replay_with_threads_matches_single_thread_byte_for_byte(settings, monkeypatch):
     expected = replay(settings)
     monkeypatch.setattr(pipeline_module, "scheduler_for", lambda device, app: MultiThreadScheduler(app))
     events = []
@@ -115,7 +115,7 @@ def test_threads_give_the_same_bytes_as_one(settings, monkeypatch):
     assert [k.rendered.frame.seq for k in kept.keyframes] == [k.rendered.frame.seq for k in wanted.keyframes]
 
 
-def test_with_threads_a_failure_still_carries_what_was_reached(settings, monkeypatch):
+def test_replay_failure_with_threads_carries_partial_outcome(settings, monkeypatch):
     monkeypatch.setattr(pipeline_module, "scheduler_for", lambda device, app: MultiThreadScheduler(app))
 
     def fail_on_the_second(progress):
@@ -130,7 +130,7 @@ def test_with_threads_a_failure_still_carries_what_was_reached(settings, monkeyp
 
 
 @pytest.mark.cuda
-def test_a_gpu_gives_the_same_bytes_twice_and_what_the_cpu_sees(gpu, settings):
+def test_replay_on_cuda_is_deterministic_and_close_to_cpu(gpu, settings):
     on_cpu = replay(settings)
     first, second = (replay(replace(settings, device="cuda", out=settings.out / name)) for name in "ab")
     assert sha256(first) == sha256(second)
@@ -142,7 +142,7 @@ def test_a_gpu_gives_the_same_bytes_twice_and_what_the_cpu_sees(gpu, settings):
     assert first.find(QualityResult).trained.means()["psnr_tissue_db"] == pytest.approx(expected, abs=0.3)
 
 
-def test_the_callers_random_numbers_are_untouched(settings):
+def test_replay_keeps_global_random_state(settings):
     torch.manual_seed(5)
     expected = torch.rand(3)
     torch.manual_seed(5)
@@ -150,7 +150,7 @@ def test_the_callers_random_numbers_are_untouched(settings):
     torch.testing.assert_close(torch.rand(3), expected, rtol=0, atol=0)
 
 
-def test_what_is_wrong_is_said_before_anything_is_written(tiny, tmp_path, monkeypatch):
+def test_replay_refuses_invalid_settings_before_output(tiny, tmp_path, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     out = tmp_path / "out"
     for error, settings in (
@@ -167,13 +167,13 @@ def test_what_is_wrong_is_said_before_anything_is_written(tiny, tmp_path, monkey
     assert not out.exists()
 
 
-def test_a_small_frame_gets_no_more_gaussians_than_it_can_show(tiny, tmp_path):
+def test_gaussian_count_is_limited_by_frame_size(tiny, tmp_path):
     settings = ReplaySettings(tiny, tmp_path / "out")
     assert settings.reconstructor_config(64 * 48).gaussians == 64 * 48 // 4
     assert settings.reconstructor_config(640 * 512).gaussians == settings.reconstructor_config().gaussians
 
 
-def test_offline_a_small_frame_gets_no_more_gaussians_than_it_can_show(tiny, tmp_path):
+def test_offline_gaussian_count_is_limited_by_frame_size(tiny, tmp_path):
     settings = ReplaySettings(tiny, tmp_path / "out", field="hexplane")
     small = settings.reconstructor_config(64 * 48, offline=True)
     assert (small.gaussians, small.max_gaussians) == (64 * 48 // 4, 64 * 48 // 2)
@@ -181,18 +181,18 @@ def test_offline_a_small_frame_gets_no_more_gaussians_than_it_can_show(tiny, tmp
 
 
 @pytest.mark.parametrize(("asked", "trained"), [(None, "left"), ("left", "left"), ("both", "both")])
-def test_the_displayed_eye_is_trained_on_unless_both_are_asked_for(tiny, tmp_path, asked, trained):
+def test_eyes_setting_defaults_to_left_eye(tiny, tmp_path, asked, trained):
     settings = ReplaySettings(tiny, tmp_path / "out", eyes=asked)
     assert settings.reconstructor_config().eyes == trained
     assert settings.reconstructor_config(offline=True).eyes == trained
 
 
-def test_a_third_eye_is_refused(tiny, tmp_path):
+def test_eyes_setting_refuses_unknown_value(tiny, tmp_path):
     with pytest.raises(InvalidSetting, match="eyes is 'right'"):
         ReplaySettings(tiny, tmp_path / "out", eyes="right")
 
 
-def test_the_next_frame_is_predicted_as_the_causal_protocol_does(settings):
+def test_next_frame_score_matches_causal_protocol(settings):
     """Compare with the causal protocol, which renders through a separate path."""
     from gsplat_core.evaluation.protocols import PictureMaker, evaluate_causal
     from gsplat_core.io.recordings import open_recording
@@ -217,14 +217,14 @@ def test_the_next_frame_is_predicted_as_the_causal_protocol_does(settings):
     assert sum(trained_db) > sum(predicted_db[1:]), "three steps on a frame make its picture better than its prediction"
 
 
-def test_progress_has_the_previous_frame_beside_the_training_error(settings):
+def test_progress_includes_previous_frame_score(settings):
     events = []
     replay(settings, events.append)
     assert [event.previous_frame_db is None for event in events] == [True, True, False, False, False]
     assert all(event.trained for event in events)
 
 
-def test_progress_of_a_withheld_frame_has_no_score(tiny, tmp_path):
+def test_progress_has_no_score_for_withheld_frame(tiny, tmp_path):
     folder = tmp_path / "images"
     folder.mkdir()
     for frame in open_recording(tiny):
@@ -235,7 +235,7 @@ def test_progress_of_a_withheld_frame_has_no_score(tiny, tmp_path):
     assert [event.psnr_tissue_db is None for event in events] == [True, False, False, False, True]
 
 
-def test_a_black_picture_is_withheld_as_in_a_live_stream(tiny, tmp_path):
+def test_replay_withholds_black_picture(tiny, tmp_path):
     folder = tmp_path / "images"
     folder.mkdir()
     for frame in open_recording(tiny):
@@ -252,9 +252,7 @@ def test_a_black_picture_is_withheld_as_in_a_live_stream(tiny, tmp_path):
     ("model", "poses", "refused"),
     [("fisheye", "estimated", True), ("fisheye", "auto", False), ("fisheye", "given", False), ("pinhole", "estimated", False)],
 )  # fmt: skip
-def test_poses_that_cannot_be_estimated_are_refused_before_the_first_frame(
-    settings, monkeypatch, model, poses, refused
-):
+def test_prepare_refuses_estimated_poses_for_fisheye_camera(settings, monkeypatch, model, poses, refused):
     source = replay_module.open_source(settings.recording)
     about = source.description
     camera = Camera(about.camera.K, about.width_px, about.height_px, model=model)
@@ -271,7 +269,7 @@ def test_poses_that_cannot_be_estimated_are_refused_before_the_first_frame(
 
 @pytest.mark.parametrize("device", ["cpu", "cuda"])
 @pytest.mark.parametrize("offline", [False, True])
-def test_all_checks_are_made_before_the_first_frame(tmp_path, monkeypatch, device, offline):
+def test_prepare_runs_all_checks_before_first_frame(tmp_path, monkeypatch, device, offline):
     made = []
     description = SimpleNamespace(
         name="clip", frame_count=9, width_px=80, height_px=60, fields={"depth"}, camera="camera", notes=("a note",)

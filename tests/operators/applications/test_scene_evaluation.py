@@ -68,9 +68,7 @@ class Run:
 
 
 @pytest.mark.parametrize("device", ["cpu", "cuda"])
-def test_each_size_has_one_renderer_and_its_memory_is_checked_on_the_host(
-    monkeypatch: pytest.MonkeyPatch, device: str
-) -> None:
+def test_scene_evaluation_creates_one_renderer_per_image_size(monkeypatch: pytest.MonkeyPatch, device: str) -> None:
     run = Run(monkeypatch, device)
     run.evaluated()
     assert run.renderers == ["0.png", "16.png"]
@@ -79,9 +77,7 @@ def test_each_size_has_one_renderer_and_its_memory_is_checked_on_the_host(
     assert run.events == [(1, 3), (2, 3), (3, 3)]
 
 
-def test_scores_are_means_over_the_images_and_the_worst_is_named(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_scene_evaluation_reports_mean_scores_and_worst_image(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     found = Run(monkeypatch, "cpu").evaluated(tmp_path)
     expected = [-20 * np.log10(abs(level - 128 / 255)) for level in LEVELS.values()]
     assert [each.psnr_db for each in found.images] == pytest.approx(expected, abs=0.01)
@@ -93,7 +89,7 @@ def test_scores_are_means_over_the_images_and_the_worst_is_named(
     assert sorted(path.name for path in tmp_path.glob("*.png")) == ["0000.png", "0001.png", "0002.png"]
 
 
-def test_an_interrupted_evaluation_scores_what_was_reached(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interrupted_scene_evaluation_scores_finished_images(monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(Run(monkeypatch, "cpu").evaluated(stops_after=2).images) == 2
     with pytest.raises(InvalidSetting, match="before its first image"):
         Run(monkeypatch, "cpu").evaluated(stops_after=0)

@@ -71,7 +71,7 @@ def graph(recording):
     return Graph(RecordingSource(recording))
 
 
-def test_operators_and_the_graph_contribute_their_parts(graph):
+def test_session_outcome_combines_parts_of_operators_and_graph(graph):
     outcome = Session(graph, SETTINGS, command="count", notes=["first"]).execute()
     assert outcome.find(Counted) == Counted(5) and outcome.find(Named) == Named("counting")
     assert outcome.notes == ("first", "5 counted")
@@ -80,7 +80,7 @@ def test_operators_and_the_graph_contribute_their_parts(graph):
     assert outcome.operators["count"].count == 5 and set(outcome.latency) == {"source,count"}
 
 
-def test_the_four_steps_are_those_of_execute(graph):
+def test_session_start_run_end_outcome_equal_execute(graph):
     session = Session(graph, SETTINGS, command="count")
     session.start()
     session.run()
@@ -89,7 +89,7 @@ def test_the_four_steps_are_those_of_execute(graph):
     assert session.outcome().find(Counted) == Counted(5)
 
 
-def test_parts_in_conflict_refuse_the_run_before_any_operator_starts(recording):
+def test_session_refuses_conflicting_outcome_parts_before_start(recording):
     CountOp.started = 0
     session = Session(Graph(RecordingSource(recording), ["one", "two"]), SETTINGS, command="count")
     with pytest.raises(RunFailed, match="two operators of one run contribute a Counted") as caught:
@@ -97,7 +97,7 @@ def test_parts_in_conflict_refuse_the_run_before_any_operator_starts(recording):
     assert isinstance(caught.value.__cause__, InvalidInput) and CountOp.started == 0
 
 
-def test_a_failure_leaves_what_was_reached_and_every_other_part_is_done(recording):
+def test_session_failure_keeps_partial_outcome_and_runs_other_finishers(recording):
     done = []
 
     def fails(session):
@@ -121,7 +121,7 @@ def test_a_failure_leaves_what_was_reached_and_every_other_part_is_done(recordin
     assert outcome.notes == (outcome.stop_reason, "no room for this either", "3 counted")
 
 
-def test_an_error_that_is_a_bug_is_not_kept_for_the_end(graph):
+def test_session_raises_programming_error_immediately(graph):
     def broken(session):
         raise ZeroDivisionError
 
@@ -129,7 +129,7 @@ def test_an_error_that_is_a_bug_is_not_kept_for_the_end(graph):
         Session(graph, SETTINGS, command="count", finish=[broken]).execute()
 
 
-def test_a_contribution_that_fails_does_not_hide_the_others(recording):
+def test_failing_contribution_keeps_other_contributions(recording):
     class Unreadable(Graph):
         over = False
 
@@ -146,7 +146,7 @@ def test_a_contribution_that_fails_does_not_hide_the_others(recording):
     assert str(session.failure) == "cannot be read back" and session.outcome().find(Counted) == Counted(5)
 
 
-def test_a_stop_is_an_interruption_only_before_the_source_has_ended(recording):
+def test_stop_request_after_end_of_source_is_not_interruption(recording):
     graph = Graph(RecordingSource(recording))
     outcome = Session(graph, SETTINGS, command="count", stop_requested=lambda: True).execute()
     assert not outcome.interrupted, "the source was not asked to stop, and ended by itself"

@@ -129,7 +129,7 @@ def replayed(folder: Path, **settings) -> RunOutcome:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("change", [as_it_is, eventful])
-def test_every_picture_comes_out_again(tmp_path, change):
+def test_session_replay_reproduces_shown_pictures_byte_for_byte(tmp_path, change):
     live = record(tmp_path, change)
     recorded = live.find(RecordingResult)
     assert recorded is not None and recorded.recorded.lost == {}
@@ -161,7 +161,7 @@ def depth_found(monkeypatch):
 
 
 @pytest.mark.slow
-def test_depth_that_was_found_beside_the_stream_is_given_again(tmp_path, depth_found):
+def test_session_replay_reproduces_late_depth(tmp_path, depth_found):
     live = record(tmp_path, of_two_eyes, waits_for=depth_found)
     found, taken = live.find(FoundDepth), live.find(TakenDepth)
     assert found.frames.get("stereo", 0) >= taken.frames >= 2 and found.metric
@@ -175,7 +175,7 @@ def test_depth_that_was_found_beside_the_stream_is_given_again(tmp_path, depth_f
 
 
 @pytest.mark.slow
-def test_without_the_late_depth_the_pictures_are_others(tmp_path, depth_found):
+def test_session_replay_without_one_late_depth_differs_and_notes_frame(tmp_path, depth_found):
     """The comparison can fail: without one of the depths it does, and the replay says which is not there."""
     assert record(tmp_path, of_two_eyes, waits_for=depth_found).find(TakenDepth).frames >= 2
     log = next((tmp_path / "session/segments").glob("*/log.jsonl"))
@@ -197,7 +197,7 @@ def leaving_the_body(frame: Frame) -> Frame:
 
 
 @pytest.mark.slow
-def test_what_the_out_of_body_gate_holds_back_is_not_recorded(tmp_path):
+def test_session_recording_contains_no_out_of_body_pixels(tmp_path):
     record(tmp_path, leaving_the_body)
     reader = SessionReader(tmp_path / "session")
     frames = [frame for _, frame in reader.frames()] + list(reader.prepared())
@@ -212,7 +212,7 @@ def test_what_the_out_of_body_gate_holds_back_is_not_recorded(tmp_path):
 
 
 @pytest.mark.slow
-def test_without_the_schedule_the_pictures_are_others(session):
+def test_session_replay_with_ignore_schedule_differs(session):
     with_it, without = replayed(session), replayed(session, ignore_schedule=True)
     digests = [outcome.find(QualityResult).frames_sha256 for outcome in (with_it, without)]
     assert digests[0] != digests[1]
@@ -220,7 +220,7 @@ def test_without_the_schedule_the_pictures_are_others(session):
 
 
 @pytest.mark.slow
-def test_another_call_gives_other_pictures(session):
+def test_session_replay_with_changed_schedule_reports_first_different_frame(session):
     """The comparison can fail: one step more in one call, and it does."""
     logs = sorted((session / "session/segments").glob("*/log.jsonl"))
     log = next(path for path in logs if '"event":"observe"' in path.read_text())
@@ -233,7 +233,7 @@ def test_another_call_gives_other_pictures(session):
     assert any(f"the first of frame {comparison.first_different}" in note for note in outcome.notes)
 
 
-def test_a_cut_session_gives_the_same_pictures_up_to_there(session):
+def test_truncated_session_replays_identically_up_to_cut(session):
     segments = sorted((session / "session/segments").iterdir())
     (image,) = segments[1].glob("image_*.mkv")
     before = [line.seq for line in SessionReader(session / "session").frame_lines()]
@@ -250,27 +250,27 @@ def test_a_cut_session_gives_the_same_pictures_up_to_there(session):
 
 @pytest.mark.parametrize("options", [{"scale": 0.5}, {"heldout": True}, {"steps_per_frame": 3}])
 @pytest.mark.slow
-def test_what_the_session_did_not_have_is_replayed_like_any_recording(session, options):
+def test_session_replay_with_other_options_does_not_follow_schedule(session, options):
     outcome = replayed(session, **options)
     assert outcome.find(ShownComparison) is None
     assert any("schedule is not followed" in note for note in outcome.notes)
     assert outcome.find(QualityResult).frames == FRAMES
 
 
-def test_a_session_whose_beginning_was_removed_is_replayed_like_any_recording(session):
+def test_session_replay_without_first_segment_does_not_follow_schedule(session):
     shutil.rmtree(session / "session/segments/000000")
     outcome = replayed(session)
     assert any("schedule is not followed" in note for note in outcome.notes)
 
 
-def test_settings_of_another_version_are_refused_with_a_sentence(session):
+def test_session_replay_refuses_settings_of_other_version(session):
     log = session / "session/segments/000000/log.jsonl"
     log.write_text(log.read_text().replace('"sh_degree":0', '"sh_degree":77'))
     with pytest.raises(InvalidSetting, match="--ignore-schedule"):
         replayed(session)
 
 
-def test_only_the_beginning_can_be_replayed(session):
+def test_session_replay_with_max_frames_matches_beginning(session):
     outcome = replayed(session, max_frames=5)
     comparison = outcome.find(ShownComparison)
     assert comparison is not None and comparison.different == 0

@@ -32,7 +32,7 @@ def wall(distance: float = 50.0) -> Model:
     return Model(1, gaussians, None, CAMERA, WINDOW_S)
 
 
-def test_an_orbit_starts_at_the_recorded_view_keeps_its_distance_and_comes_round():
+def test_orbit_view_starts_at_recorded_pose_and_keeps_distance():
     model = wall()
     view = view_of(model, CAMERA, ViewWish("orbit"))
     assert typical_depth(model, CAMERA) == pytest.approx(50, abs=0.1)
@@ -53,7 +53,7 @@ def moving_wall():
 
 
 @pytest.mark.parametrize(("baseline", "apart"), [(None, 3.0), (4.4, 4.4)])
-def test_two_eyes_stand_apart_in_the_scene_s_unit_also_where_the_camera_is_turned(baseline, apart):
+def test_stereo_view_baseline_is_along_rotated_camera_x_axis(baseline, apart):
     pose = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     model = wall()
     left, right = view_of(model, CAMERA.with_pose(pose), ViewWish("stereo", baseline)).cameras(1.0)
@@ -62,7 +62,7 @@ def test_two_eyes_stand_apart_in_the_scene_s_unit_also_where_the_camera_is_turne
     assert np.allclose(moved / np.linalg.norm(moved), pose[0, :3]), "to the picture's right"
 
 
-def test_a_path_is_followed_at_the_size_of_the_pictures(tmp_path):
+def test_path_view_interpolates_poses_at_picture_size(tmp_path):
     moved = np.eye(4)
     moved[0, 3] = 2.0
     cameras = [
@@ -91,19 +91,19 @@ def test_a_path_is_followed_at_the_size_of_the_pictures(tmp_path):
         ("stereo", float("inf"), "a positive one"),
     ],
 )
-def test_what_there_is_not_is_refused(name, baseline, said):
+def test_view_of_refuses_unknown_view_and_invalid_baseline(name, baseline, said):
     with pytest.raises(InvalidSetting, match=said):
         view_of(wall(), CAMERA, ViewWish(name, baseline))
 
 
-def test_an_empty_model_has_no_other_side():
+def test_orbit_view_of_empty_model_is_refused():
     model = wall()
     away = Model(1, model.gaussians.select(slice(0, 0)), None, CAMERA, WINDOW_S)
     with pytest.raises(InvalidSetting, match="shows nothing"):
         view_of(away, CAMERA, ViewWish("orbit"))
 
 
-def test_what_was_never_seen_is_hatched_and_the_rest_is_the_picture(tmp_path):
+def test_render_of_orbit_view_hatches_unobserved_pixels(tmp_path):
     save_bundle(wall(), tmp_path / "model")
     assert render_model(tmp_path / "model", tmp_path / "orbit", fps=2, view=ViewWish("orbit")) == 3
     aside = cv2.imread(str(tmp_path / "orbit" / "000001.png"))[..., ::-1]
@@ -115,7 +115,7 @@ def test_what_was_never_seen_is_hatched_and_the_rest_is_the_picture(tmp_path):
     assert (video.get(cv2.CAP_PROP_FRAME_WIDTH), video.get(cv2.CAP_PROP_FRAME_HEIGHT)) == (96, 40)
 
 
-def test_depths_of_half_covered_pixels_count_and_fainter_ones_do_not():
+def test_typical_depth_ignores_pixels_below_half_alpha():
     from types import SimpleNamespace
 
     output = SimpleNamespace(
@@ -125,7 +125,7 @@ def test_depths_of_half_covered_pixels_count_and_fainter_ones_do_not():
     assert typical_depth(model, CAMERA) == 20.0
 
 
-def test_a_path_may_cover_the_model_s_time_exactly_and_begin_no_earlier(tmp_path):
+def test_path_view_must_lie_within_model_time_window(tmp_path):
     def path(first_s, last_s):
         file = tmp_path / "path.json"
         cameras = [{"time_s": time_s, "camera_to_world": np.eye(4).tolist()} for time_s in (first_s, last_s)]
@@ -139,7 +139,7 @@ def test_a_path_may_cover_the_model_s_time_exactly_and_begin_no_earlier(tmp_path
             view_of(moving_wall(), CAMERA, path(first_s, last_s))
 
 
-def test_files_that_a_view_is_read_from():
+def test_view_wish_inputs_lists_path_file():
     assert ViewWish().inputs == ViewWish("stereo").inputs == () and [p.name for p in ViewWish("a.json").inputs] == [
         "a.json"
     ]

@@ -10,7 +10,7 @@ from gsplat_core.training.upkeep import Upkeep
 from operators.reconstruct import warm_reconstructor
 
 
-def test_upkeep_is_done_once_in_each_scene_and_nothing_of_it_stays(monkeypatch):
+def test_warm_reconstructor_runs_upkeep_per_scene_and_leaves_no_gaussians(monkeypatch):
     done = []
     once = Upkeep.once
 

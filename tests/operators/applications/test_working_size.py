@@ -60,7 +60,7 @@ class Machine:
 @pytest.mark.parametrize("size", [(640, 512), (1920, 1080), (360, 288), (320, 256), (4096, 2160), (512, 640)])
 @pytest.mark.parametrize("fixed_ms", [0.0, 4.0, 12.0, 25.0])
 @pytest.mark.parametrize("ms_per_megapixel", [1.0, 30.0, 120.0, 300.0, 2000.0])
-def test_without_disturbances_the_choice_is_the_best_of_all_sizes(size, fixed_ms, ms_per_megapixel):
+def test_working_size_is_largest_that_keeps_up(size, fixed_ms, ms_per_megapixel):
     machine = Machine(stream(*size), fixed_ms, ms_per_megapixel)
     chosen = choose_working_size(machine.about, machine.measure)
     assert len(machine.asked) == len(set(machine.asked)) <= MOST_MEASUREMENTS
@@ -73,7 +73,7 @@ def test_without_disturbances_the_choice_is_the_best_of_all_sizes(size, fixed_ms
 @pytest.mark.parametrize("disturbed", range(MOST_MEASUREMENTS))
 @pytest.mark.parametrize(("fixed_ms", "ms_per_megapixel"), [(3.0, 100.0), (6.0, 200.0), (12.0, 500.0), (15.0, 700.0)])
 @pytest.mark.parametrize("factor", [1.3, 2.0])
-def test_other_load_during_one_measurement_changes_the_choice_by_at_most_one_step(
+def test_working_size_changes_at_most_one_step_by_one_disturbed_measurement(
     fixed_ms, ms_per_megapixel, disturbed, factor
 ):
     machine = Machine(stream(), fixed_ms, ms_per_megapixel)
@@ -87,7 +87,7 @@ def test_other_load_during_one_measurement_changes_the_choice_by_at_most_one_ste
 
 
 @pytest.mark.parametrize("fps", [15.0, 25.0, 60.0])
-def test_slower_cameras_leave_room_for_larger_pictures(fps):
+def test_working_size_is_smaller_at_higher_fps(fps):
     machine = Machine(stream(fps=fps), 3.0, 200.0)
     assert machine.best() - choose_working_size(machine.about, machine.measure).scale <= 1 / SCALE_STEPS
     faster = Machine(stream(fps=2 * fps), 3.0, 200.0)
@@ -97,25 +97,25 @@ def test_slower_cameras_leave_room_for_larger_pictures(fps):
     )
 
 
-def test_a_smaller_share_of_the_interval_gives_a_smaller_size():
+def test_working_size_is_smaller_for_smaller_interval_share():
     machine = Machine(stream(), 3.0, 200.0)
     half = choose_working_size(machine.about, machine.measure, share=0.5)
     assert half.scale <= machine.best(0.5) < machine.best()
 
 
-def test_a_machine_that_is_fast_enough_works_at_the_full_size_and_measures_little():
+def test_fast_machine_works_at_full_size_after_two_measurements():
     machine = Machine(stream(), 1.0, 20.0)
     chosen = choose_working_size(machine.about, machine.measure)
     assert chosen.scale == 1 and len(machine.asked) == 2
     assert chosen.sentence.startswith("the run reconstructs all 640x512 pixels: a frame takes 8 ms at this size")
 
 
-def test_small_pictures_are_not_made_smaller_than_the_least():
+def test_working_size_keeps_pictures_at_minimum_side():
     machine = Machine(stream(80, 64), 500.0, 0.0)
     assert choose_working_size(machine.about, machine.measure).scale == 1 and machine.asked == [1.0]
 
 
-def test_where_nothing_fits_the_smallest_size_is_taken_and_the_sentence_says_that_frames_are_passed_over():
+def test_working_size_of_slow_machine_is_smallest_with_note_about_skipped_frames():
     machine = Machine(stream(), 90.0, 100.0)
     chosen = choose_working_size(machine.about, machine.measure)
     assert chosen.scale == machine.best() and min(chosen.width_px, chosen.height_px) >= MIN_SIDE_PX
@@ -128,7 +128,7 @@ def test_where_nothing_fits_the_smallest_size_is_taken_and_the_sentence_says_tha
 @pytest.mark.parametrize(
     "times", [[0.040, 0.060, 0.020, 0.035, 0.030, 0.050], [0.02] * 6, [0.5, 0.001, 0.5, 0.001, 0.5, 0.001]]
 )
-def test_times_that_contradict_each_other_end_with_an_allowed_size(times):
+def test_working_size_is_valid_for_inconsistent_measurements(times):
     """Under other load a smaller picture may take longer."""
     left, asked = iter(times), []
 
@@ -141,7 +141,7 @@ def test_times_that_contradict_each_other_end_with_an_allowed_size(times):
     assert chosen.scale * SCALE_STEPS == round(chosen.scale * SCALE_STEPS) and chosen.scale <= 1 and chosen.frame_s > 0
 
 
-def test_a_scale_that_was_asked_for_is_kept_and_nothing_is_measured(monkeypatch, tmp_path):
+def test_requested_scale_is_kept_without_measurement(monkeypatch, tmp_path):
     tried = []
     monkeypatch.setattr(live_module, "trial_run", lambda settings, source, new_graph: tried.append(settings.scale))
     monkeypatch.setattr(live_module, "measured_frame_s", lambda *_: pytest.fail("nothing is to be measured"))
@@ -178,7 +178,7 @@ class Still:
         return Frame(0, 0, np.full((*shape, 3), 90, np.uint8), mask=np.ones(shape, np.uint8))
 
 
-def test_the_size_that_is_chosen_is_that_of_the_run_and_its_note_and_its_report(monkeypatch, tmp_path):
+def test_chosen_working_size_is_in_source_settings_and_note(monkeypatch, tmp_path):
     about = stream()
     machine, sizes = Machine(about, 4.0, 300.0), []
 
@@ -199,14 +199,14 @@ def test_the_size_that_is_chosen_is_that_of_the_run_and_its_note_and_its_report(
     assert frame.image.shape == (height, width, 3) and frame.mask.shape == (height, width)
 
 
-def test_a_machine_that_keeps_up_with_all_of_it_reads_the_source_itself(monkeypatch, tmp_path):
+def test_full_working_size_uses_source_without_scaling(monkeypatch, tmp_path):
     monkeypatch.setattr(live_module, "measured_frame_s", lambda *_: 0.001)
     read = Still(stream())
     settings, source = on_trial(LiveSettings("a", tmp_path), read, [])
     assert source is read and settings.scale == 1.0
 
 
-def test_a_scaled_source_is_the_source_at_another_size():
+def test_scaled_source_resizes_frames_and_forwards_calls():
     read = Still(stream())
     scaled = ScaledSource(read, 0.25)
     scaled.open()
@@ -223,7 +223,7 @@ def test_a_scaled_source_is_the_source_at_another_size():
     assert scaled.read(0.5).image.shape[:2] != (64, 80)
 
 
-def test_a_stream_that_has_ended_gives_nothing():
+def test_scaled_source_read_returns_none_at_end_of_stream():
     class Ended(Still):
         def read(self, timeout_s):
             return None
@@ -237,7 +237,7 @@ def shown(frame, shown_ns, new=True):
     return ShownPicture(picture, frame.image, PictureState.LIVE, 0, shown_ns, new)
 
 
-def test_the_next_made_up_frame_comes_when_the_last_one_was_shown_and_the_lower_quartile_counts(monkeypatch):
+def test_paced_tissue_waits_for_shown_frame_and_uses_lower_quartile_time(monkeypatch):
     tissue = PacedTissue(scaled_description(stream(), 0.125))
     took_ms = [900, 800, 700, 10, 12, 11, 500, 13, 9, 10, 12, 11]
     given = tissue.frames()
@@ -250,14 +250,14 @@ def test_the_next_made_up_frame_comes_when_the_last_one_was_shown_and_the_lower_
     assert tissue.frame_s == pytest.approx(0.010)
 
 
-def test_a_machine_that_shows_nothing_is_given_up(monkeypatch):
+def test_paced_tissue_gives_up_if_no_frame_is_shown(monkeypatch):
     monkeypatch.setattr(working_size, "GIVEN_UP_S", 0.001)
     tissue = PacedTissue(scaled_description(stream(), 0.125))
     assert len(list(tissue.frames())) == STARTING_FRAMES + 1
     assert tissue.frame_s == 0.001
 
 
-def test_the_live_graph_itself_is_measured(tmp_path):
+def test_measured_frame_s_runs_live_graph(tmp_path):
     about = scaled_description(stream(), 0.125)
     graphs = []
 

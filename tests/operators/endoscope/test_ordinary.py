@@ -39,7 +39,7 @@ def with_faults(pictures):
 @pytest.mark.slow
 @pytest.mark.recordings
 @pytest.mark.parametrize("name", ["cutting", "heart", "colon"])
-def test_every_fault_is_found_that_looking_at_every_frame_finds(recordings_dir, name):
+def test_picture_stages_find_same_faults_as_checking_every_frame(recordings_dir, name):
     given = frames(with_faults(clip(recordings_dir, name)))
     everything = StageOp(None, stages=picture_stages())
     seldom = PictureStagesOp(None, stages=picture_stages())
@@ -87,7 +87,7 @@ def calm(stages):
     return operator
 
 
-def test_ordinary_frames_keep_what_was_left_out(frame):
+def test_ordinary_frames_keep_loss_mask_of_last_checked_frame(frame):
     operator = calm([Nothing(), LeavesOutTheTop()])
     passed = [through([operator], frame(k)) for k in range(8)]
     assert all(not each.loss_mask[:4].any() and each.loss_mask[4:].all() for each in passed)
@@ -95,7 +95,7 @@ def test_ordinary_frames_keep_what_was_left_out(frame):
     assert operator.stages[1].frames == 2
 
 
-def test_nothing_is_ordinary_after_a_withheld_frame(frame):
+def test_frame_after_withheld_frame_is_checked(frame):
     class Withholds(Stage):
         def annotate(self, frame):
             return self.withhold(frame, "odd") if frame.seq == 0 else frame
@@ -105,7 +105,7 @@ def test_nothing_is_ordinary_after_a_withheld_frame(frame):
     assert operator.stages[1].frames == 2
 
 
-def test_stages_look_at_ordinary_frames_in_turn(frame):
+def test_stages_check_ordinary_frames_in_turn(frame):
     stages = [Nothing() for _ in range(7)]
     operator = calm(stages)
     looked = []
@@ -118,7 +118,7 @@ def test_stages_look_at_ordinary_frames_in_turn(frame):
     assert [sum(each) for each in zip(*looked, strict=True)] == [31] + [6] * 6
 
 
-def test_what_one_stage_finds_makes_those_after_it_look(frame):
+def test_stage_finding_makes_later_stages_check_frame(frame):
     class Finds(Stage):
         def annotate(self, frame):
             return self.withhold(frame, "odd") if frame.seq else frame

@@ -39,7 +39,7 @@ def run(stage, given):
     return [stage.apply(frame) for frame in given]
 
 
-def test_a_bad_picture_is_withheld_with_its_reason_and_counted():
+def test_sequence_stage_withholds_and_counts_black_frame():
     given = frames(texture(1, 20))
     given[12] = given[12].with_fields(image=given[12].image // 30)
     stage = SequenceStage()
@@ -48,14 +48,14 @@ def test_a_bad_picture_is_withheld_with_its_reason_and_counted():
     assert stage.counts() == SequenceCounts(20, {"black": 1})
 
 
-def test_a_reason_that_a_frame_has_already_stays():
+def test_sequence_stage_keeps_existing_withheld_reason():
     given = frames([image // 30 for image in texture(1, 3)], withheld="out of body")
     stage = SequenceStage()
     assert {frame.withheld for frame in run(stage, given)} == {"out of body"}
     assert stage.counts().found == {"black": 3}
 
 
-def test_a_clock_jump_does_not_reach_the_model():
+def test_sequence_stage_removes_clock_jump_from_timestamps():
     given = frames(texture(1, 20))
     given[10:] = [frame.with_fields(pts_ns=frame.pts_ns + 10**13) for frame in given[10:]]
     stage = SequenceStage()
@@ -63,7 +63,7 @@ def test_a_clock_jump_does_not_reach_the_model():
     assert stage.counts().found == {"clock jump": 1}
 
 
-def test_a_late_frame_is_withheld_and_is_not_what_the_next_one_is_compared_with():
+def test_sequence_stage_withholds_late_frame_and_ignores_it_for_comparison():
     given = frames(texture(1, 20))
     late = given[11].with_fields(pts_ns=given[8].pts_ns, image=given[8].image)
     passed = run(SequenceStage(), [*given[:11], late, *given[12:]])
@@ -71,7 +71,7 @@ def test_a_late_frame_is_withheld_and_is_not_what_the_next_one_is_compared_with(
     assert passed[11].pts_ns == given[10].pts_ns
 
 
-def test_a_damaged_frame_is_left_to_what_handles_damage():
+def test_stages_pass_damaged_frame_unchanged():
     given = frames(texture(1, 9))
     given[5] = given[5].with_fields(status=FrameStatus.DAMAGED, image=given[4].image)
     stages = (SequenceStage(), CutStage())
@@ -80,7 +80,7 @@ def test_a_damaged_frame_is_left_to_what_handles_damage():
         assert stage.counts().found == {}
 
 
-def test_mask_and_depth_are_checked_where_there_are_any():
+def test_mask_and_depth_stage_removes_bad_depth_and_withholds_empty_mask():
     given = frames(texture(1, 6))
     depth = np.full(given[0].image.shape[:2], 60, np.float32)
     given[2] = given[2].with_fields(depth=depth * np.nan, mask=np.zeros(depth.shape, np.uint8))
@@ -91,7 +91,7 @@ def test_mask_and_depth_are_checked_where_there_are_any():
     assert stage.counts() == MaskAndDepthCounts(6, {"depth not usable": 1, "no tissue": 1})
 
 
-def test_a_cut_is_marked_on_the_second_frame_of_the_new_scene():
+def test_cut_stage_marks_cut_on_second_frame_of_new_scene():
     stage = CutStage()
     passed = run(stage, frames([*texture(1, 10), *texture(40, 10)]))
     assert [(k, frame.withheld) for k, frame in enumerate(passed) if frame.withheld] == [(10, "cut in doubt")]
@@ -99,7 +99,7 @@ def test_a_cut_is_marked_on_the_second_frame_of_the_new_scene():
     assert stage.counts() == CutCounts(20, {"cut": 1, "cut in doubt": 1})
 
 
-def test_withheld_frames_are_no_scene():
+def test_cut_stage_ignores_withheld_frames():
     given = frames([*texture(1, 10), *texture(40, 10), *texture(1, 20)[10:]])
     given[10:20] = [frame.with_fields(withheld="out of body") for frame in given[10:20]]
     assert [frame.new_scene for frame in run(CutStage(), given)] == [None] * 30
@@ -118,7 +118,7 @@ def run_all(given):
 
 @pytest.mark.recordings
 @pytest.mark.parametrize("name", ["cutting", "heart"])
-def test_good_video_keeps_everything_but_masks_of_the_loss(recordings_dir, name, compute):
+def test_stages_change_only_loss_mask_of_good_video(recordings_dir, name, compute):
     operator = StageOp(None, stages=all_stages())
     operator.start()
     for frame in frames(clip(recordings_dir, name)):
@@ -133,13 +133,13 @@ def test_good_video_keeps_everything_but_masks_of_the_loss(recordings_dir, name,
 
 @pytest.mark.recordings
 @pytest.mark.parametrize("name", sorted(PLACES.keys() - {"cutting", "heart"}))
-def test_no_recording_has_withheld_frames_or_new_scenes(recordings_dir, name):
+def test_stages_withhold_no_frame_and_find_no_cut_in_good_recordings(recordings_dir, name):
     for frame in run_all(frames(clip(recordings_dir, name))):
         assert (frame.withheld, frame.new_scene) == (None, None)
 
 
 @pytest.mark.recordings
-def test_many_faults_in_one_stream_are_each_found_and_it_goes_on(recordings_dir):
+def test_stages_find_each_of_many_faults_in_one_stream(recordings_dir):
     images = list(clip(recordings_dir, "cutting"))
     other = resized(clip(recordings_dir, "heart")[:20], images[0])
     given = frames([*images[:20], images[20] // 30, *[images[20]] * 10, *images[20:50], *other, *images[50:70]])
@@ -157,7 +157,7 @@ def test_many_faults_in_one_stream_are_each_found_and_it_goes_on(recordings_dir)
     assert times == sorted(times) and times[-1] < 4 * 10**9
 
 
-def test_a_restart_forgets_everything(compute):
+def test_stage_op_restart_resets_stages(compute):
     operator = StageOp(None, stages=all_stages())
     for _ in range(2):
         operator.start()
@@ -191,7 +191,7 @@ def test_no_frame_of_any_content_raises_in_any_stage(height, width, seed):
         assert frame.loss_mask is None or set(np.unique(frame.loss_mask)) <= {0, 1}
 
 
-def test_masks_of_the_loss_add_up():
+def test_frame_excluding_combines_loss_masks():
     (frame,) = frames(texture(1, 1))
     one, other = (np.ones(frame.image.shape[:2], np.uint8) for _ in range(2))
     one[:10], other[-10:] = 0, 0
@@ -211,7 +211,7 @@ def test_masks_of_the_loss_add_up():
         (StripStage, "cutting", "strip or text"),
     ],
 )
-def test_pixels_that_do_not_count_are_added_to_the_mask_of_the_loss(recordings_dir, stage, name, what):
+def test_stage_adds_excluded_pixels_to_existing_loss_mask(recordings_dir, stage, name, what):
     images = clip(recordings_dir, name)
     before = np.ones(images[0].shape[:2], np.uint8)
     before[:9] = 0
@@ -221,7 +221,7 @@ def test_pixels_that_do_not_count_are_added_to_the_mask_of_the_loss(recordings_d
     assert made.counts().found[what] > 0
 
 
-def test_blur_is_withheld_and_each_scene_has_its_own_sharpness():
+def test_sharpness_stage_withholds_blur_relative_to_scene():
     soft = [cv2.GaussianBlur(image, (0, 0), 3) for image in texture(1, 40)]
     given = frames([*texture(1, 20), *soft[20:30], *texture(1, 40)[30:]])
     assert {frame.withheld for frame in run(SharpnessStage(), given)[20:30]} == {"blur"}
@@ -229,7 +229,7 @@ def test_blur_is_withheld_and_each_scene_has_its_own_sharpness():
     assert {frame.withheld for frame in run(SharpnessStage(), given)[:30]} == {None}
 
 
-def test_both_eyes_of_interlaced_video_are_repaired():
+def test_interlacing_stage_repairs_both_eyes():
     images = [np.roll(image, 6 * k, axis=1) for k, image in enumerate(texture(1, 20, 320, 256))]
     for image, later in itertools.pairwise(images):
         image[1::2] = later[1::2]
@@ -239,7 +239,7 @@ def test_both_eyes_of_interlaced_video_are_repaired():
     assert stage.counts().found["de-interlaced"] > 10
 
 
-def test_removing_combs_is_no_blur():
+def test_sharpness_stage_does_not_report_deinterlaced_frames_as_blur():
     """The pictures without combs are compared with each other, not with the sharper ones from before combs were found."""
     images = [np.roll(image, 6 * k, axis=1) for k, image in enumerate(texture(1, 30, 320, 256))]
     for image, later in itertools.pairwise(images):

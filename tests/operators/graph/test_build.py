@@ -64,7 +64,7 @@ def into(type=None, **kwargs):
     return lambda spec: spec.input("in", type=type, **kwargs)
 
 
-def test_unconnected_ports_are_listed_together(kit):
+def test_build_lists_all_unconnected_ports(kit):
     def wire(app):
         app.add_operator(Ports(app, name="a", ports=out()))
         app.add_operator(Ports(app, name="b", ports=into()))
@@ -72,7 +72,7 @@ def test_unconnected_ports_are_listed_together(kit):
     refused(kit, wire, r"not connected: output a.out, input b.in; connect by add_flow, or declare .* optional=True")
 
 
-def test_types_of_connected_ports_must_fit(kit):
+def test_build_refuses_connected_ports_with_incompatible_types(kit):
     def wire(app):
         app.add_flow(Ports(app, name="a", ports=out(str)), Ports(app, name="b", ports=into(int)))
 
@@ -97,11 +97,11 @@ def test_types_of_connected_ports_must_fit(kit):
         (np.ndarray, list[int], False),
     ],
 )
-def test_which_types_fit(taken, given, fits):
+def test_accepts_type_compatibility(taken, given, fits):
     assert accepts(taken, given) is fits
 
 
-def test_duplicate_names_are_refused(kit):
+def test_build_refuses_duplicate_operator_names(kit):
     def wire(app):
         app.add_operator(Ports(app, name="twin"))
         app.add_operator(Ports(app, name="twin"))
@@ -117,7 +117,7 @@ def test_duplicate_names_are_refused(kit):
         (None, r"say which ports to connect: 'a' has outputs \['out'\], 'b' has inputs \['in', 'more'\]"),
     ],
 )
-def test_unknown_ports_name_the_valid_ones(kit, pairs, message):
+def test_unknown_port_error_lists_valid_ports(kit, pairs, message):
     def two(spec):
         spec.input("in")
         spec.input("more")
@@ -128,7 +128,7 @@ def test_unknown_ports_name_the_valid_ones(kit, pairs, message):
     refused(kit, wire, message)
 
 
-def test_an_input_fed_twice_must_be_of_any_size(kit):
+def test_build_refuses_second_connection_unless_input_is_any_size(kit):
     def wire(app):
         sink = Ports(app, name="sink", ports=into())
         app.add_flow(Ports(app, name="a", ports=out()), sink)
@@ -138,7 +138,7 @@ def test_an_input_fed_twice_must_be_of_any_size(kit):
 
 
 @pytest.mark.parametrize(("size", "capacity"), [(4, 2), (1, 0)])
-def test_a_capacity_too_small_for_its_ports_is_refused(kit, size, capacity):
+def test_build_refuses_capacity_below_port_size(kit, size, capacity):
     def wire(app):
         sink = Ports(app, name="b", ports=into(size=size))
         app.add_flow(Ports(app, name="a", ports=out()), sink, capacity=capacity)
@@ -146,7 +146,7 @@ def test_a_capacity_too_small_for_its_ports_is_refused(kit, size, capacity):
     refused(kit, wire, r"holds 2, but its ports wait for 4|capacity must be at least 1, got 0")
 
 
-def test_an_empty_composition_is_refused(kit):
+def test_build_refuses_application_without_operators(kit):
     refused(kit, lambda app: None, "composed no operators")
 
 
@@ -167,12 +167,12 @@ def test_an_empty_composition_is_refused(kit):
         (lambda spec: spec.output("a").connector(ConnectorType.DOUBLE_BUFFER), "a queue belongs to the input"),
     ],
 )
-def test_wrong_declarations_are_refused(declare, message):
+def test_operator_spec_refuses_invalid_declarations(declare, message):
     with pytest.raises(GraphInvalid, match=message):
         declare(OperatorSpec("op"))
 
 
-def test_defaults_are_holoscans():
+def test_port_defaults_equal_holoscan():
     spec = OperatorSpec("op")
     one, batch, many, output = (
         spec.input("one"),
@@ -205,7 +205,7 @@ def test_parameters_become_attributes(kit):
             Ports(app, ports=lambda spec, taken=taken: spec.param(taken, None))
 
 
-def test_conditions_are_positional(kit):
+def test_operator_takes_conditions_as_positional_arguments(kit):
     app = kit.Wired(lambda app: None)
     count = CountCondition(app, 1)
     assert isinstance(count, Condition) and Ports(app, count).conditions == [count]
@@ -219,6 +219,6 @@ def test_conditions_are_positional(kit):
         Ports(app, MessageAvailableCondition(app, receiver="nope"), ports=into())
 
 
-def test_importing_the_graph_does_not_import_the_sdk():
+def test_importing_operators_graph_does_not_import_holoscan():
     code = "import sys, operators.graph; sys.exit(any(name.split('.')[0] == 'holoscan' for name in sys.modules))"
     assert subprocess.run([sys.executable, "-c", code], timeout=300, check=False).returncode == 0

@@ -9,7 +9,7 @@ import pytest
 from operators.graph import ManualClock, RealtimeClock
 
 
-def test_a_real_clock_counts_from_its_beginning(monkeypatch):
+def test_realtime_clock_counts_from_creation_or_reset(monkeypatch):
     now = [7_000_000_000]
     monkeypatch.setattr(time, "monotonic_ns", lambda: now[0])
     clock = RealtimeClock()
@@ -21,7 +21,7 @@ def test_a_real_clock_counts_from_its_beginning(monkeypatch):
     assert clock.timestamp() == 3
 
 
-def test_a_manual_clock_only_jumps_forward():
+def test_manual_clock_advance_to_never_moves_backwards():
     clock = ManualClock()
     assert clock.timestamp() == 0
     clock.advance_to(5_000_000_000)

@@ -34,7 +34,7 @@ MS = 1_000_000
     ],
 )
 @pytest.mark.parametrize("period", [100 * MS, timedelta(milliseconds=100)])
-def test_periodic_policies(policy, ticks_ms, due_ms, period):
+def test_periodic_condition_due_times_by_policy(policy, ticks_ms, due_ms, period):
     condition = PeriodicCondition(None, period, policy)
     for tick_ms, due in zip(ticks_ms, due_ms, strict=True):
         assert condition.check(tick_ms * MS) == (SchedulingStatus.READY, 0)
@@ -43,7 +43,7 @@ def test_periodic_policies(policy, ticks_ms, due_ms, period):
         assert condition.check(due * MS)[0] is SchedulingStatus.READY
 
 
-def test_impossible_conditions_are_refused():
+def test_conditions_refuse_invalid_arguments():
     with pytest.raises(ValueError, match="period must be positive"):
         PeriodicCondition(None, 0)
     with pytest.raises(ValueError, match="must not be negative"):
@@ -60,7 +60,7 @@ class Stamp(Operator):
         self.stamps.append((context.clock.timestamp() // MS, self.name))
 
 
-def test_clocks_begin_at_zero_and_tell_seconds():
+def test_clocks_start_at_zero_and_return_seconds():
     manual, real = ManualClock(), RealtimeClock()
     manual.advance_to(2_500_000_000)
     manual.advance_to(1)
@@ -71,7 +71,7 @@ def test_clocks_begin_at_zero_and_tell_seconds():
     assert before <= real.time() * 1e9 + 1 and real.timestamp() >= before
 
 
-def test_a_manual_clock_compresses_an_hour(kit, greedy_runner):
+def test_manual_clock_runs_hourly_operator_without_waiting(kit, greedy_runner):
     stamps = []
 
     def wire(app):
@@ -111,14 +111,14 @@ class Weekdays(Condition):
         self.times_ns.pop(0)
 
 
-def test_a_condition_of_ones_own_runs_on_every_engine(kit, greedy_runner):
+def test_custom_condition_runs_on_every_engine(kit, greedy_runner):
     stamps = []
     app = kit.Wired(lambda app: app.add_operator(Stamp(app, Weekdays(app, [5 * MS, 9 * MS]), name="s", stamps=stamps)))
     greedy_runner(app, clock=ManualClock())
     assert stamps == [(5, "s"), (9, "s")]
 
 
-def test_all_conditions_must_agree(kit, runner):
+def test_operator_computes_only_if_all_conditions_are_ready(kit, runner):
     stamps = []
 
     def wire(app):
@@ -129,7 +129,7 @@ def test_all_conditions_must_agree(kit, runner):
     assert len(stamps) == 2
 
 
-def test_a_count_is_used_up_exactly():
+def test_count_condition_is_never_after_count_executions():
     assert CountCondition(None, 0).check(0) == (SchedulingStatus.NEVER, 0)
     condition = CountCondition(None, 1)
     assert condition.check(0) == (SchedulingStatus.READY, 0)
@@ -137,7 +137,7 @@ def test_a_count_is_used_up_exactly():
     assert condition.check(0) == (SchedulingStatus.NEVER, 0)
 
 
-def test_a_message_of_any_input_ends_the_wait_and_so_does_the_timeout():
+def test_message_or_timeout_condition_is_ready_on_message_or_timeout():
     condition, edges = MessageOrTimeoutCondition(None, 50), ([], [])
     condition.watch(iter(edges))
     assert condition.check(0) == (SchedulingStatus.READY, 0)
@@ -151,7 +151,7 @@ def test_a_message_of_any_input_ends_the_wait_and_so_does_the_timeout():
     assert condition.check(8)[0] is SchedulingStatus.WAIT_TIME
 
 
-def test_the_shortest_times_are_one_nanosecond():
+def test_condition_periods_and_timeouts_are_at_least_one_nanosecond():
     assert PeriodicCondition(None, 1).recess_period_ns == 1
     assert PeriodicCondition(None, timedelta(microseconds=3)).recess_period_ns == 3000
     assert MessageOrTimeoutCondition(None, 1).timeout_ns == 1
@@ -160,7 +160,7 @@ def test_the_shortest_times_are_one_nanosecond():
             MessageOrTimeoutCondition(None, impossible)
 
 
-def test_each_state_of_an_event_has_its_status_and_each_change_wakes():
+def test_asynchronous_condition_state_sets_status_and_wakes_scheduler():
     condition, woken = AsynchronousCondition(None), []
     assert condition.check(0)[0] is SchedulingStatus.READY
     condition.event_state = AsynchronousEventState.WAIT  # without a scheduler that waits, there is nothing to wake
@@ -177,7 +177,7 @@ def test_each_state_of_an_event_has_its_status_and_each_change_wakes():
         assert woken.pop() is state and not woken
 
 
-def test_a_disabled_tick_is_final_and_wakes():
+def test_boolean_condition_disable_tick_is_never_and_wakes_scheduler():
     condition, woken = BooleanCondition(None), []
     assert condition.check_tick_enabled() and condition.check(0)[0] is SchedulingStatus.READY
     condition._wake = lambda: woken.append(True)

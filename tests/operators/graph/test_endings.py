@@ -19,7 +19,7 @@ from operators.graph import (
 )
 
 
-def test_a_finished_consumer_does_not_hold_up_the_others(kit, runner):
+def test_finished_consumer_does_not_block_other_consumers(kit, runner):
     def wire(app):
         source = app.counted(20, kit.Source, name="source")
         few, all_ = kit.Collect(app, CountCondition(app, 3), name="few"), kit.Collect(app, name="all")
@@ -36,7 +36,7 @@ def test_a_finished_consumer_does_not_hold_up_the_others(kit, runner):
     assert (stats.sent, stats.received, stats.queued, stats.dropped) == (20, 3, 0, {"closed": 17})
 
 
-def test_a_join_that_starved_does_not_hold_up_its_other_producer(kit, runner):
+def test_join_without_input_does_not_block_its_other_producer(kit, runner):
     def wire(app):
         short, long = app.counted(2, kit.Source, name="short"), app.counted(9, kit.Source, name="long")
         join, sink = kit.Join(app, name="join"), kit.Collect(app, name="sink")
@@ -51,7 +51,7 @@ def test_a_join_that_starved_does_not_hold_up_its_other_producer(kit, runner):
     assert app.ops.values == list(range(9))
 
 
-def test_a_source_whose_only_consumer_is_done_finishes(kit, runner):
+def test_source_finishes_if_only_consumer_is_finished(kit, runner):
     def wire(app):
         app.chain(kit.Source(app, name="endless"), kit.Collect(app, CountCondition(app, 4), name="sink"))
 
@@ -61,7 +61,7 @@ def test_a_source_whose_only_consumer_is_done_finishes(kit, runner):
     assert result.computes["sink"] == 4
 
 
-def test_deadlock_says_who_waits_on_what(kit, runner):
+def test_graph_deadlock_lists_waiting_operators_and_edges(kit, runner):
     def wire(app):
         source, join = app.counted(10, kit.Source, name="source"), kit.Join(app, name="join")
         nothing = kit.Apply(app, name="nothing", function=lambda value: None)
@@ -99,7 +99,7 @@ def test_stop_execution_in_compute_ends_an_endless_graph(kit, runner):
 
 
 @pytest.mark.parametrize("waiting_for", ["event", "time", "nothing"])
-def test_stop_execution_from_another_thread(kit, runner, waiting_for):
+def test_stop_execution_from_other_thread_ends_waiting_graph(kit, runner, waiting_for):
     begun = threading.Event()
 
     class Waiting(Operator):
@@ -127,7 +127,7 @@ def test_stop_execution_from_another_thread(kit, runner, waiting_for):
     assert outcome[0].reason is StopReason.STOPPED
 
 
-def test_an_operator_can_finish_alone(kit, runner):
+def test_operator_stop_execution_finishes_only_that_operator(kit, runner):
     def wire(app):
         source, sink = kit.Source(app, name="source"), kit.Collect(app, name="sink")
         sink.function = lambda value: source.stop_execution() if value == 3 else None
@@ -140,7 +140,7 @@ def test_an_operator_can_finish_alone(kit, runner):
     assert app.ops.values == list(range(len(app.ops.values)))
 
 
-def test_an_outside_event_wakes(kit, runner):
+def test_event_from_other_thread_wakes_operator(kit, runner):
     class Driven(Operator):
         def start(self):
             self.computes = 0

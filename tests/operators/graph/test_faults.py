@@ -10,7 +10,7 @@ from operators.errors import OperatorFailed
 from operators.graph import DISABLE_BRANCH, CountCondition, FaultAction, FaultPolicy, Operator, StopReason
 
 
-def test_the_graph_stops_and_the_error_names_operator_and_frame(kit, runner):
+def test_operator_error_stops_graph_and_names_operator_and_frame(kit, runner):
     life = kit.Recorder()
 
     def wire(app):
@@ -28,7 +28,7 @@ def test_the_graph_stops_and_the_error_names_operator_and_frame(kit, runner):
     assert [fault.action for fault in app.result.faults] == [FaultAction.STOP_GRAPH]
 
 
-def test_the_frame_may_be_an_attribute_of_the_message(kit, runner):
+def test_operator_error_takes_frame_from_message_attribute(kit, runner):
     class Plain(kit.Source):
         def compute(self, op_input, op_output, context):
             op_output.emit(SimpleNamespace(seq=41), "out")
@@ -41,7 +41,7 @@ def test_the_frame_may_be_an_attribute_of_the_message(kit, runner):
         runner(app)
 
 
-def test_without_a_frame_the_error_does_not_invent_one(kit, runner):
+def test_operator_error_without_frame_has_no_frame_number(kit, runner):
     class Bad(Operator):
         def compute(self, op_input, op_output, context):
             raise RuntimeError("boom")
@@ -52,7 +52,7 @@ def test_without_a_frame_the_error_does_not_invent_one(kit, runner):
     assert caught.value.seq is None
 
 
-def test_restart_goes_on_with_the_next_message(kit, runner):
+def test_restart_policy_continues_with_next_message(kit, runner):
     life = kit.Recorder()
 
     def flaky(value):
@@ -76,7 +76,7 @@ def test_restart_goes_on_with_the_next_message(kit, runner):
 
 
 @pytest.mark.parametrize("afterwards", [FaultAction.STOP_GRAPH, FaultAction.DISABLE_BRANCH])
-def test_restarts_are_bounded(kit, runner, afterwards):
+def test_restart_policy_ends_after_maximum_restarts(kit, runner, afterwards):
     def bad(value):
         raise ValueError(value)
 
@@ -98,7 +98,7 @@ def test_restarts_are_bounded(kit, runner, afterwards):
     assert [fault.action for fault in app.result.faults] == [FaultAction.RESTART, FaultAction.RESTART, afterwards]
 
 
-def test_a_disabled_branch_finishes_and_the_others_go_on(kit, runner):
+def test_disable_branch_policy_finishes_branch_and_keeps_others(kit, runner):
     def wire(app):
         source, raw = app.counted(30, kit.Source, name="ingest"), kit.Collect(app, name="raw")
         recon = kit.Apply(
@@ -119,7 +119,7 @@ def test_a_disabled_branch_finishes_and_the_others_go_on(kit, runner):
     assert [fault.error.seq for fault in result.faults] == [4]
 
 
-def test_disabling_one_of_two_producers_of_a_join_ends_the_join(kit, runner):
+def test_disabling_one_producer_of_join_ends_join(kit, runner):
     def wire(app):
         bad, good = app.counted(9, kit.Source, name="bad", failing={2}), app.counted(9, kit.Source, name="good")
         bad.fault_policy = DISABLE_BRANCH
@@ -159,7 +159,7 @@ class Bad(Operator):
 
 
 @pytest.mark.parametrize("phase", ["initialize", "start", "stop"])
-def test_errors_outside_compute_stop_what_was_started(kit, runner, phase):
+def test_error_outside_compute_stops_started_operators(kit, runner, phase):
     life = kit.Recorder()
 
     def wire(app):
@@ -178,7 +178,7 @@ def test_errors_outside_compute_stop_what_was_started(kit, runner, phase):
     assert life.names("stop") == expected
 
 
-def test_an_operator_that_cannot_start_may_be_disabled(kit, runner):
+def test_disable_branch_policy_applies_to_error_in_start(kit, runner):
     def wire(app):
         app.add_operator(Bad(app, name="bad", phase="start", fault_policy=DISABLE_BRANCH))
         sink = kit.Collect(app)
@@ -192,7 +192,7 @@ def test_an_operator_that_cannot_start_may_be_disabled(kit, runner):
     assert result.computes["bad"] == 0
 
 
-def test_the_first_of_several_failures_is_raised(kit, runner):
+def test_first_of_several_operator_failures_is_raised(kit, runner):
     class Worse(Bad):
         def stop(self):
             raise OSError("cannot stop either")
@@ -202,7 +202,7 @@ def test_the_first_of_several_failures_is_raised(kit, runner):
         runner(app)
 
 
-def test_a_system_exit_is_carried_out_of_run(kit, runner):
+def test_system_exit_in_compute_propagates_from_run(kit, runner):
     life = kit.Recorder()
 
     def leave(value):
@@ -221,7 +221,7 @@ def test_a_system_exit_is_carried_out_of_run(kit, runner):
 @pytest.mark.parametrize(
     "arguments", [(FaultAction.RESTART, 0), (FaultAction.STOP_GRAPH, 1), (FaultAction.RESTART, -1)]
 )
-def test_policies_that_make_no_sense_are_refused(arguments):
+def test_fault_policy_refuses_invalid_combinations(arguments):
     with pytest.raises(ValueError, match="does not go with"):
         FaultPolicy(*arguments)
     with pytest.raises(ValueError, match="afterwards"):

@@ -12,7 +12,7 @@ from operators.graph import (
 )
 
 
-def test_chain_delivers_everything_in_order(kit, runner):
+def test_chain_delivers_all_messages_in_order(kit, runner):
     app = kit.Wired(lambda app: _chain(app, kit, 50))
     result = runner(app)
     _, _, sink = app.ops
@@ -33,7 +33,7 @@ def _chain(app, kit, count):
     return operators
 
 
-def test_values_travel_by_reference(kit, runner):
+def test_messages_are_passed_by_reference(kit, runner):
     import numpy as np
 
     made = []
@@ -114,7 +114,7 @@ def test_metadata_of_a_join_follows_its_policy(kit, runner, policy, tag):
         assert seen == [{"seq": i, "tag": tag, "left": i, "right": i} for i in range(3)]
 
 
-def test_run_again_recomposes(kit, runner):
+def test_second_run_recomposes_application(kit, runner):
     app = kit.Wired(lambda app: _chain(app, kit, 4))
     runner(app)
     first = app.ops

@@ -16,7 +16,7 @@ pytestmark = [
 ]
 
 
-def test_room_is_seen_that_is_made_after_the_sdk_has_told_of_it(kit, runner, monkeypatch):
+def test_producer_sees_room_made_after_sdk_notification(kit, runner, monkeypatch):
     take = LockedEdge.pop
 
     def take_late(edge):
@@ -36,7 +36,7 @@ def test_room_is_seen_that_is_made_after_the_sdk_has_told_of_it(kit, runner, mon
     assert [sink.values for sink in app.ops] == [[0, 1, 2]] * 2
 
 
-def test_a_look_at_an_operator_that_computes_its_last_message_does_not_end_it(kit, runner, monkeypatch):
+def test_gate_check_during_last_compute_does_not_end_operator(kit, runner, monkeypatch):
     from operators.graph.holoscan import Gate
 
     look, gates = Gate.check, {}
@@ -67,7 +67,7 @@ def _through(app, kit, function):
     return sink
 
 
-def test_an_operator_that_two_threads_look_at_when_it_stops_is_not_started_again(kit, runner, monkeypatch):
+def test_concurrent_gate_checks_do_not_restart_stopped_operator(kit, runner, monkeypatch):
     from operators.graph.holoscan import Gate
 
     look, computed = Gate.check, threading.Event()

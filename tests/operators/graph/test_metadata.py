@@ -10,7 +10,7 @@ from operators.graph.operator import MetadataPolicy, merge_metadata
 
 
 @pytest.mark.parametrize(("policy", "kept"), [(MetadataPolicy.UPDATE, 2), (MetadataPolicy.REJECT, 1)])
-def test_one_of_two_values_is_kept(policy, kept):
+def test_merge_metadata_keeps_value_by_policy(policy, kept):
     into = {"seq": 1, "own": 5}
     merge_metadata(into, {"seq": 2, "new": 7}, policy)
     assert into == {"seq": kept, "own": 5, "new": 7}
@@ -19,7 +19,7 @@ def test_one_of_two_values_is_kept(policy, kept):
 @pytest.mark.parametrize(
     ("one", "other", "equal"), [(1, 1, True), ("a", "a", True), ((1, 2), (1, 2), True), (1, 2, False), ("1", 1, False)]
 )
-def test_different_values_are_a_conflict_where_that_is_asked_for(one, other, equal):
+def test_merge_metadata_raise_policy_refuses_different_values(one, other, equal):
     into = {"seq": one}
     if equal:
         merge_metadata(into, {"seq": other, "new": 3}, MetadataPolicy.RAISE)
@@ -29,7 +29,7 @@ def test_different_values_are_a_conflict_where_that_is_asked_for(one, other, equ
             merge_metadata(into, {"seq": other}, MetadataPolicy.RAISE)
 
 
-def test_arrays_are_equal_only_to_themselves():
+def test_merge_metadata_compares_arrays_by_identity():
     array = np.zeros(2)
     merge_metadata({"a": array}, {"a": array}, MetadataPolicy.RAISE)
     for one, other in ((array, array.copy()), (array, 1), (1, array)):

@@ -20,7 +20,7 @@ from operators.graph.operator import InputContext
 
 
 @pytest.mark.parametrize(("policy", "received"), [("drop_oldest", [2, 5, 8]), ("drop_new", [0, 3, 6])])
-def test_drops_are_counted(kit, runner, policy, received):
+def test_edge_counts_dropped_messages_by_policy(kit, runner, policy, received):
     def wire(app):
         source, sink = app.counted(3, kit.Source, name="source", per_compute=3), kit.Collect(app, name="sink")
         app.add_flow(source, sink, policy=policy)
@@ -39,7 +39,7 @@ def test_drops_are_counted(kit, runner, policy, received):
         assert stats.dropped == {policy: 6}
 
 
-def test_a_dropping_edge_does_not_hold_up_its_producer(kit, runner):
+def test_drop_oldest_edge_does_not_block_producer(kit, runner):
     """A viewer never slows the graph: the source goes on while the viewer's frame is unseen."""
     seen = threading.Event()
 
@@ -71,7 +71,7 @@ def test_emitting_more_than_a_blocking_edge_holds_is_an_error(kit, runner):
     assert isinstance(caught.value.__cause__, QueueFull)
 
 
-def test_a_larger_capacity_takes_more(kit, runner):
+def test_edge_capacity_limits_messages_per_compute(kit, runner):
     with pytest.raises(OperatorFailed, match="holds 2"):
         # The default condition of an output asks for room for one message only.
         runner(
@@ -96,7 +96,7 @@ class Batch(Operator):
         self.values.append(op_input.receive("in"))
 
 
-def test_a_port_of_size_n_receives_n_at_once(kit, runner):
+def test_input_of_size_n_receives_n_messages_per_compute(kit, runner):
     def wire(app):
         batch = Batch(app)
         app.chain(app.counted(7, kit.Source), batch)
@@ -117,7 +117,7 @@ class Many(Operator):
         self.values.append(op_input.receive("in"))
 
 
-def test_any_size_receives_from_every_connection_in_order(kit, runner):
+def test_any_size_input_receives_from_connections_in_order(kit, runner):
     def wire(app):
         many = Many(app)
         for factor in (1, 10, 100):
@@ -164,7 +164,7 @@ class Feedback(Operator):
         op_output.emit(op_input.receive("in") + (op_input.receive("back") or 0), "out")
 
 
-def test_a_loop_runs_and_ends(kit, greedy_runner):
+def test_graph_with_feedback_loop_finishes(kit, greedy_runner):
     def wire(app):
         feedback, sink, tee = Feedback(app, name="sum"), kit.Collect(app, name="sink"), kit.Apply(app, name="tee")
         app.add_flow(app.counted(5, kit.Source), feedback, {("out", "in")})
@@ -211,14 +211,14 @@ class Misuse(Operator):
         (lambda ins, outs: ins.receive("in"), r"no input 'in'; it has \[\]"),
     ],
 )
-def test_misused_ports_are_errors(kit, runner, act, message):
+def test_port_misuse_raises_port_error(kit, runner, act, message):
     app = kit.Wired(lambda app: app.chain(Misuse(app, CountCondition(app, 1), act=act), kit.Collect(app)))
     with pytest.raises(OperatorFailed, match=message) as caught:
         runner(app)
     assert isinstance(caught.value.__cause__, PortError)
 
 
-def test_operators_find_each_other(kit, runner):
+def test_context_find_operator_returns_operator_by_name(kit, runner):
     found = []
 
     class Finder(Operator):
@@ -236,7 +236,7 @@ def test_operators_find_each_other(kit, runner):
     assert found == [*app.ops, None]
 
 
-def test_the_messages_that_wait_at_an_input_are_counted():
+def test_input_context_queued_counts_waiting_messages():
     ports = {"frame": SimpleNamespace(batched=False), "alone": SimpleNamespace(batched=False)}
     operator = SimpleNamespace(spec=SimpleNamespace(inputs=ports))
     waiting = [1, 2, 3]

@@ -51,7 +51,7 @@ def run_two(scheduler, fails=False):
 
 
 @pytest.mark.parametrize("scheduler", [GreedyScheduler, MultiThreadScheduler])
-def test_every_thread_is_prepared_once_before_anyone_computes(scheduler):
+def test_prepare_thread_runs_once_per_operator_before_any_compute(scheduler):
     events = run_two(scheduler)
     assert sorted(name for name, what, _ in events[:2] if what == "prepares") == ["first", "second"]
     assert [what for _, what, _ in events[2:]] == ["computes", "computes"]
@@ -60,6 +60,6 @@ def test_every_thread_is_prepared_once_before_anyone_computes(scheduler):
 
 
 @pytest.mark.parametrize("scheduler", [GreedyScheduler, MultiThreadScheduler])
-def test_what_it_raises_ends_the_run_before_anyone_computes(scheduler):
+def test_prepare_thread_error_ends_run_before_any_compute(scheduler):
     with pytest.raises(OperatorFailed, match=r"'second' failed in prepare_thread.*no font"):
         run_two(scheduler, fails=True)

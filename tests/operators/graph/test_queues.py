@@ -16,7 +16,7 @@ OPERATIONS = st.lists(st.sampled_from(["push", "push", "push", "pop", "pop", "cl
 
 
 @given(OPERATIONS, st.integers(1, 4), st.sampled_from(QueuePolicy))
-def test_every_message_is_accounted_for(operations, capacity, policy):
+def test_edge_statistics_account_for_every_message(operations, capacity, policy):
     edge, expected, seen = Edge("a -> b", capacity, policy), [], []
     for number, operation in enumerate(operations):
         if operation == "push":
@@ -52,7 +52,7 @@ def carried(policy):
     return edge, wire
 
 
-def test_a_carried_edge_never_overfills_the_engine():
+def test_carried_edge_keeps_engine_queue_within_capacity():
     edge, wire = carried(QueuePolicy.DROP_OLDEST)
     for number in range(5):
         edge.push(Message(number, None, ()))
@@ -61,7 +61,7 @@ def test_a_carried_edge_never_overfills_the_engine():
     assert edge.stats().dropped == {"drop_oldest": 4}
 
 
-def test_a_carried_edge_notices_a_message_out_of_order():
+def test_carried_edge_raises_on_message_out_of_order():
     edge, wire = carried(QueuePolicy.BLOCK)
     edge.push(Message(1, None, ()))
     wire[0] = Message(2, None, ())

@@ -27,7 +27,7 @@ from operators.graph import (
 )
 
 
-def test_greedy_order_is_topological_and_the_same_each_time(kit):
+def test_greedy_scheduler_order_is_topological_and_deterministic(kit):
     def trace(compose_backwards):
         order = []
 
@@ -59,7 +59,7 @@ def test_greedy_order_is_topological_and_the_same_each_time(kit):
     assert trace(True) == trace(False)
 
 
-def test_greedy_computes_in_the_calling_thread(kit):
+def test_greedy_scheduler_computes_in_calling_thread(kit):
     threads = set()
     app = kit.Wired(
         lambda app: app.chain(
@@ -70,12 +70,12 @@ def test_greedy_computes_in_the_calling_thread(kit):
     assert threads == {threading.current_thread()}
 
 
-def test_threads_refuse_a_manual_clock():
+def test_multi_thread_scheduler_refuses_manual_clock():
     with pytest.raises(GraphInvalid, match="ManualClock needs the GreedyScheduler"):
         MultiThreadScheduler(clock=ManualClock())
 
 
-def test_threads_compute_side_by_side(kit):
+def test_multi_thread_scheduler_computes_branches_in_parallel(kit):
     """Each of two branches waits until the other computes, which one thread could not do."""
     meet = threading.Barrier(2, timeout=300)
 
@@ -89,7 +89,7 @@ def test_threads_compute_side_by_side(kit):
     assert kit.guarded(app.run).reason is StopReason.FINISHED
 
 
-def test_threads_lose_nothing_under_pressure(kit):
+def test_multi_thread_scheduler_delivers_1000_messages_in_order(kit):
     def wire(app):
         source, sink = app.counted(1000, kit.Source, name="source"), kit.Collect(app, name="sink")
         join, viewer = kit.Join(app, name="join"), kit.Collect(app, name="viewer")
@@ -112,7 +112,7 @@ def test_threads_lose_nothing_under_pressure(kit):
         assert edge.sent == edge.received + sum(edge.dropped.values()) and edge.queued == 0
 
 
-def test_an_operator_that_does_not_return_is_named(kit):
+def test_operator_stuck_error_names_operator_that_does_not_return(kit):
     release, entered = threading.Event(), threading.Event()
     life = kit.Recorder()
 
@@ -136,7 +136,7 @@ def test_an_operator_that_does_not_return_is_named(kit):
     assert life.names("stop") == ["source"], "an operator that still computes must not be entered by stop"
 
 
-def test_run_async_gives_the_result_and_can_be_stopped_at_once(kit):
+def test_run_async_can_be_stopped_immediately(kit):
     app = kit.Wired(lambda app: app.chain(kit.Source(app), kit.Collect(app)))
     for _ in range(20):
         future = app.run_async()
@@ -144,7 +144,7 @@ def test_run_async_gives_the_result_and_can_be_stopped_at_once(kit):
         assert future.result(300).reason is StopReason.STOPPED
 
 
-def test_an_event_during_a_long_appointment_wakes_greedy(kit):
+def test_event_wakes_greedy_scheduler_during_periodic_wait(kit):
     """An event wakes its operator although another operator waits for an hour."""
     asleep, woken = threading.Event(), threading.Event()
 
@@ -174,13 +174,13 @@ def test_an_event_during_a_long_appointment_wakes_greedy(kit):
     assert future.result(300).reason is StopReason.STOPPED
 
 
-def test_an_unknown_engine_is_refused(kit):
+def test_run_refuses_unknown_engine(kit):
     with pytest.raises(ValueError, match="unknown engine 'cuda'; choose embedded or holoscan"):
         run(kit.Wired(lambda app: None), "cuda")
 
 
 @pytest.mark.holoscan
-def test_a_scheduler_without_counterpart_is_refused(kit, sdk):
+def test_holoscan_engine_refuses_scheduler_without_counterpart(kit, sdk):
     class Own:
         pass
 
@@ -228,7 +228,7 @@ INTERRUPTED = """
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", ["busy", "idle"])
 @pytest.mark.parametrize("where", ["main thread", "other thread"])  # the main one sleeps through what another is handed
-def test_ctrl_c_stops_every_operator_and_comes_out_of_run(runner, mode, where):
+def test_ctrl_c_stops_all_operators_and_run_raises_keyboard_interrupt(runner, mode, where):
     command = [sys.executable, "-c", textwrap.dedent(INTERRUPTED), runner.engine, runner.kind.__name__, mode, where]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300, env=os.environ, check=False)
     assert done.stdout.split("\n")[:2] == ["stopped", "interrupted stopped"], done.stderr

@@ -17,13 +17,13 @@ def hide(monkeypatch, *hidden):
     )
 
 
-def test_a_missing_sdk_names_the_extra(monkeypatch):
+def test_missing_sdk_error_names_pip_extra(monkeypatch):
     hide(monkeypatch, "holoscan")
     with pytest.raises(EngineMissing, match=r"not installed; install it with: pip install 'intrasplat\[holoscan\]'"):
         sdk.load_sdk()
 
 
-def test_a_missing_cuda_runtime_names_the_library_and_the_extra(monkeypatch):
+def test_missing_cuda_runtime_error_names_library_and_pip_extra(monkeypatch):
     hide(monkeypatch, "nvidia")
 
     def cannot(name, mode=0):
@@ -36,7 +36,7 @@ def test_a_missing_cuda_runtime_names_the_library_and_the_extra(monkeypatch):
         sdk._preload_cudart()
 
 
-def test_a_broken_sdk_says_what_the_loader_said(monkeypatch):
+def test_broken_sdk_error_includes_import_error(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: object())
     monkeypatch.setattr(sdk, "_preload_cudart", lambda: None)
 

@@ -9,27 +9,27 @@ from operators.graph import ConditionType, IOSpec, OperatorSpec, QueuePolicy
 
 
 @pytest.mark.parametrize(("size", "capacity", "batched"), [(1, 1, False), (2, 2, True), (IOSpec.ANY_SIZE, 1, True)])
-def test_an_input_holds_as_many_messages_as_its_size(size, capacity, batched):
+def test_input_capacity_equals_size(size, capacity, batched):
     port = OperatorSpec().input("in", size=size)
     assert (port.capacity, port.min_size, port.batched) == (capacity, capacity, batched)
     assert port.condition_type is ConditionType.MESSAGE_AVAILABLE and port.policy is QueuePolicy.BLOCK
 
 
-def test_an_output_waits_for_room_for_one_message():
+def test_output_min_size_is_one_message():
     port = OperatorSpec().output("out", size=3)
     assert (port.capacity, port.min_size) == (3, 1)
     assert port.condition_type is ConditionType.DOWNSTREAM_MESSAGE_AFFORDABLE
 
 
 @pytest.mark.parametrize("size", [0, -2])
-def test_a_size_below_one_is_refused(size):
+def test_port_size_below_one_is_refused(size):
     with pytest.raises(GraphInvalid, match=f"size must be at least 1, got {size}"):
         OperatorSpec().input("in", size=size)
     with pytest.raises(GraphInvalid, match="size must be at least 1, got -1"):
         OperatorSpec().output("out", size=IOSpec.ANY_SIZE)
 
 
-def test_conditions_and_queues_belong_to_their_ports():
+def test_port_refuses_condition_or_queue_of_other_direction():
     spec = OperatorSpec("op")
     port, out = spec.input("in"), spec.output("out")
     assert port.condition(ConditionType.NONE) is port and port.condition_type is ConditionType.NONE
@@ -52,7 +52,7 @@ def test_conditions_and_queues_belong_to_their_ports():
         out.connector(out.ConnectorType.DEFAULT)
 
 
-def test_names_are_unique_and_policies_known():
+def test_spec_refuses_duplicate_names_and_unknown_policy():
     spec = OperatorSpec("op")
     spec.input("a")
     spec.output("a")

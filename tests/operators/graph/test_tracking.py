@@ -13,7 +13,7 @@ from operators.graph.tracking import FlowTracker, Histogram
 
 
 @given(st.lists(st.integers(0, 2**44 - 1), min_size=1, max_size=200))
-def test_percentiles_are_at_most_one_bucket_above(durations):
+def test_histogram_percentiles_exceed_exact_by_at_most_one_bucket(durations):
     histogram = Histogram()
     for duration in durations:
         histogram.record(duration)
@@ -25,7 +25,7 @@ def test_percentiles_are_at_most_one_bucket_above(durations):
         assert exact_ms * (1 - 1e-12) <= found_ms <= exact_ms * (1 + 1 / 32) + 1e-12
 
 
-def test_a_share_of_the_durations_is_never_one_too_many():
+def test_histogram_quantile_rank_is_not_rounded_up():
     # Up to 63 every duration has its own bucket; in floats 0.07 * 100 and 0.55 * 20 are above 7 and 11.
     for count in (20, 25, 50):
         histogram = Histogram()
@@ -35,7 +35,7 @@ def test_a_share_of_the_durations_is_never_one_too_many():
         np.testing.assert_allclose(found, np.arange(1, count + 1) * 1e-6, rtol=1e-12)
 
 
-def test_durations_beyond_the_range_are_kept_as_the_longest():
+def test_histogram_clamps_durations_beyond_range():
     histogram = Histogram()
     histogram.record(2**60)
     histogram.record(-5)
@@ -46,7 +46,7 @@ def test_durations_beyond_the_range_are_kept_as_the_longest():
     st.lists(st.integers(0, 10**10), max_size=100),
     st.lists(st.integers(0, 10**10), min_size=1, max_size=9, unique=True),
 )
-def test_durations_between_bounds_are_all_counted_once(durations, bounds):
+def test_histogram_between_counts_each_duration_once(durations, bounds):
     histogram, bounds = Histogram(), sorted(bounds)
     for duration in durations:
         histogram.record(duration)
@@ -59,7 +59,7 @@ def test_durations_between_bounds_are_all_counted_once(durations, bounds):
         )
 
 
-def test_an_empty_histogram_is_all_zero():
+def test_empty_histogram_summary_is_zero():
     assert Histogram().summary().count == 0 and Histogram().summary().p99_ms == 0.0
 
 
@@ -79,7 +79,7 @@ def diamond(kit, app, count):
     app.add_flow(source, kit.Collect(app, name="raw"))
 
 
-def test_every_path_from_root_to_leaf_has_its_latency(kit, runner):
+def test_tracker_has_latency_of_every_path_from_root_to_leaf(kit, runner):
     app = kit.Wired(lambda app: diamond(kit, app, 12), track=True)
     for _ in range(2):  # begins anew with each run
         runner(app)
@@ -95,7 +95,7 @@ def test_every_path_from_root_to_leaf_has_its_latency(kit, runner):
         assert 2.0 <= compute["depth"].p50_ms <= compute["depth"].p99_ms <= compute["depth"].max_ms
 
 
-def test_flow_is_readable_while_running(kit, runner):
+def test_flow_tracker_is_readable_during_run(kit, runner):
     passed, go_on = threading.Event(), threading.Event()
 
     def pause(value):
@@ -121,13 +121,13 @@ def test_flow_is_readable_while_running(kit, runner):
     assert tracker.latency()["src,sink"].count == 9
 
 
-def test_without_tracking_nothing_is_kept(kit, greedy_runner):
+def test_tracker_is_empty_if_tracking_is_off(kit, greedy_runner):
     app = kit.Wired(lambda app: app.chain(app.counted(3, kit.Source), kit.Collect(app)))
     greedy_runner(app)
     assert app.track().latency() == {} == app.track().compute()
 
 
-def test_the_oldest_origin_of_a_path_counts_and_loops_end():
+def test_tracker_extend_keeps_oldest_origin_and_ends_loops():
     tracker = FlowTracker()
     old, new = tracker.begin("src", 100), tracker.begin("src", 200)
     ((node, began_ns),) = tracker.extend("join", [new, old])
@@ -135,7 +135,7 @@ def test_the_oldest_origin_of_a_path_counts_and_loops_end():
     assert tracker.extend("src", [((node, began_ns),)]) == ()
 
 
-def test_a_chain_of_diamonds_does_not_explode():
+def test_tracker_limits_paths_of_chained_diamonds_to_64():
     tracker, trails = FlowTracker(), []
     trail = tracker.begin("src", 0)
     for depth in range(40):
@@ -144,7 +144,7 @@ def test_a_chain_of_diamonds_does_not_explode():
     assert len(trail) == 64
 
 
-def test_durations_are_summed_and_counted_up_to_a_bound():
+def test_histogram_sums_durations_and_counts_between_bounds():
     histogram = Histogram()
     for duration in (-4, 0, 10, 20, 20, 63, 2**44, 2**50):
         histogram.record(duration)
@@ -154,7 +154,7 @@ def test_durations_are_summed_and_counted_up_to_a_bound():
     assert histogram.quantiles_ms((0.25, 0.5, 1.0)) == [0.0, 20 * 1e-6, (2**44 - 1) * 1e-6]
 
 
-def test_a_bucket_is_a_32nd_of_an_octave():
+def test_histogram_bucket_width_is_one_32nd_of_octave():
     for duration, end in (
         (63, 63),
         (64, 65),
@@ -171,7 +171,7 @@ def test_a_bucket_is_a_32nd_of_an_octave():
         assert histogram.quantiles_ms((0.5,)) == [end * 1e-6]
 
 
-def test_a_leaf_counts_each_path_and_a_loop_none():
+def test_tracker_finish_counts_each_path_and_no_loop():
     tracker = FlowTracker()
     root = tracker.begin("source", 5)
     assert tracker.begin("source", 7)[0][0] is root[0][0]
@@ -181,7 +181,7 @@ def test_a_leaf_counts_each_path_and_a_loop_none():
     assert tracker.paths() == {} == tracker.operators()
 
 
-def test_curves_are_given_by_path():
+def test_tracker_latency_quantiles_are_given_by_path():
     tracker = FlowTracker()
     tracker.finish("sink", [tracker.begin("source", 0)])
     ((path, values),) = tracker.latency_quantiles_ms((0.5, 1.0)).items()

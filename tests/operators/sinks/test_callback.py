@@ -5,7 +5,7 @@ from __future__ import annotations
 from operators.sinks.sink import CallbackSinkOp
 
 
-def test_a_callback_gets_each_message(rendered, compute):
+def test_callback_sink_calls_function_with_each_message(rendered, compute):
     seen = []
     operator = CallbackSinkOp(None, callback=seen.append)
     operator.start()

@@ -11,7 +11,7 @@ from operators.sinks.video import write_png
 
 
 @pytest.mark.parametrize(("shape", "dtype"), [((7, 5, 3), np.uint8), ((7, 5), np.uint8), ((7, 5), np.uint16)])
-def test_every_value_comes_back(tmp_path, shape, dtype, rng):
+def test_write_png_round_trip_is_lossless(tmp_path, shape, dtype, rng):
     image = rng.integers(0, np.iinfo(dtype).max, shape, dtype, endpoint=True)
     write_png(tmp_path / "picture.png", image)
     read = cv2.imread(str(tmp_path / "picture.png"), cv2.IMREAD_UNCHANGED)
@@ -20,7 +20,7 @@ def test_every_value_comes_back(tmp_path, shape, dtype, rng):
 
 
 @pytest.mark.parametrize("image", [np.zeros((4, 4)), np.zeros((4, 4, 7), np.uint8), np.zeros(4, np.uint8)])
-def test_what_png_cannot_hold_is_refused(tmp_path, image):
+def test_write_png_refuses_unsupported_shape_or_dtype(tmp_path, image):
     with pytest.raises(InvalidInput, match=r"must be \[H, W\] or \[H, W, 3\] of uint8 or uint16"):
         write_png(tmp_path / "picture.png", image)
     assert list(tmp_path.iterdir()) == []

@@ -25,7 +25,7 @@ def keep(count, length, rendered, compute, worst=None):
 
 
 @pytest.mark.parametrize("length", [1, 2, 5, 11, 64, 130])
-def test_first_last_and_evenly_between(length, rendered, compute):
+def test_keyframes_include_first_and_last_and_are_evenly_spaced(length, rendered, compute):
     operator, held = keep(5, length, rendered, compute)
     seqs = [f.rendered.frame.seq for f in operator.keyframes]
     assert seqs == sorted(set(seqs)) and len(seqs) == min(5, length)
@@ -35,19 +35,19 @@ def test_first_last_and_evenly_between(length, rendered, compute):
     assert max(gaps, default=0) <= max(1, length / 2)
 
 
-def test_the_worst_frame_is_among_them(rendered, compute):
+def test_keyframes_include_worst_frame(rendered, compute):
     operator, _ = keep(5, 50, rendered, compute, worst=37)
     assert operator.worst_seq == 37
     assert 37 in [f.rendered.frame.seq for f in operator.keyframes]
 
 
-def test_without_a_frame_there_are_none():
+def test_keyframes_are_empty_without_frames():
     operator = KeyframesOp(None)
     operator.start()
     assert operator.keyframes == [] and operator.worst_seq is None
 
 
-def test_planes_that_no_picture_shows_are_not_kept(rendered, frame, compute):
+def test_keyframes_drop_right_image_and_measured_depth(rendered, frame, compute):
     image = frame(0).image
     full = frame(
         0, right_image=image, depth=np.ones(image.shape[:2], np.float32), mask=np.ones(image.shape[:2], np.uint8)

@@ -11,7 +11,7 @@ from operators.outcome import OutcomeBuilder
 from operators.sinks.video import OutputVideosOp
 
 
-def test_each_output_is_a_video_of_all_frames(tmp_path, rendered, compute):
+def test_output_videos_sink_writes_one_video_per_output(tmp_path, rendered, compute):
     sink = OutputVideosOp(None, folder=tmp_path, outputs=("depth", "normals", "image"), fps=10.0)
     for seq in range(3):
         shown = rendered(seq)

@@ -10,19 +10,19 @@ from operators.sinks.video import CAPTION_HEIGHT_PX, depth_map, depth_range, err
 GREY = (70, 74, 80)
 
 
-def test_no_error_is_dark_and_much_error_is_bright(rendered):
+def test_error_map_brightness_follows_error(rendered):
     assert error_map(rendered(0, offset=0)).max() < 10
     assert error_map(rendered(0, offset=32)).mean() > 200
 
 
-def test_tools_are_grey_because_they_are_not_scored(rendered, frame):
+def test_error_map_shows_tools_grey(rendered, frame):
     mask = np.ones((16, 24), np.uint8)
     mask[2, 3] = 0
     picture = error_map(rendered(frame=frame(0, mask=mask)))
     assert tuple(picture[2, 3]) == GREY and tuple(picture[2, 4]) != GREY
 
 
-def test_near_is_bright_far_is_dark_unknown_is_grey(rendered):
+def test_depth_map_shows_near_bright_far_dark_and_unknown_grey(rendered):
     depth = np.linspace(40, 80, 24, dtype=np.float32)[None].repeat(16, 0)
     depth[0] = 0
     shown = rendered(depth=depth)
@@ -33,7 +33,7 @@ def test_near_is_bright_far_is_dark_unknown_is_grey(rendered):
     assert 40 <= near < 42 and 78 < far <= 80
 
 
-def test_a_flat_scene_is_one_colour_and_an_empty_one_has_no_range(rendered):
+def test_depth_map_of_flat_scene_has_one_colour(rendered):
     flat = rendered(depth=np.full((16, 24), 60, np.float32))
     assert np.ptp(depth_map(flat).reshape(-1, 3), axis=0).max() == 0
     assert depth_range(rendered(depth=np.zeros((16, 24), np.float32))) is None
@@ -48,7 +48,7 @@ def test_a_flat_scene_is_one_colour_and_an_empty_one_has_no_range(rendered):
         ((100, 1), (10, 10), (0, 10, 4, 5)),
     ],
 )
-def test_a_picture_is_fitted_without_being_stretched(size, wanted, box):
+def test_fitted_picture_keeps_aspect_ratio(size, wanted, box):
     canvas = fitted(np.full((*size, 3), 200, np.uint8), *wanted)
     bright = (canvas == 200).all(-1)
     top, bottom, left, right = box
@@ -57,7 +57,7 @@ def test_a_picture_is_fitted_without_being_stretched(size, wanted, box):
 
 
 @pytest.mark.parametrize(("width", "zoom"), [(24, 14), (319, 2), (320, 1), (321, 1)])
-def test_small_pictures_are_enlarged_by_a_whole_factor(rendered, frame, width, zoom):
+def test_side_by_side_enlarges_small_pictures_by_integer_factor(rendered, frame, width, zoom):
     image = np.full((16, width, 3), 90, np.uint8)
     pair = side_by_side(rendered(frame=frame(image=image)))
     assert pair.shape == (CAPTION_HEIGHT_PX + 16 * zoom, 2 * width * zoom, 3)
@@ -66,7 +66,7 @@ def test_small_pictures_are_enlarged_by_a_whole_factor(rendered, frame, width, z
     assert (below[:, zoom * width - 1 : zoom * width + 1] == (17, 20, 24)).all()
 
 
-def test_the_range_of_depth_is_from_the_2nd_to_the_98th_percentile_of_what_is_known(rendered):
+def test_depth_range_is_2nd_to_98th_percentile_of_known_depth(rendered):
     depth = np.arange(1, 385, dtype=np.float32).reshape(16, 24)
     alpha = np.full((16, 24), 0.51, np.float32)
     known = np.arange(3, 383)

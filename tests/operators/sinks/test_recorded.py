@@ -21,7 +21,7 @@ from operators.sinks.session_recorder import Recorded, stated
         ({"deleted_sessions": 2}, ["earlier recordings next to .*: 2$"]),
     ],
 )  # fmt: skip
-def test_each_loss_is_one_sentence(fields, said):
+def test_stated_gives_one_sentence_per_recording_loss(fields, said):
     import re
 
     found = stated(Recorded(Path("/session"), **fields))

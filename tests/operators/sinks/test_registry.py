@@ -14,7 +14,7 @@ from operators.sources.recording import RecordingSource
 from operators.storage import StorageReserve
 
 
-def test_each_sink_takes_rendered_or_scored_frames(tmp_path, recording):
+def test_registered_sinks_take_rendered_or_scored_frames(tmp_path, recording):
     options = SinkOptions(tmp_path, RecordingSource(recording).description, StorageReserve(tmp_path, lambda: 0))
     made = {name: SINKS[name](None, name, options) for name in SINKS}
     assert {name: input_of(sink) for name, sink in made.items()} == {
@@ -25,11 +25,11 @@ def test_each_sink_takes_rendered_or_scored_frames(tmp_path, recording):
     assert made["video"].path.parent == tmp_path and made["video"].fps == recording.fps
 
 
-def test_an_operator_whose_input_takes_anything_is_no_sink():
+def test_input_of_refuses_sink_with_untyped_input():
     with pytest.raises(InvalidInput, match="it must have one, declared with type=RenderedFrame or type=ScoredFrame"):
         input_of(CallbackSinkOp(None, name="any", callback=print))
 
 
-def test_an_unknown_sink_is_refused_by_its_name(tmp_path):
+def test_replay_settings_refuse_unknown_sink(tmp_path):
     with pytest.raises(InvalidSetting, match=r"sinks is \('hologram',\); choose video or keyframes"):
         ReplaySettings(tmp_path, tmp_path / "out", sinks=("hologram",))

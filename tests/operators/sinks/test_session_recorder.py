@@ -50,7 +50,7 @@ def frames_of(folder: Path):
     return [frame for _, frame in SessionReader(folder / "s").frames() if frame is not None]
 
 
-def test_everything_is_there_when_it_is_closed(tmp_path):
+def test_closed_recorder_has_written_all_frames_and_shown_pictures(tmp_path):
     recorder = recorder_in(tmp_path)
     frames = [new_frame(seq) for seq in range(20)]
     for frame in frames:
@@ -67,7 +67,7 @@ def test_everything_is_there_when_it_is_closed(tmp_path):
     assert stated(recorded) == []
 
 
-def test_a_slow_disk_loses_frames_says_so_and_makes_nobody_wait(tmp_path, gate):
+def test_recorder_drops_and_counts_frames_on_slow_disk_without_blocking(tmp_path, gate):
     frames = [new_frame(seq) for seq in range(50)]
     size = sum(
         frames[0].__dict__[name].nbytes
@@ -87,7 +87,7 @@ def test_a_slow_disk_loses_frames_says_so_and_makes_nobody_wait(tmp_path, gate):
     assert "40 times" in stated(recorder.recorded)[0]
 
 
-def test_shown_pictures_are_lost_before_frames(tmp_path, gate):
+def test_recorder_drops_shown_pictures_before_frames(tmp_path, gate):
     frames = [
         new_frame(seq, right_image=None, depth=None, depth_confidence=None, mask=None, loss_mask=None)
         for seq in range(8)
@@ -104,7 +104,7 @@ def test_shown_pictures_are_lost_before_frames(tmp_path, gate):
     assert recorded.lost == {"shown: writing is too slow": 4 - recorded.shown}
 
 
-def test_what_was_prepared_of_a_lost_frame_is_lost_too(tmp_path, gate):
+def test_recorder_drops_prepared_frame_of_lost_frame(tmp_path, gate):
     frames = [new_frame(seq) for seq in range(3)]
     recorder = recorder_in(tmp_path, queue_bytes=8000)
     for frame in frames:
@@ -120,7 +120,7 @@ def test_what_was_prepared_of_a_lost_frame_is_lost_too(tmp_path, gate):
     }
 
 
-def test_a_full_disk_ends_the_recording_and_not_the_session(tmp_path, monkeypatch):
+def test_full_disk_ends_recording_but_not_session(tmp_path, monkeypatch):
     room = [0]
     recorder = recorder_in(tmp_path, reserve=StorageReserve(tmp_path, lambda: room[0]))
     for seq in range(5):
@@ -139,7 +139,7 @@ def test_a_full_disk_ends_the_recording_and_not_the_session(tmp_path, monkeypatc
 
 
 @pytest.mark.parametrize("error", [OSError(28, "No space left on device"), OSError(5, "Input/output error")])
-def test_a_disk_that_fails_ends_the_recording_with_one_sentence(tmp_path, monkeypatch, error):
+def test_disk_error_ends_recording_with_one_line_reason(tmp_path, monkeypatch, error):
     recorder = recorder_in(tmp_path)
     recorder.frame(new_frame(0))
     while recorder.recorded.frames < 1:
@@ -157,7 +157,7 @@ def test_a_disk_that_fails_ends_the_recording_with_one_sentence(tmp_path, monkey
 
 
 @pytest.mark.slow
-def test_a_file_that_may_not_grow_any_more_ends_the_recording(tmp_path):
+def test_file_size_limit_ends_recording(tmp_path):
     """Apply a real system limit in a separate process."""
     program = f"""
 import resource, signal
@@ -183,7 +183,7 @@ print(recorder.recorded.ended)
 
 
 @pytest.mark.slow
-def test_killed_at_any_moment_it_plays_up_to_there(tmp_path):
+def test_recording_of_killed_process_is_readable_to_last_frame(tmp_path):
     program = f"""
 from pathlib import Path
 from operators.sinks.session_recorder import SessionRecorder
@@ -220,7 +220,7 @@ for seq in range(100_000):
     assert len(list(recording)) == len(frames)
 
 
-def test_a_frame_that_no_recording_can_hold_is_counted(tmp_path):
+def test_recorder_counts_frame_with_invalid_pose_as_lost(tmp_path):
     pose = np.full((4, 4), np.nan)
     recorder = recorder_in(tmp_path)
     recorder.frame(new_frame(0))
@@ -233,7 +233,7 @@ def test_a_frame_that_no_recording_can_hold_is_counted(tmp_path):
     assert line.seq == 1 and "pose" in line.why
 
 
-def test_a_bug_in_the_thread_is_raised_where_it_is_closed(tmp_path, monkeypatch):
+def test_recorder_close_raises_error_of_writer_thread(tmp_path, monkeypatch):
     def broken(self, frame):
         raise ZeroDivisionError("a bug")
 
@@ -245,7 +245,7 @@ def test_a_bug_in_the_thread_is_raised_where_it_is_closed(tmp_path, monkeypatch)
     recorder.close()
 
 
-def test_a_disk_that_does_not_answer_is_given_up(tmp_path, gate, monkeypatch):
+def test_recorder_close_gives_up_on_unresponsive_disk(tmp_path, gate, monkeypatch):
     monkeypatch.setattr(session_recorder, "CLOSE_S", 0.2)
     recorder = recorder_in(tmp_path)
     recorder.frame(new_frame(0))
@@ -253,7 +253,7 @@ def test_a_disk_that_does_not_answer_is_given_up(tmp_path, gate, monkeypatch):
     assert recorder.recorded.ended is not None and "does not answer" in recorder.recorded.ended
 
 
-def test_what_is_being_written_is_waited_for(tmp_path, monkeypatch):
+def test_recorder_close_waits_for_slow_writes(tmp_path, monkeypatch):
     monkeypatch.setattr(session_recorder, "CLOSE_S", 3.0)
     written = SessionWriter.frame
 
@@ -269,7 +269,7 @@ def test_what_is_being_written_is_waited_for(tmp_path, monkeypatch):
     assert (recorder.recorded.frames, recorder.recorded.ended) == (16, None)
 
 
-def test_a_folder_with_a_recording_is_refused(tmp_path):
+def test_recorder_refuses_folder_that_holds_recording(tmp_path):
     recorder_in(tmp_path).close()
     with pytest.raises(OutputError, match="already holds a recording"):
         recorder_in(tmp_path)
@@ -279,7 +279,7 @@ def recorder_of(folder, reserve=None):
     return SessionRecorder(folder, session_info(), reserve=reserve)
 
 
-def test_a_disk_that_is_full_at_the_beginning_is_refused_and_nothing_is_left(tmp_path):
+def test_recorder_open_on_full_disk_fails_without_leftovers(tmp_path):
     full = StorageReserve(tmp_path, lambda: 2**62)
     (tmp_path / "out").mkdir()
     for folder in (tmp_path / "out" / "recordings" / "s", tmp_path / "s", tmp_path / "out" / "s"):
@@ -288,7 +288,7 @@ def test_a_disk_that_is_full_at_the_beginning_is_refused_and_nothing_is_left(tmp
     assert [path.name for path in tmp_path.rglob("*")] == ["out"], "folders that were there before stay"
 
 
-def test_a_recording_that_cannot_begin_leaves_earlier_recordings_beside_it(tmp_path, monkeypatch):
+def test_failed_recorder_open_keeps_earlier_recordings(tmp_path, monkeypatch):
     (tmp_path / "recordings" / "earlier").mkdir(parents=True)
 
     def begun(folder, *_):
@@ -310,7 +310,7 @@ def _root() -> Path:
     return Path(__file__).resolve().parents[3]
 
 
-def test_late_depth_that_finds_no_room_is_lost_in_its_place(tmp_path, gate):
+def test_recorder_logs_lost_late_depth_at_its_schedule_position(tmp_path, gate):
     recorder = recorder_in(tmp_path, queue_bytes=10_000)
     recorder.frame(new_frame(0))
     recorder.line(Observed(seq=0, steps=1, train=True))

@@ -20,7 +20,7 @@ def frames_of(path):
     return frames
 
 
-def test_the_video_shows_raw_and_reconstruction_side_by_side(tmp_path, rendered, compute):
+def test_video_sink_shows_raw_and_reconstruction_side_by_side(tmp_path, rendered, compute):
     operator = VideoSinkOp(None, path=tmp_path / "out.mp4", fps=25.0)
     operator.start()
     for k in range(4):
@@ -35,7 +35,7 @@ def test_the_video_shows_raw_and_reconstruction_side_by_side(tmp_path, rendered,
     assert 20 < float(reconstruction.mean()) - float(raw.mean()) < 40
 
 
-def test_the_caption_tells_frame_and_model(tmp_path, rendered, compute):
+def test_video_caption_changes_with_model_version_and_training(tmp_path, rendered, compute):
     """The caption changes with the frame number and never covers the picture; no character recognition is used."""
     from operators.sinks.video import CAPTION_HEIGHT_PX, side_by_side
 
@@ -46,14 +46,14 @@ def test_the_caption_tells_frame_and_model(tmp_path, rendered, compute):
     assert (np.abs(one.astype(int) - held_out).sum(axis=2) > 0)[:CAPTION_HEIGHT_PX].any()
 
 
-def test_stopping_without_a_frame_leaves_no_file(tmp_path):
+def test_video_sink_without_frames_leaves_no_file(tmp_path):
     operator = VideoSinkOp(None, path=tmp_path / "out.mp4", fps=25.0)
     operator.start()
     operator.stop()
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_failed_run_keeps_the_video_of_the_run_before(tmp_path, rendered, compute):
+def test_video_sink_keeps_earlier_video_if_run_fails(tmp_path, rendered, compute):
     path = tmp_path / "out.mp4"
     path.write_bytes(b"earlier")
     operator = VideoSinkOp(None, path=path, fps=25.0, reserve=StorageReserve(tmp_path, lambda: 1 << 60))
@@ -64,7 +64,7 @@ def test_a_failed_run_keeps_the_video_of_the_run_before(tmp_path, rendered, comp
     assert path.read_bytes() == b"earlier" and len(list(tmp_path.iterdir())) == 1
 
 
-def test_a_full_disk_stops_the_video_while_it_can_still_be_finished(tmp_path, rendered, compute):
+def test_video_sink_finishes_video_if_disk_fills_up(tmp_path, rendered, compute):
     reserve_bytes = 0
     operator = VideoSinkOp(
         None, path=tmp_path / "out.mp4", fps=25.0, reserve=StorageReserve(tmp_path, lambda: reserve_bytes)
@@ -80,7 +80,7 @@ def test_a_full_disk_stops_the_video_while_it_can_still_be_finished(tmp_path, re
 
 
 @pytest.mark.parametrize("size", [(400, 500), (9, 700), (300, 8)])
-def test_a_frame_of_another_size_is_fitted_into_the_video(tmp_path, rendered, frame, compute, size):
+def test_video_sink_fits_frame_of_other_size(tmp_path, rendered, frame, compute, size):
     operator = VideoSinkOp(None, path=tmp_path / "out.mp4", fps=25.0)
     operator.start()
     compute(operator, rendered=rendered(0))
@@ -91,7 +91,7 @@ def test_a_frame_of_another_size_is_fitted_into_the_video(tmp_path, rendered, fr
     assert 150 < second.max() <= 255
 
 
-def test_the_sink_contributes_the_number_of_frames_and_the_video_if_any(tmp_path, rendered, compute):
+def test_video_sink_contributes_frame_count_and_video_path(tmp_path, rendered, compute):
     operator, outcome = VideoSinkOp(None, path=tmp_path / "out.mp4", fps=25.0), OutcomeBuilder()
     operator.contribute(outcome)
     assert outcome.find(DisplayResult) == DisplayResult(0) and outcome.outputs == {}

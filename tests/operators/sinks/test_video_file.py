@@ -29,7 +29,7 @@ def _read(path: Path) -> list[tuple[float, np.ndarray]]:
 
 
 @pytest.mark.parametrize("size", [(48, 64), (47, 63), (1, 1), (16, 500)])
-def test_what_is_read_is_what_was_written(tmp_path: Path, size: tuple[int, int]) -> None:
+def test_video_file_round_trip_preserves_frames_and_times(tmp_path: Path, size: tuple[int, int]) -> None:
     written = _pictures(6, *size)
     with VideoFile(tmp_path / "v.mp4", size[1], size[0], 25.0) as video:
         for image in written:
@@ -42,7 +42,7 @@ def test_what_is_read_is_what_was_written(tmp_path: Path, size: tuple[int, int])
     assert [path.name for path in tmp_path.iterdir()] == ["v.mp4"]
 
 
-def test_times_are_those_of_the_recording_and_rise(tmp_path: Path) -> None:
+def test_video_file_times_follow_recording_and_increase(tmp_path: Path) -> None:
     with VideoFile(tmp_path / "v.mp4", 64, 48, 30.0) as video:
         for image, time_s in zip(_pictures(5), (0.0, 0.5, 0.5, 0.4, 2.0), strict=True):
             video.write(image, time_s)
@@ -51,7 +51,7 @@ def test_times_are_those_of_the_recording_and_rise(tmp_path: Path) -> None:
     assert all(later > earlier for earlier, later in pairwise(times))
 
 
-def test_without_frames_there_is_no_file_and_an_earlier_one_stays(tmp_path: Path) -> None:
+def test_video_file_without_frames_keeps_earlier_file(tmp_path: Path) -> None:
     (tmp_path / "v.mp4").write_bytes(b"earlier")
     VideoFile(tmp_path / "v.mp4", 64, 48, 30.0).close()
     assert (tmp_path / "v.mp4").read_bytes() == b"earlier"
@@ -63,7 +63,7 @@ def test_without_frames_there_is_no_file_and_an_earlier_one_stays(tmp_path: Path
     assert len(_read(tmp_path / "v.mp4")) == 1 and len(list(tmp_path.iterdir())) == 1
 
 
-def test_what_cannot_be_written(tmp_path: Path) -> None:
+def test_video_file_refuses_wrong_size_and_full_disk(tmp_path: Path) -> None:
     with VideoFile(tmp_path / "v.mp4", 64, 48, 30.0) as video:
         video.write(_pictures(1)[0])
         with pytest.raises(OutputError, match=r"\[48, 60\]"):
@@ -93,7 +93,7 @@ def _encoders() -> list[str]:
     return [thread.name for thread in threading.enumerate() if thread.name.startswith("encode v.mp4")]
 
 
-def test_a_disk_that_is_full_while_a_frame_is_coded_is_told_by_a_later_call_and_leaves_no_file(
+def test_video_file_raises_encoder_error_on_later_write_and_leaves_no_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _fail_from(1, monkeypatch)
@@ -107,7 +107,7 @@ def test_a_disk_that_is_full_while_a_frame_is_coded_is_told_by_a_later_call_and_
     assert list(tmp_path.iterdir()) == [] and _encoders() == []
 
 
-def test_a_last_frame_that_cannot_be_coded_is_told_by_closing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_video_file_close_raises_encoder_error_of_last_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "v.mp4").write_bytes(b"earlier")
     _fail_from(0, monkeypatch)
     video = VideoFile(tmp_path / "v.mp4", 64, 48, 30.0)
@@ -119,7 +119,7 @@ def test_a_last_frame_that_cannot_be_coded_is_told_by_closing(tmp_path: Path, mo
     assert _encoders() == []
 
 
-def test_a_written_picture_may_be_changed_at_once(tmp_path: Path) -> None:
+def test_video_file_copies_written_picture(tmp_path: Path) -> None:
     picture = np.full((48, 64, 3), 200, np.uint8)
     with VideoFile(tmp_path / "v.mp4", 64, 48, 30.0) as video:
         for _ in range(4):

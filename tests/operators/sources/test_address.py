@@ -11,7 +11,7 @@ from gsplat_core.errors import InvalidSetting
 from operators.sources.address import PARSERS, Address, SourceOptions, UrlAddress
 
 
-def test_an_address_has_a_place_and_options():
+def test_address_parse_returns_place_and_options():
     address = Address.parse("pipe", "/path/of a/fifo?size=640x512&name=a%20b&empty=")
     assert (address.scheme, address.place) == ("pipe", "/path/of a/fifo")
     assert address.options == {"size": "640x512", "name": "a b", "empty": ""}
@@ -20,7 +20,7 @@ def test_an_address_has_a_place_and_options():
 
 
 @pytest.mark.parametrize("query", ["a=1&a=1", "b=3&a=1&a=2", "a=1&b=2&a=3"])
-def test_an_option_that_is_there_twice_is_refused(query):
+def test_address_refuses_duplicate_option(query):
     with pytest.raises(InvalidSetting, match="pipe: the option 'a' occurs twice"):
         Address.parse("pipe", f"-?{query}")
 
@@ -84,12 +84,12 @@ def test_each_kind_of_option_has_its_values(kind, text, value):
     address.refuse_others()  # an option that was asked for is no other one
 
 
-def test_no_size_is_none_and_no_flag_is_no():
+def test_missing_size_is_none_and_missing_flag_is_false():
     address = Address("cam", "0")
     assert address.size() is None and address.flag("it") is False
 
 
-def test_an_option_that_nobody_asked_for_is_refused_with_the_known_ones():
+def test_refuse_others_error_lists_known_options():
     address = Address("cam", "0", {"fsp": "30"})
     with pytest.raises(InvalidSetting, match="unknown option 'fsp'; known are none"):
         address.refuse_others()
@@ -108,7 +108,7 @@ def test_an_option_that_nobody_asked_for_is_refused_with_the_known_ones():
         ("stereo", [None, "side_by_side", "top_bottom"], ["both", ""]),
     ],
 )
-def test_options_have_ranges(name, possible, impossible):
+def test_source_options_refuse_values_out_of_range(name, possible, impossible):
     for value in possible:
         assert getattr(SourceOptions(**{name: value}), name) == value
     for value in impossible:
@@ -116,7 +116,7 @@ def test_options_have_ranges(name, possible, impossible):
             SourceOptions(**{name: value})
 
 
-def test_a_source_that_is_asked_for_nothing_keeps_two_frames_and_the_recorded_pace():
+def test_source_options_defaults():
     options = SourceOptions()
     assert (options.waiting, options.speed, options.scale, options.fps, options.max_frames) == (2, 1.0, 1.0, None, None)
     assert not (options.realtime or options.loop or options.bounce)
@@ -141,7 +141,7 @@ def test_a_source_that_is_asked_for_nothing_keeps_two_frames_and_the_recorded_pa
         ("zmq+ipc", "open_s", "0.1", "600", ("0.09", "601")),
     ],
 )
-def test_options_of_addresses_have_ranges(scheme, name, least, most, beyond):
+def test_address_options_refuse_values_out_of_range(scheme, name, least, most, beyond):
     for value in (least, most):
         PARSERS[scheme](f"place?{name}={value}", SourceOptions())
     for value in beyond:
@@ -150,7 +150,7 @@ def test_options_of_addresses_have_ranges(scheme, name, least, most, beyond):
 
 
 @pytest.mark.parametrize("name", ["open_s", "stall_s"])
-def test_times_of_urls_have_ranges(name):
+def test_url_timeouts_refuse_values_out_of_range(name):
     for value in ("0.1", "600"):
         assert getattr(UrlAddress.parse("rtsp", f"scope:554/live#{name}={value}"), name) == float(value)
     for value in ("0.09", "601"):
@@ -158,7 +158,7 @@ def test_times_of_urls_have_ranges(name):
             UrlAddress.parse("rtsp", f"scope:554/live#{name}={value}")
 
 
-def test_addresses_without_options_have_defaults():
+def test_address_option_defaults():
     synthetic = PARSERS["synthetic"]("", SourceOptions())
     assert (synthetic.width_px, synthetic.height_px, synthetic.fps, synthetic.seed, synthetic.eyes) == (
         640,
@@ -176,14 +176,14 @@ def test_addresses_without_options_have_defaults():
     assert (url.open_s, url.stall_s, url.transport) == (10, 5, "tcp")
 
 
-def test_a_stream_is_analysed_for_nine_tenths_of_the_time_that_it_has_to_open():
+def test_url_analyzeduration_is_nine_tenths_of_open_timeout():
     options = UrlAddress.parse("rtsp", "scope:554/live#open_s=20&transport=udp").options()
     assert options["analyzeduration"] == "18000000" and options["rtsp_transport"] == "udp"
     assert "rtsp_transport" not in UrlAddress.parse("http", "scope/live").options()
 
 
 @pytest.mark.parametrize(("host", "is_one"), [("a" * 63 + ".b", True), ("a" * 64 + ".b", False), (".".join(["a" * 62] * 4) + ".b", True), (".".join(["a" * 62] * 4) + ".bcd", False)])  # fmt: skip
-def test_labels_of_a_host_have_63_characters_and_its_name_253(host, is_one):
+def test_url_host_limits_labels_to_63_and_name_to_253_characters(host, is_one):
     if is_one:
         assert UrlAddress.parse("http", f"{host}/live").name == f"http://{host}/live"
         return

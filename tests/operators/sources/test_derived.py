@@ -49,7 +49,7 @@ def all_of(source):
 
 
 @pytest.mark.parametrize(("layout", "size"), [("side_by_side", (12, 16)), ("top_bottom", (24, 8))])
-def test_a_picture_is_split_into_two_eyes(frame, layout, size):
+def test_split_source_splits_picture_into_two_eyes(frame, layout, size):
     whole = default_camera(24, 16)
     mask, depth = np.ones((16, 24), np.uint8), np.full((16, 24), 50, np.float32)
     given = [frame(k, mask=mask, depth=depth) for k in range(3)]
@@ -65,7 +65,7 @@ def test_a_picture_is_split_into_two_eyes(frame, layout, size):
     assert source.state is SourceState.ENDED and source.counts() == {}
 
 
-def test_a_calibration_of_the_left_eye_is_kept_and_one_of_both_is_refused():
+def test_split_source_refuses_calibration_of_whole_picture():
     left = Camera(np.array([[30.0, 0, 6], [0, 30, 8], [0, 0, 1]]), 24, 16)
     assert SplitSource(Given([], left), "side_by_side").description.camera.K.tolist() == left.K.tolist()
     both = Camera.from_focal(30.0, 24, 16)
@@ -73,7 +73,7 @@ def test_a_calibration_of_the_left_eye_is_kept_and_one_of_both_is_refused():
         SplitSource(Given([], both), "side_by_side")
 
 
-def test_what_has_no_two_halves_is_refused():
+def test_split_source_refuses_odd_width_and_stereo_source():
     with pytest.raises(InvalidSetting, match="not two eyes side by side"):
         SplitSource(Given([], default_camera(25, 16)), "side_by_side")
     with pytest.raises(InvalidSetting, match="has a right picture for each frame"):
@@ -84,7 +84,7 @@ def at(frame, index, ms, **fields):
     return frame(index, pts_ns=index, arrived_ns=round(ms * MS), **fields)
 
 
-def test_two_sources_are_joined_by_the_moment_at_which_their_frames_came(camera, frame):
+def test_joined_source_pairs_frames_by_arrival_time(camera, frame):
     left = Given([at(frame, k, 1000 + 40 * k) for k in range(5)], camera, "left")
     right = Given([at(frame, 10 + k, 1003 + 40 * k) for k in range(5)], camera, "right")
     source = JoinedSource(left, right, waiting=64)
@@ -95,7 +95,7 @@ def test_two_sources_are_joined_by_the_moment_at_which_their_frames_came(camera,
         np.testing.assert_array_equal(each.right_image, frame(10 + k).image)
 
 
-def test_an_eye_that_is_missing_takes_no_picture_away(camera, frame):
+def test_joined_source_passes_left_frames_without_right_partner(camera, frame):
     left = Given([at(frame, k, 1000 + 40 * k) for k in range(5)], camera)
     right = Given([at(frame, 10, 1000), at(frame, 13, 1120), at(frame, 99, 5000)], camera)
     source = JoinedSource(left, right, waiting=64)
@@ -104,7 +104,7 @@ def test_an_eye_that_is_missing_takes_no_picture_away(camera, frame):
     assert source.counts()["without_right"] == 3
 
 
-def test_damage_to_either_eye_is_damage_and_another_size_is_left_out(camera, frame):
+def test_joined_source_marks_damage_and_drops_right_image_of_other_size(camera, frame):
     torn = {"status": FrameStatus.DAMAGED, "damage": "torn"}
     left = Given([at(frame, k, 1000 + 40 * k) for k in range(2)], camera)
     small = at(frame, 1, 1040, image=np.zeros((4, 4, 3), np.uint8))
@@ -114,7 +114,7 @@ def test_damage_to_either_eye_is_damage_and_another_size_is_left_out(camera, fra
     assert second.right_image is None and source.counts() == {"right_of_another_size": 1}
 
 
-def test_eyes_of_two_sizes_are_refused(camera):
+def test_joined_source_refuses_eyes_of_different_size(camera):
     with pytest.raises(InvalidSetting, match="the left eye has 24x16 px and the right one 12x16"):
         JoinedSource(Given([], camera), Given([], Camera.from_focal(30.0, 12, 16)))
 
@@ -124,7 +124,7 @@ def folder(tmp_path_factory):
     return synthesize(tmp_path_factory.mktemp("recordings") / "tiny", frames=4, width_px=64, height_px=48, stereo=False)
 
 
-def test_addresses_say_how_the_eyes_come(folder, tmp_path):
+def test_stereo_addresses_open_split_and_joined_sources(folder, tmp_path):
     (tmp_path / "double").mkdir()
     import cv2
 
@@ -154,12 +154,12 @@ def test_addresses_say_how_the_eyes_come(folder, tmp_path):
         ("realtime:x?stereo=both", "stereo is 'both'; choose side_by_side or top_bottom"),
     ],
 )
-def test_addresses_that_are_wrong_are_sentences(address, what):
+def test_invalid_stereo_address_is_refused(address, what):
     with pytest.raises(InvalidSetting, match=what.replace("|", r"\|")):
         open_source(address)
 
 
-def test_a_path_may_have_such_words_in_it(tmp_path):
+def test_existing_path_with_query_characters_is_opened(tmp_path):
     path = tmp_path / "take?stereo=side_by_side"
     synthesize(path, frames=1, width_px=64, height_px=48, stereo=False)
     assert open_source(path).description.width_px == 64
@@ -169,7 +169,7 @@ def test_a_path_may_have_such_words_in_it(tmp_path):
     ("at_ms", "right_ms", "paired", "left_over"),
     [(100, [60, 95, 103, 140], 103, [140]), (100, [60, 97, 110], 97, [110]), (100, [100, 100, 130], 100, [100, 130]), (100, [70], None, [70]), (100, [], None, [])],
 )  # fmt: skip
-def test_the_right_picture_nearest_in_time_is_paired_and_earlier_ones_are_dropped(at_ms, right_ms, paired, left_over):
+def test_joined_source_pairs_nearest_right_frame_and_drops_earlier(at_ms, right_ms, paired, left_over):
     """Pictures are at most 20 ms apart."""
     picture = lambda ms: Frame(0, ms * 1_000_000, np.full((4, 4, 3), ms, np.uint8))
     rights, counted = iter([picture(ms) for ms in right_ms]), []
@@ -209,13 +209,13 @@ def picture(moment_ms, **changed):
         (100, [90], [200], 90, [200], []),
     ],
 )  # fmt: skip
-def test_a_frame_is_paired_with_the_nearest_one_of_the_other_eye(at_ms, waiting_ms, comes_ms, right, left, counted):
+def test_joined_source_pairing_reads_at_most_one_later_frame(at_ms, waiting_ms, comes_ms, right, left, counted):
     """Within half a frame interval. Earlier frames of the other eye are dropped with it, and no more than one later frame is read."""
     found, kept, reasons = paired(at_ms, waiting_ms, comes_ms)
     assert (found, kept, reasons) == (right, left, counted)
 
 
-def test_frames_of_another_size_than_described_are_scaled_by_the_same_factor():
+def test_scaled_source_scales_frames_of_other_size_by_same_factor():
     description = SourceDescription("camera", 80, 60, 30.0, Camera.from_focal(50.0, 80, 60))
     scaled = ScaledSource(SimpleNamespace(description=description), 0.5)
     assert (scaled.description.width_px, scaled.description.height_px) == (40, 30)

@@ -42,7 +42,7 @@ def write(images, index, value, suffix=".png"):
     (images / f"frame-{index:06d}{suffix}").write_bytes(encoded(value, suffix))
 
 
-def test_images_are_read_as_they_appear(images, reading):
+def test_folder_source_reads_images_as_they_appear(images, reading):
     write(images, 3, 30)
     write(images, 4, 40)
     source = open_source(f"folder:{images}?fps=20", ALL)
@@ -56,7 +56,7 @@ def test_images_are_read_as_they_appear(images, reading):
     assert frame.pts_ns >= 4 * 50_000_000 and source.counts() == {}
 
 
-def test_every_image_may_be_asked_for(images, reading):
+def test_folder_source_with_every_reads_existing_images(images, reading):
     for index in (1, 2, 10):
         write(images, index, index)
     stream = reading(open_source(f"folder:{images}?every=1", ALL))
@@ -64,7 +64,7 @@ def test_every_image_may_be_asked_for(images, reading):
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
-def test_an_image_that_is_being_written_is_waited_for(images, reading, suffix):
+def test_folder_source_waits_for_partially_written_image(images, reading, suffix):
     write(images, 0, 50, suffix)
     stream = reading(open_source(f"folder:{images}", ALL))
     stream.frame()
@@ -77,7 +77,7 @@ def test_an_image_that_is_being_written_is_waited_for(images, reading, suffix):
     assert abs(value_of(stream.frame()) - 90) <= 1 and stream.source.counts() == {}
 
 
-def test_a_file_that_is_renamed_when_it_is_done_is_read_then(images, reading):
+def test_folder_source_reads_file_after_rename_to_final_name(images, reading):
     write(images, 0, 50)
     stream = reading(open_source(f"folder:{images}", ALL))
     stream.frame()
@@ -88,7 +88,7 @@ def test_a_file_that_is_renamed_when_it_is_done_is_read_then(images, reading):
     assert value_of(stream.frame()) == 60
 
 
-def test_what_never_becomes_an_image_is_passed_over_and_counted(images, reading, monkeypatch, tmp_path):
+def test_folder_source_skips_and_counts_unreadable_files(images, reading, monkeypatch, tmp_path):
     monkeypatch.setattr(folder_module, "UNREADABLE_AFTER_S", 0.1)
     write(images, 0, 50)
     stream = reading(open_source(f"folder:{images}", ALL))
@@ -104,7 +104,7 @@ def test_what_never_becomes_an_image_is_passed_over_and_counted(images, reading,
     assert value_of(stream.frame()) == 70 and stream.source.counts()["unreadable"] == 5
 
 
-def test_an_image_before_the_last_one_is_counted_and_left_out(images, reading):
+def test_folder_source_skips_and_counts_out_of_order_image(images, reading):
     write(images, 5, 50)
     stream = reading(open_source(f"folder:{images}", ALL))
     stream.frame()
@@ -114,7 +114,7 @@ def test_an_image_before_the_last_one_is_counted_and_left_out(images, reading):
     assert value_of(stream.frame()) == 60
 
 
-def test_another_size_is_passed_on_and_removed_images_do_no_harm(images, reading):
+def test_folder_source_passes_other_size_and_ignores_removed_images(images, reading):
     write(images, 0, 50)
     stream = reading(open_source(f"folder:{images}", ALL))
     stream.frame()
@@ -123,7 +123,7 @@ def test_another_size_is_passed_on_and_removed_images_do_no_harm(images, reading
     assert stream.frame().image.shape == (8, 90, 3)
 
 
-def test_a_folder_that_goes_and_comes_back(images, reading):
+def test_folder_source_reconnects_after_folder_is_recreated(images, reading):
     write(images, 0, 50)
     stream = reading(open_source(f"folder:{images}", ALL))
     stream.frame()
@@ -136,7 +136,7 @@ def test_a_folder_that_goes_and_comes_back(images, reading):
     assert value_of(stream.frame()) == 60 and stream.source.state is SourceState.LIVE
 
 
-def test_opening_again_begins_with_what_is_new_then(images, reading):
+def test_folder_source_reopened_starts_at_newest_image(images, reading):
     write(images, 0, 50)
     source = open_source(f"folder:{images}", ALL)
     assert value_of(reading(source).frame()) == 50
@@ -146,7 +146,7 @@ def test_opening_again_begins_with_what_is_new_then(images, reading):
     assert value_of(reading(source).frame()) == 70
 
 
-def test_what_is_no_folder_or_stays_empty_is_a_sentence(images, tmp_path):
+def test_folder_source_refuses_missing_or_empty_folder(images, tmp_path):
     with pytest.raises(SourceUnavailable, match="is no folder"):
         open_source(f"folder:{tmp_path}/nothing")
     with pytest.raises(SourceUnavailable, match=r"no whole image came into .*/images within 0\.1 s"):
@@ -155,7 +155,7 @@ def test_what_is_no_folder_or_stays_empty_is_a_sentence(images, tmp_path):
         open_source("folder:")
 
 
-def test_a_large_folder_is_looked_through_seldom(images, monkeypatch):
+def test_new_files_predicts_next_name_without_scanning_folder(images, monkeypatch):
     for index in range(50):
         (images / f"{index}.png").touch()
     files = NewFiles(images)
@@ -172,6 +172,6 @@ def test_a_large_folder_is_looked_through_seldom(images, monkeypatch):
     assert scans == []
 
 
-def test_names_with_the_next_number():
+def test_following_name_increments_number():
     assert following_name(Path("a/frame-000041.color.png")) == Path("a/frame-000042.color.png")
     assert following_name(Path("x9.jpg")) == Path("x10.jpg") and following_name(Path("left.png")) is None

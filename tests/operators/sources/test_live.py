@@ -52,7 +52,7 @@ def all_of(source):
     return seqs
 
 
-def test_whoever_is_late_gets_the_newest_frames_and_what_was_dropped_is_counted(camera, frame):
+def test_live_source_keeps_newest_frames_and_counts_dropped(camera, frame):
     hold = threading.Event()
     source = opened(Scripted([*(frame(k) for k in range(10)), hold], camera, waiting=2))
     assert isinstance(source, FrameSource) and source.state is SourceState.LIVE
@@ -62,14 +62,14 @@ def test_whoever_is_late_gets_the_newest_frames_and_what_was_dropped_is_counted(
     source.close()
 
 
-def test_a_source_that_does_not_drop_waits_for_its_reader(camera, frame):
+def test_live_source_without_drops_waits_for_reader(camera, frame):
     source = Scripted([frame(k) for k in range(50)], camera, waiting=1, drops=False)
     source.open()
     assert all_of(source) == list(range(50)) and source.counts() == {}
     source.close()
 
 
-def test_frames_are_live_and_say_when_they_arrived(camera, frame):
+def test_live_source_sets_status_and_arrival_time(camera, frame):
     before = time.monotonic_ns()
     given = [frame(0), frame(1, arrived_ns=7), frame(2, status=FrameStatus.DAMAGED)]
     source = opened(Scripted(given, camera, waiting=3))
@@ -79,7 +79,7 @@ def test_frames_are_live_and_say_when_they_arrived(camera, frame):
     source.close()
 
 
-def test_a_stall_is_a_state_with_a_sentence_and_is_counted_when_it_is_over(camera, frame):
+def test_live_source_reports_and_counts_stall(camera, frame):
     hold = threading.Event()
     source = opened(Scripted([frame(0), hold, frame(1)], camera, stalled_after_s=0.0))
     assert source.read(SOON_S).seq == 0
@@ -93,7 +93,7 @@ def test_a_stall_is_a_state_with_a_sentence_and_is_counted_when_it_is_over(camer
     assert source.state is SourceState.ENDED and source.state_sentence == "camera 1 is not open"
 
 
-def test_a_lost_connection_is_a_state_until_the_next_frame_and_numbers_go_on(camera, frame):
+def test_live_source_reconnecting_until_next_frame_and_numbers_continue(camera, frame):
     hold, end = threading.Event(), threading.Event()
     script = [frame(5), frame(6), "camera 1 does not answer", "still not", hold, frame(0), frame(1), end]
     source = Scripted(script, camera, waiting=5, order=FrameOrder())
@@ -111,7 +111,7 @@ def test_a_lost_connection_is_a_state_until_the_next_frame_and_numbers_go_on(cam
     source.close()
 
 
-def test_an_error_comes_after_the_frames_before_it_and_once(camera, frame):
+def test_live_source_raises_reader_error_once_after_earlier_frames(camera, frame):
     source = Scripted([frame(0), ValueError("broken here")], camera)
     source.open()
     assert source.read(SOON_S).seq == 0
@@ -121,7 +121,7 @@ def test_an_error_comes_after_the_frames_before_it_and_once(camera, frame):
     source.close()
 
 
-def test_a_reader_that_is_left_behind_changes_nothing_in_a_later_reading(camera, frame, monkeypatch):
+def test_abandoned_reader_does_not_affect_reopened_live_source(camera, frame, monkeypatch):
     monkeypatch.setattr("operators.sources.live.LiveSource.close_timeout_s", 0.01)
     hold = threading.Event()
     source = opened(Scripted([frame(0), hold, "gone", frame(99)], camera))
@@ -135,7 +135,7 @@ def test_a_reader_that_is_left_behind_changes_nothing_in_a_later_reading(camera,
     source.close()
 
 
-def test_opening_again_begins_again(camera, frame):
+def test_live_source_reopened_starts_from_beginning(camera, frame):
     source = Scripted([frame(k) for k in range(3)], camera, waiting=1, order=FrameOrder())
     for _ in range(2):
         opened(source)
@@ -146,6 +146,6 @@ def test_opening_again_begins_again(camera, frame):
     source.close()
 
 
-def test_room_for_no_frame_is_refused(camera):
+def test_live_source_refuses_waiting_zero(camera):
     with pytest.raises(InvalidInput, match="waiting is 0"):
         Scripted([], camera, waiting=0)

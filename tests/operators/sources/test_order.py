@@ -35,30 +35,30 @@ def sender(frame):
     return Sender(frame)
 
 
-def test_what_is_in_order_passes_with_numbers_and_times_from_nought(sender):
+def test_frame_order_starts_numbers_and_times_at_zero(sender):
     assert [sender.send(k, 40 * k) for k in (7, 8, 9)] == [(0, 0), (1, 40), (2, 80)]
     assert sender.counts() == {}
 
 
-def test_missing_numbers_stay_missing_and_are_counted(sender):
+def test_frame_order_keeps_gaps_and_counts_missing_numbers(sender):
     assert [sender.send(k, 40 * k) for k in (0, 1, 5)] == [(0, 0), (1, 40), (5, 200)]
     assert sender.counts() == {"missing": 3}
 
 
-def test_a_frame_that_comes_twice_is_dropped_by_its_number_or_by_its_time_and_picture(sender):
+def test_frame_order_drops_duplicate_number_or_duplicate_time_and_picture(sender):
     assert sender.send(0, 0) and sender.send(1, 40)
     assert sender.send(1, 40) is None and sender.send(2, 40, picture=1) is None
     assert sender.send(2, 40, picture=2) == (2, 40 + 1e-6), "another picture with the same time"
     assert sender.counts() == {"duplicates": 2, "repaired_times": 1}
 
 
-def test_a_frame_after_its_time_is_dropped(sender):
+def test_frame_order_drops_out_of_order_frame(sender):
     assert [sender.send(k, 40 * k) for k in (0, 1, 3, 2, 4)] == [(0, 0), (1, 40), (3, 120), None, (4, 160)]
     assert sender.counts() == {"missing": 1, "out_of_order": 1}
 
 
 @pytest.mark.parametrize("back_ms", [5_000, 90_000, 10**9])
-def test_a_clock_that_is_set_back_goes_on(sender, back_ms):
+def test_frame_order_continues_time_after_clock_set_back(sender, back_ms):
     sender.send(0, 10**9)
     assert sender.send(1, 10**9 + 40) == (1, 40)
     assert sender.send(2, 10**9 + 80 - back_ms) == (2, 80)
@@ -66,25 +66,25 @@ def test_a_clock_that_is_set_back_goes_on(sender, back_ms):
     assert sender.counts() == {"clock_resets": 1}
 
 
-def test_a_clock_that_is_set_forward_goes_on(sender):
+def test_frame_order_continues_time_after_clock_set_forward(sender):
     sender.send(0, 0)
     assert sender.send(1, 3_600_000) == (1, 40) and sender.send(2, 3_600_040) == (2, 80)
     assert sender.counts() == {"clock_jumps": 1}
 
 
-def test_a_long_pause_is_no_jump(sender):
+def test_frame_order_does_not_treat_long_pause_as_clock_jump(sender):
     sender.send(0, 0)
     assert sender.send(1, 60_000, after_ms=60_000) == (1, 60_000)
     assert sender.counts() == {}
 
 
-def test_frames_that_come_in_a_bundle_keep_their_times(sender):
+def test_frame_order_keeps_times_of_bundled_frames(sender):
     sender.send(0, 0)
     assert [sender.send(k, 40 * k, after_ms=0.1) for k in range(1, 20)] == [(k, 40 * k) for k in range(1, 20)]
     assert sender.counts() == {}
 
 
-def test_a_sender_that_begins_again_is_followed(sender):
+def test_frame_order_follows_restarted_sender(sender):
     for k in range(10):
         sender.send(k, 40 * k)
     given = [sender.send(k, 40 * k) for k in range(5)]
@@ -95,26 +95,26 @@ def test_a_sender_that_begins_again_is_followed(sender):
     assert sender.counts() == {"out_of_order": 2, "clock_resets": 1}
 
 
-def test_numbers_far_away_are_another_way_of_counting(sender):
+def test_frame_order_treats_distant_number_as_new_count(sender):
     sender.send(0, 0)
     assert sender.send(2**40, 40) == (1, 40) and sender.send(2**40 + 1, 80) == (2, 80)
     assert sender.counts() == {"clock_resets": 1}
 
 
-def test_after_a_restart_anything_goes_on(sender):
+def test_frame_order_restart_accepts_any_number_and_time(sender):
     sender.send(3, 500)
     sender.order.restart()
     assert sender.send(3, 2, after_ms=5_000) == (1, 5_000) and sender.send(4, 42) == (2, 5_040)
     assert sender.counts() == {}
 
 
-def test_beginning_anew_forgets(sender):
+def test_frame_order_begin_resets_numbers_and_times(sender):
     sender.send(3, 500)
     sender.order.begin()
     assert sender.send(9, 1) == (0, 0)
 
 
-def test_a_trusted_sender_keeps_its_own_numbers_and_time_until_it_restarts(frame):
+def test_trusted_frame_order_keeps_times_until_restart(frame):
     order = FrameOrder(trusted=True)
     pts = [order.take(frame(k, pts_ns=k * 10**10), k).pts_ns for k in (0, 1, 2)]
     assert pts == [0, 10**10, 2 * 10**10], "faster than any clock of ours"
@@ -124,7 +124,7 @@ def test_a_trusted_sender_keeps_its_own_numbers_and_time_until_it_restarts(frame
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_whatever_a_sender_does_numbers_increase_and_time_rises(frame, seed):
+def test_frame_order_output_increases_for_random_input(frame, seed):
     rng, order, now_ns = random.Random(seed), FrameOrder(), 0
     seq, pts_ns, last = 0, 0, None
     taken = 0
@@ -168,7 +168,7 @@ def numbered(seq, pts_ns):
         ((1_000_011, 5 * S + 40), 40, {"clock_resets": 1}, (1, 40)),
     ],
 )
-def test_each_step_between_two_frames_has_its_answer(second, arrived_ns, counts, out):
+def test_frame_order_result_of_second_frame_at_limits(second, arrived_ns, counts, out):
     order = FrameOrder()
     first = order.take(numbered(10, 5 * S), 0)
     assert (first.seq, first.pts_ns) == (0, 0)
@@ -190,7 +190,7 @@ def test_each_step_between_two_frames_has_its_answer(second, arrived_ns, counts,
         ([(3, 3), (1, 4), (2, 5), (3, 6)], 1),
     ],
 )
-def test_three_late_frames_in_a_row_are_a_new_beginning(late, resets):
+def test_frame_order_resets_after_three_consecutive_late_frames(late, resets):
     order = FrameOrder()
     order.take(numbered(10, 100), 0)
     found = [order.take(numbered(*each), 50) for each in late]
@@ -198,7 +198,7 @@ def test_three_late_frames_in_a_row_are_a_new_beginning(late, resets):
     assert [each is not None for each in found] == [False] * (len(late) - resets) + [True] * resets
 
 
-def test_a_trusted_sender_keeps_its_numbers_and_goes_on_after_a_restart():
+def test_trusted_frame_order_continues_numbers_after_restart():
     order = FrameOrder(trusted=True)
     assert order.take(numbered(10, 7), 0).seq == 10
     assert order.take(numbered(9, 3), 1).pts_ns == 3  # nothing is looked at

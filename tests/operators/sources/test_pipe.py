@@ -68,7 +68,7 @@ def written():
         thread.join(300)
 
 
-def test_raw_frames_become_pictures_with_even_times(fifo, reading):
+def test_pipe_source_reads_raw_frames_with_even_times(fifo, reading):
     source = open_source(f"pipe:{fifo}{RGB}&fps=20", ALL)
     assert (source.description.width_px, source.description.height_px, source.description.fps) == (6, 4, 20)
     stream = reading(source)
@@ -80,7 +80,7 @@ def test_raw_frames_become_pictures_with_even_times(fifo, reading):
     writer.close()
 
 
-def test_a_writer_that_goes_and_one_that_comes(fifo, reading):
+def test_pipe_source_reconnects_to_second_writer(fifo, reading):
     stream = reading(open_source(f"pipe:{fifo}{RGB}", ALL))
     assert stream.source.read(0.1) is None, "nobody writes yet"
     first = Writer(fifo)
@@ -97,7 +97,7 @@ def test_a_writer_that_goes_and_one_that_comes(fifo, reading):
     second.close()
 
 
-def test_a_stream_that_describes_itself(fifo, reading, written):
+def test_pipe_source_reads_size_and_rate_from_y4m_header(fifo, reading, written):
     size = b"YUV4MPEG2 W6 H4 F50:2 Ip A1:1 C420jpeg XYSCSS=420JPEG\n"
     frame = b"FRAME\n" + bytes([150]) * 24 + bytes([128]) * 12
     written(fifo, size, frame, frame.replace(b"FRAME", b"FRAME Ixyz"))
@@ -115,7 +115,7 @@ def test_a_stream_that_describes_itself(fifo, reading, written):
     assert frame.image[..., 0].tolist() == [list(range(8)), list(range(8, 16))], "another size is passed on"
 
 
-def test_what_ffmpeg_writes_is_read_back(fifo, reading, tmp_path, written):
+def test_pipe_source_reads_y4m_written_by_ffmpeg(fifo, reading, tmp_path, written):
     path = tmp_path / "video.y4m"
     x = np.linspace(0, 200, 64)[None, :, None]
     shown = np.broadcast_to(20 + x, (48, 64, 3)).astype(np.uint8)
@@ -130,7 +130,7 @@ def test_what_ffmpeg_writes_is_read_back(fifo, reading, tmp_path, written):
         assert np.abs(stream.frame().image.astype(int) - shown).mean() < 2
 
 
-def test_standard_input_ends_with_its_writer():
+def test_pipe_source_on_stdin_ends_with_writer():
     program = (
         "from operators.sources.registry import open_source, SourceOptions\n"
         f"s = open_source('pipe:-{RGB}', SourceOptions(waiting=64)); s.open()\n"
@@ -144,7 +144,7 @@ def test_standard_input_ends_with_its_writer():
 
 @pytest.mark.parametrize("name", PLANES)
 @pytest.mark.parametrize(("width", "height"), [(64, 48), (7, 5)])
-def test_every_format_gives_the_same_picture(name, width, height):
+def test_raw_formats_decode_to_same_picture(name, width, height):
     x, y = np.linspace(0, 150, width)[None, :, None], np.linspace(0, 60, height)[:, None, None]
     shown = np.broadcast_to(30 + x + y, (height, width, 3)).astype(np.uint8)
     frame = av.VideoFrame.from_ndarray(shown, format="rgb24").reformat(format=name)
@@ -172,12 +172,12 @@ def test_every_format_gives_the_same_picture(name, width, height):
         ("pipe:-?size=6x4&format=rgb24&colour=1", "unknown option 'colour'"),
     ],
 )
-def test_options_that_are_wrong_are_named(address, what):
+def test_pipe_address_error_names_invalid_option(address, what):
     with pytest.raises(InvalidSetting, match=what):
         open_source(address)
 
 
-def test_what_is_no_pipe_is_a_sentence(tmp_path):
+def test_pipe_source_refuses_path_that_is_not_a_pipe(tmp_path):
     (tmp_path / "file").write_bytes(b"x")
     for path, what in (
         (tmp_path / "file", "is no pipe"),
@@ -188,7 +188,7 @@ def test_what_is_no_pipe_is_a_sentence(tmp_path):
             open_source(f"pipe:{path}{RGB}")
 
 
-def test_a_header_that_never_comes_is_a_sentence(fifo, monkeypatch):
+def test_pipe_source_without_header_times_out(fifo, monkeypatch):
     monkeypatch.setattr(pipe, "HEADER_TIMEOUT_S", 0.2)
     with pytest.raises(SourceUnavailable, match=r"gave no header within 0\.2 s"):
         open_source(f"pipe:{fifo}")
@@ -206,13 +206,13 @@ def test_a_header_that_never_comes_is_a_sentence(fifo, monkeypatch):
         2000 * b"x",
     ],
 )
-def test_a_header_that_makes_no_sense_is_a_sentence(fifo, written, header):
+def test_pipe_source_refuses_invalid_y4m_header(fifo, written, header):
     written(fifo, header)
     with pytest.raises(InvalidSetting):
         open_source(f"pipe:{fifo}")
 
 
-def test_a_writer_that_is_out_of_sync_is_reported(fifo, reading, written):
+def test_pipe_source_raises_source_lost_if_out_of_sync(fifo, reading, written):
     written(fifo, b"YUV4MPEG2 W6 H4 F25:1 Cmono\n", b"FRAME\n", bytes(24), b"12345678\n")
     stream = reading(open_source(f"pipe:{fifo}", ALL))
     assert stream.frame().seq == 0
@@ -220,12 +220,12 @@ def test_a_writer_that_is_out_of_sync_is_reported(fifo, reading, written):
         stream.source.read(30)
 
 
-def test_the_rate_of_a_header_may_be_missing_or_nonsense():
+def test_y4m_header_fps_is_none_if_missing_or_invalid():
     assert Y4mHeader.parse(b"YUV4MPEG2 W6 H4").fps is None and Y4mHeader.parse(b"YUV4MPEG2 W6 H4 F0:0").fps is None
     assert Y4mHeader.parse(b"YUV4MPEG2 W6 H4 C420 XCOLORRANGE=FULL").format == "yuvj420p"
 
 
-def test_a_steady_clock_is_even_and_follows_ours():
+def test_steady_clock_has_even_steps_and_follows_arrival_times():
     clock, rng = SteadyClock(25), np.random.default_rng(0)
     arrived = np.arange(3000) * 40_400_000 + rng.integers(0, 8_000_000, 3000)  # 1 % slower than it says, and jittering
     times = np.array([clock.time_ns(int(at)) for at in arrived])

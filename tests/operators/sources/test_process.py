@@ -65,7 +65,7 @@ def is_gone(number):
     return False
 
 
-def test_its_frames_are_those_of_the_source(tmp_path):
+def test_process_source_delivers_identical_frames(tmp_path):
     folder = synthesize(tmp_path / "tiny", frames=5, width_px=64, height_px=48)
     options = SourceOptions(realtime=True, speed=1000, waiting=64, process=True)
     source = open_source(folder, options)
@@ -85,21 +85,21 @@ def test_its_frames_are_those_of_the_source(tmp_path):
         source.close()
 
 
-def test_frames_of_another_size_pass(stand_in):
+def test_process_source_passes_frames_of_other_size(stand_in):
     source = stand_in("frames=3,size=300,size=8,frames=2,size=1500")
     source.open()
     shapes = [read(source).image.shape[:2] for _ in range(8)]
     assert shapes == [(16, 24)] * 3 + [(300, 300), (8, 8)] + [(16, 24)] * 2 + [(1500, 1500)]
 
 
-def test_a_frame_is_not_overwritten_by_later_ones(stand_in):
+def test_process_source_frames_are_not_overwritten(stand_in):
     source = stand_in("frames=40,block")
     source.open()
     frames = [read(source) for _ in range(40)]
     assert all((frame.image == frame.seq).all() for frame in frames)
 
 
-def test_a_process_that_crashes_is_replaced_and_numbers_and_times_go_on(stand_in, tmp_path):
+def test_process_source_restarts_after_crash_and_continues_numbers(stand_in, tmp_path):
     source = stand_in(f"frames=3,once={tmp_path / 'crashed'},frames=2,block")
     source.open()
     before = [read(source) for _ in range(3)]
@@ -112,7 +112,7 @@ def test_a_process_that_crashes_is_replaced_and_numbers_and_times_go_on(stand_in
 
 
 @pytest.mark.slow
-def test_while_another_process_starts_the_state_says_why(stand_in, caplog):
+def test_process_source_logs_reason_while_restarting(stand_in, caplog):
     source = stand_in("frames=1,crash=SIGKILL")
     source.open()
     assert read(source).seq == 0
@@ -121,7 +121,7 @@ def test_while_another_process_starts_the_state_says_why(stand_in, caplog):
     assert read(source).seq == 1
 
 
-def test_an_exception_in_the_source_is_a_reason_to_start_again(stand_in, caplog):
+def test_process_source_restarts_after_exception(stand_in, caplog):
     source = stand_in("frames=1,raise=what is this")
     source.open()
     assert [read(source).seq for _ in range(2)] == [0, 1]
@@ -129,7 +129,7 @@ def test_an_exception_in_the_source_is_a_reason_to_start_again(stand_in, caplog)
 
 
 @pytest.mark.parametrize("frames", [0, 2])
-def test_a_file_that_is_damaged_ends_the_source_at_once_and_no_frame_is_repeated(stand_in, frames):
+def test_process_source_ends_without_restart_on_damaged_file(stand_in, frames):
     source = stand_in(f"frames={frames},refuse=frame 2 is damaged. Remove it.")
     source.open()
     assert [read(source).seq for _ in range(frames)] == list(range(frames))
@@ -138,7 +138,7 @@ def test_a_file_that_is_damaged_ends_the_source_at_once_and_no_frame_is_repeated
     assert "process_restarts" not in source.counts()
 
 
-def test_a_camera_that_refuses_is_opened_again(stand_in, monkeypatch):
+def test_process_source_restarts_if_camera_may_return(stand_in, monkeypatch):
     monkeypatch.setattr(process, "MOST_FAILURES", 2)
     source = stand_in("frames=1,refuse=no signal.", may_return=True)
     source.open()
@@ -146,7 +146,7 @@ def test_a_camera_that_refuses_is_opened_again(stand_in, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_process_that_says_nothing_is_replaced(stand_in):
+def test_process_source_replaces_hung_process(stand_in):
     source = stand_in("frames=1,crash=SIGSTOP", hung_after_s=0.5)
     source.open()
     first = pid(source)
@@ -155,7 +155,7 @@ def test_a_process_that_says_nothing_is_replaced(stand_in):
 
 
 @pytest.mark.slow
-def test_a_process_that_was_opened_late_is_not_replaced(stand_in):
+def test_process_source_opened_late_is_not_treated_as_hung(stand_in):
     source = stand_in("pause=0.3,frames=1", hung_after_s=2.0)
     time.sleep(2.1)
     source.open()
@@ -164,7 +164,7 @@ def test_a_process_that_was_opened_late_is_not_replaced(stand_in):
 
 
 @pytest.mark.slow
-def test_a_source_that_is_stuck_in_its_driver_gets_another_process(stand_in):
+def test_process_source_replaces_process_stuck_in_driver(stand_in):
     source = stand_in("frames=1,block", stuck_after_s=1.5)
     source.open()
     assert read(source).seq == 0
@@ -174,7 +174,7 @@ def test_a_source_that_is_stuck_in_its_driver_gets_another_process(stand_in):
 
 
 @pytest.mark.slow
-def test_one_that_never_gives_a_frame_is_given_up_with_a_sentence(stand_in, monkeypatch):
+def test_process_source_gives_up_after_maximum_failures(stand_in, monkeypatch):
     monkeypatch.setattr(process, "MOST_FAILURES", 3)
     source = stand_in("crash=SIGABRT")
     source.open()
@@ -194,14 +194,14 @@ def test_one_that_never_gives_a_frame_is_given_up_with_a_sentence(stand_in, monk
         ("silent", "it has not opened the source within 1.5 s"),
     ],
 )
-def test_what_cannot_be_opened_is_a_sentence_and_leaves_no_process(stand_in, address, what):
+def test_process_source_open_failure_leaves_no_process(stand_in, address, what):
     before = children()
     with pytest.raises(SourceUnavailable, match=what):
         stand_in(address, open_timeout_s=1.5 if address == "silent" else SOON_S)
     assert children() == before
 
 
-def test_states_sentences_counts_and_the_log_come_through(stand_in, caplog):
+def test_process_source_forwards_state_counts_notes_and_log(stand_in, caplog):
     source = stand_in("frames=1,log=a warning,lost=the cable is out,block")
     assert source.description.notes == ("assumed",)
     source.open()
@@ -227,7 +227,7 @@ def children():
 
 @pytest.mark.parametrize("address", ["frames=2,block", "block", "crash=SIGSTOP"])
 @pytest.mark.slow
-def test_closing_leaves_no_process_no_memory_and_no_open_file(stand_in, address):
+def test_process_source_close_leaves_no_process_or_open_file(stand_in, address):
     gc.collect()
     files = len(os.listdir("/proc/self/fd"))
     source = stand_in(address)
@@ -240,7 +240,7 @@ def test_closing_leaves_no_process_no_memory_and_no_open_file(stand_in, address)
 
 
 @pytest.mark.slow
-def test_one_that_was_never_opened_or_is_forgotten_ends_too(stand_in):
+def test_unopened_or_deleted_process_source_ends_its_process(stand_in):
     source = stand_in("frames=1,block")
     number = pid(source)
     source.close()
@@ -252,7 +252,7 @@ def test_one_that_was_never_opened_or_is_forgotten_ends_too(stand_in):
     assert is_gone(number)
 
 
-def test_a_signal_to_the_process_leaves_it_alone(stand_in):
+def test_process_source_child_ignores_signals(stand_in):
     source = stand_in("frames=1,block")
     source.open()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -274,7 +274,7 @@ time.sleep(1000)
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
-def test_when_the_parent_dies_the_process_ends(number):
+def test_process_source_child_ends_with_parent(number):
     paths = filter(None, [str(ROOT), str(Path(__file__).parent), os.environ.get("PYTHONPATH")])
     env = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
     with subprocess.Popen(

@@ -17,12 +17,12 @@ CAMERA = Camera.from_focal(30.0, 3, 2)
 
 
 @pytest.mark.parametrize("data", [b"", b"{", b"\xff", b"[]", b"3", b"{}", b'{"kind": 3}', b"[" * 200_000])
-def test_bytes_that_are_no_message_are_refused(data):
+def test_parsed_refuses_invalid_bytes(data):
     with pytest.raises(InvalidMessage):
         parsed(data)
 
 
-def test_a_description_and_options_come_back():
+def test_source_description_and_options_round_trip_as_json():
     about = SourceDescription("cam", 3, 2, 25.0, CAMERA, frozenset({"mask", "depth"}), frame_count=7, notes=("a", "b"))
     assert SourceDescription.from_json(parsed(message("x", about=about.as_json()))["about"]) == about
     options = SourceOptions(scale=0.5, loop=True, waiting=3, stereo="top_bottom")
@@ -33,13 +33,13 @@ def test_a_description_and_options_come_back():
     "change",
     [{"camera": None}, {"camera": {"fx": 1}}, {"notes": 3}, {"more": 1}, {"name": 3}, {"width_px": "3"}, {"fps": 0}],
 )
-def test_what_describes_no_source_is_refused(change):
+def test_source_description_from_json_refuses_invalid_content(change):
     about = SourceDescription("cam", 3, 2, 25.0, CAMERA)
     for content in (about.as_json() | change, None, [], np.zeros(3)):
         with pytest.raises(InvalidMessage, match="describes no source"):
             SourceDescription.from_json(content)
 
 
-def test_counts_are_numbers_by_reason():
+def test_finite_counts_keeps_integer_counts_only():
     assert finite_counts({"late": 3, "lost": "many", "odd": 1.5}) == {"late": 3}
     assert finite_counts([1]) == {} == finite_counts(None)

@@ -16,17 +16,17 @@ BYTES = {
 """Bytes of one picture of this odd size. Half a pixel of chroma is stored as a whole one."""
 
 
-def test_each_format_takes_its_bytes():
+def test_raw_format_frame_bytes():
     assert {name: RawFormat(name, WIDTH, HEIGHT).frame_bytes for name in PLANES} == BYTES
 
 
-def test_an_unknown_format_is_refused_with_the_known_ones():
+def test_unknown_raw_format_error_lists_known_formats():
     with pytest.raises(InvalidSetting, match="format is 'rgb25'; known are rgb24, bgr24"):
         RawFormat("rgb25", WIDTH, HEIGHT)
 
 
 @pytest.mark.parametrize("name", ["rgb24", "bgr24", "rgba", "bgra", "gray"])
-def test_packed_pictures_keep_their_values(name, rng):
+def test_packed_raw_formats_keep_pixel_values(name, rng):
     channels = {"gray": 1, "rgba": 4, "bgra": 4}.get(name, 3)
     values = rng.integers(0, 256, (HEIGHT, WIDTH, channels), np.uint8)
     picture = RawFormat(name, WIDTH, HEIGHT).picture(values.tobytes())
@@ -47,7 +47,7 @@ def test_packed_pictures_keep_their_values(name, rng):
         ("uyvy422", b"\x5a\x51\xf0\x51" * 289),
     ],
 )
-def test_planes_with_chroma_give_red_everywhere(name, red):
+def test_yuv_raw_formats_decode_red_at_odd_size(name, red):
     picture = RawFormat(name, WIDTH, HEIGHT).picture(red)
     assert picture.shape == (HEIGHT, WIDTH, 3)
     # A red of BT.601: chroma exchanged would be blue, and a plane read from elsewhere another colour at its rows.

@@ -46,7 +46,7 @@ def released(source, clock, most=math.inf):
     return found
 
 
-def test_each_frame_is_released_at_its_time(recording, clock):
+def test_realtime_source_releases_each_frame_at_its_time(recording, clock):
     source = RealtimeSource(recording)
     assert isinstance(source, FrameSource)
     assert released(source, clock) == [(k, 40 * k, 40 * k) for k in range(5)]
@@ -54,26 +54,26 @@ def test_each_frame_is_released_at_its_time(recording, clock):
     assert (about.name, about.fps, about.frame_count, about.digest) == ("fake", 25, 5, None)
 
 
-def test_looped_it_goes_on_without_a_gap_or_a_repeated_number(recording, clock):
+def test_realtime_loop_continues_numbers_and_times(recording, clock):
     source = RealtimeSource(recording, SourceOptions(loop=True))
     assert source.description.frame_count is None
     assert released(source, clock, 23) == [(k, 40 * k, 40 * k) for k in range(23)]
     assert recording.opened == 1, "later rounds come out of memory"
 
 
-def test_what_is_too_large_to_remember_is_decoded_again(recording, clock, monkeypatch):
+def test_realtime_loop_decodes_again_if_recording_exceeds_cache(recording, clock, monkeypatch):
     monkeypatch.setattr(recording_module, "REMEMBERED_BYTES", 2000)
     assert len(released(RealtimeSource(recording, SourceOptions(loop=True)), clock, 12)) == 12
     assert recording.opened >= 3
 
 
-def test_times_that_are_uneven_stay_uneven(recording, clock, frame):
+def test_realtime_source_keeps_uneven_times(recording, clock, frame):
     recording.frames[:] = [frame(k, pts_ns=pts * 10**6) for k, pts in enumerate((7, 47, 167))]
     source = RealtimeSource(recording, SourceOptions(loop=True))
     assert [pts for _, pts, _ in released(source, clock, 6)] == [0, 40, 160, 200, 240, 360]
 
 
-def test_a_video_of_variable_frame_rate_is_played_at_the_times_that_a_replay_has(tmp_path, clock):
+def test_realtime_times_of_variable_frame_rate_equal_replay_times(tmp_path, clock):
     times_ms = [0, 33, 99, 132, 232, 265]
     path = videos.write_timed(tmp_path / "v.mkv", times_ms, 30, Fraction(1, 1000))
     replayed = [frame.pts_ns / 1e6 for frame in RecordingSource(open_recording(path)).frames()]
@@ -92,11 +92,11 @@ def test_a_video_of_variable_frame_rate_is_played_at_the_times_that_a_replay_has
         (SourceOptions(speed=math.inf), 40, 0),
     ],
 )
-def test_speed_moves_the_clock_and_the_frame_rate_moves_the_frames(recording, clock, options, pts_ms, at_ms):
+def test_realtime_speed_changes_release_and_fps_changes_timestamps(recording, clock, options, pts_ms, at_ms):
     assert released(RealtimeSource(recording, options), clock) == [(k, pts_ms * k, at_ms * k) for k in range(5)]
 
 
-def test_as_fast_as_they_are_taken_drops_nothing(recording):
+def test_realtime_at_infinite_speed_drops_no_frame(recording):
     source = RealtimeSource(recording, SourceOptions(loop=True, speed=math.inf, max_frames=200, waiting=1))
     source.open()
     seqs = []
@@ -107,7 +107,7 @@ def test_as_fast_as_they_are_taken_drops_nothing(recording):
     source.close()
 
 
-def test_a_frame_that_is_decoded_late_is_counted_and_the_others_keep_their_times(recording, clock, monkeypatch):
+def test_realtime_counts_late_frame_and_keeps_later_times(recording, clock, monkeypatch):
     source = RealtimeSource(recording)
     frames = iter(recording)
 
@@ -122,7 +122,7 @@ def test_a_frame_that_is_decoded_late_is_counted_and_the_others_keep_their_times
     assert source.counts() == {"decoded_late": 1}
 
 
-def test_the_time_that_opening_takes_does_not_come_out_of_the_second_frames(recording, clock, monkeypatch):
+def test_realtime_clock_starts_after_opening(recording, clock, monkeypatch):
     source = RealtimeSource(recording)
     numbered = source._numbered
 
@@ -134,7 +134,7 @@ def test_the_time_that_opening_takes_does_not_come_out_of_the_second_frames(reco
     assert [at_ms - 30 for _, _, at_ms in released(source, clock)] == [0, 40, 80, 120, 160]
 
 
-def test_after_a_long_pause_of_the_machine_the_clock_starts_again(recording, clock, monkeypatch):
+def test_realtime_clock_restarts_after_system_suspend(recording, clock, monkeypatch):
     source = RealtimeSource(recording)
     frames = iter(recording)
 
@@ -154,7 +154,7 @@ def folder(tmp_path_factory):
     return synthesize(tmp_path_factory.mktemp("recordings") / "tiny", frames=4, width_px=64, height_px=48, stereo=True)
 
 
-def test_a_path_is_played_in_real_time_with_what_lies_beside_the_images(folder):
+def test_realtime_option_plays_recording_with_sidecar_fields(folder):
     assert isinstance(open_source(folder), RecordingSource), "only where it is asked for"
     source = open_source(folder, SourceOptions(realtime=True, loop=True, speed=math.inf, scale=0.5))
     assert isinstance(source, RealtimeSource) and source.description.width_px == 32
@@ -168,7 +168,7 @@ def test_a_path_is_played_in_real_time_with_what_lies_beside_the_images(folder):
     source.close()
 
 
-def test_its_address_says_how_it_is_played(folder):
+def test_realtime_address_options(folder):
     source = open_source(f"realtime:{folder}?loop=1&speed=2.5&fps=60")
     assert (source.options.loop, source.options.speed, source.options.fps) == (True, 2.5, 60)
     assert open_source(f"realtime://{folder}?speed=max").drops is False
@@ -187,12 +187,12 @@ def test_its_address_says_how_it_is_played(folder):
         ("loop=1&loop=0", "'loop' occurs twice"),
     ],
 )
-def test_options_that_are_wrong_are_named(folder, query, what):
+def test_realtime_address_error_names_invalid_option(folder, query, what):
     with pytest.raises(InvalidSetting, match=what):
         open_source(f"realtime:{folder}?{query}")
 
 
-def test_a_recording_that_is_not_there_is_a_sentence():
+def test_realtime_address_of_missing_recording_is_refused():
     with pytest.raises(RecordingMissing):
         open_source("realtime:/nowhere/at/all")
 
@@ -200,6 +200,6 @@ def test_a_recording_that_is_not_there_is_a_sentence():
 @pytest.mark.parametrize(
     "wrong", [{"speed": 0}, {"speed": math.nan}, {"fps": 0.0}, {"waiting": 0}, {"stereo": "both"}, {"speed": 10**6}]
 )
-def test_options_out_of_range_are_refused(wrong):
+def test_source_options_out_of_range_are_refused(wrong):
     with pytest.raises(InvalidSetting, match=next(iter(wrong))):
         SourceOptions(**wrong)

@@ -19,7 +19,7 @@ def folder(tmp_path_factory):
     return synthesize(tmp_path_factory.mktemp("recordings") / "tiny", frames=4, width_px=64, height_px=48, stereo=False)
 
 
-def test_a_path_is_a_recording_with_the_same_frames(folder):
+def test_open_source_of_path_reads_recording_frames(folder):
     source = open_source(folder, SourceOptions(scale=0.5, max_frames=3))
     recording = open_recording(folder, scale=0.5, max_frames=3)
     assert isinstance(source, RecordingSource)
@@ -35,14 +35,14 @@ def test_a_path_is_a_recording_with_the_same_frames(folder):
             np.testing.assert_array_equal(played.depth, expected.depth)
 
 
-def test_the_first_frames_are_no_more_than_asked_for(folder):
+def test_first_frames_returns_at_most_requested_count(folder):
     source = open_source(folder)
     assert [frame.seq for frame in FirstFrames(source, 2)] == [0, 1]
     assert list(FirstFrames(source, 0)) == []
 
 
 @pytest.mark.parametrize("address", ["tape://studio/7?take=2", Path("tape://studio/7?take=2")])
-def test_a_scheme_chooses_the_source(monkeypatch, address):
+def test_open_source_selects_parser_by_scheme(monkeypatch, address):
     asked = []
     SOURCES.add("tape", lambda rest, options: asked.append((rest, options)))
     try:
@@ -52,16 +52,16 @@ def test_a_scheme_chooses_the_source(monkeypatch, address):
     assert asked == [("studio/7?take=2", SourceOptions(0.5, 7))]
 
 
-def test_a_recording_may_be_named_by_its_scheme(folder):
+def test_open_source_accepts_recording_scheme(folder):
     assert open_source(f"recording://{folder}").description.name == folder.name
 
 
-def test_an_unknown_scheme_is_refused_by_its_name():
+def test_open_source_refuses_unknown_scheme():
     with pytest.raises(InvalidSetting, match="unknown source 'tapes'; known are recording, realtime"):
         open_source("tapes://studio/1")
 
 
-def test_a_path_that_exists_is_a_path_whatever_it_looks_like(folder, tmp_path, monkeypatch):
+def test_open_source_prefers_existing_path_over_scheme(folder, tmp_path, monkeypatch):
     (tmp_path / "tape:").mkdir()
     (tmp_path / "tape:" / "take").symlink_to(folder)
     monkeypatch.chdir(tmp_path)
@@ -69,7 +69,7 @@ def test_a_path_that_exists_is_a_path_whatever_it_looks_like(folder, tmp_path, m
 
 
 @pytest.mark.parametrize("address", ["nowhere", "/nowhere/at/all", "C:/recordings", "a:b", ""])
-def test_what_is_no_address_and_not_there_is_a_missing_recording(address, tmp_path, monkeypatch):
+def test_open_source_of_missing_path_raises_recording_missing(address, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(RecordingMissing):
         open_source(address or tmp_path / "empty")
@@ -79,13 +79,13 @@ def test_what_is_no_address_and_not_there_is_a_missing_recording(address, tmp_pa
     "address",
     ["", " ", "\t\n", "recording:", "realtime:", "folder:", "v4l2:", "zmq+ipc://", "pipe:", "folder:?pattern=x"],
 )
-def test_an_empty_address_is_refused_and_is_not_the_current_folder(address, monkeypatch, tmp_path):
+def test_open_source_refuses_empty_address(address, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InvalidSetting, match="is empty"):
         open_source(address, SourceOptions(process=True, realtime=True))
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), 0.0, -1.0, 1e9])
-def test_a_frame_rate_that_is_none_is_refused(value):
+def test_source_options_refuse_invalid_fps(value):
     with pytest.raises(InvalidSetting, match="fps is"):
         SourceOptions(fps=value)

@@ -26,7 +26,7 @@ def reader(memory):
     reader.close()
 
 
-def test_pieces_are_copies_in_order_each_at_an_aligned_position(reader):
+def test_frame_reader_returns_aligned_pieces_as_copies(reader):
     first, second, third = reader.read(0, [5, 64, 3])
     assert (bytes(first), bytes(second), bytes(third)) == (
         bytes(range(5)),
@@ -60,24 +60,24 @@ def test_pieces_are_copies_in_order_each_at_an_aligned_position(reader):
         (0, [64, 64, 65]),
     ],
 )
-def test_what_cannot_be_a_frame_or_lies_outside_is_refused(reader, offset, sizes):
+def test_frame_reader_refuses_invalid_offsets_and_sizes(reader, offset, sizes):
     with pytest.raises(InvalidMessage):
         reader.read(offset, sizes)
 
 
-def test_memory_that_has_grown_is_mapped_again(memory, reader):
+def test_frame_reader_maps_grown_memory_again(memory, reader):
     reader.read(0, [5])
     os.lseek(memory, 0, os.SEEK_END)
     os.write(memory, bytes([7] * 64))
     assert bytes(reader.read(192, [64])[0]) == bytes([7] * 64)
 
 
-def test_empty_memory_holds_no_frame(memory):
+def test_frame_reader_refuses_empty_memory(memory):
     with pytest.raises(InvalidMessage, match="outside of the shared memory"):
         FrameReader(memory).read(0, [1])
 
 
-def test_what_is_written_into_a_slot_is_read_from_there(memory):
+def test_frame_writer_slots_round_trip(memory):
     writer, reader = FrameWriter(memory), FrameReader(memory)
     small, large = [b"ab", b"c"], [bytes(range(200)), b"d"]
     assert not writer.fits(small)

@@ -12,7 +12,7 @@ from operators.sources.address import SourceOptions
 from operators.sources.live import Backoff, SteadyClock, StreamSource, check_size, resized
 
 
-def test_sizes_are_taken_up_to_their_borders():
+def test_check_size_at_limits():
     check_size("cam", 1, 1)
     check_size("cam", MAX_PIXELS, 1)
     check_size("cam", 8, 9, least=8)
@@ -22,7 +22,7 @@ def test_sizes_are_taken_up_to_their_borders():
 
 
 @pytest.mark.parametrize(("scale", "size"), [(1, (4, 6)), (0.5, (2, 3)), (1.5, (6, 9)), (0.01, (1, 1))])
-def test_frames_are_resized_by_a_factor(scale, size):
+def test_resized_scales_frame_by_factor(scale, size):
     frame = Frame(0, 0, np.full((4, 6, 3), 9, np.uint8))
     found = resized(frame, scale)
     assert found.image.shape == (*size, 3) and (found.image == 9).all()
@@ -30,7 +30,7 @@ def test_frames_are_resized_by_a_factor(scale, size):
 
 
 @pytest.mark.parametrize(("fps", "rate", "notes"), [(None, 30.0, 2), (12.5, 12.5, 1)])
-def test_what_a_sender_does_not_state_is_assumed_and_said(fps, rate, notes):
+def test_stream_source_notes_assumed_frame_rate(fps, rate, notes):
     source = StreamSource(SourceOptions(max_frames=5))
     source.describe("cam", (64, 48), fps)
     about = source.description
@@ -39,7 +39,7 @@ def test_what_a_sender_does_not_state_is_assumed_and_said(fps, rate, notes):
     ) == notes
 
 
-def test_a_scaled_stream_has_sides_of_at_least_eight_pixels():
+def test_scaled_stream_source_refuses_sides_below_eight_pixels():
     StreamSource(SourceOptions()).describe("cam", (3, 3), 30)
     StreamSource(SourceOptions(scale=0.5)).describe("cam", (16, 16), 30)
     with pytest.raises(InvalidSetting, match="7x7 px cannot be used; both sides must be at least 8 px"):
@@ -59,14 +59,14 @@ S = 1_000_000_000
         (1_100_000_001, 1_100_000_001),  # more is a pause
     ],
 )
-def test_a_frame_is_one_period_later_and_a_little_more_when_it_is_behind(arrived_ns, time_ns):
+def test_steady_clock_catches_up_gradually(arrived_ns, time_ns):
     clock = SteadyClock(10)
     assert clock.time_ns(5 * S) == 0
     assert clock.time_ns(5 * S + arrived_ns) == time_ns
     assert clock.time_ns(5 * S) == time_ns + 100_000_000
 
 
-def test_each_failure_waits_twice_as_long_up_to_a_limit_and_success_begins_anew():
+def test_backoff_doubles_up_to_limit_and_resets_on_success():
     backoff = Backoff()
     assert [backoff.failed() for _ in range(6)] == [0.25, 0.5, 1.0, 2.0, 2.0, 2.0]
     assert backoff.failures == 6
@@ -74,7 +74,7 @@ def test_each_failure_waits_twice_as_long_up_to_a_limit_and_success_begins_anew(
     assert backoff.failures == 0 and backoff.failed() == 0.25
 
 
-def test_a_source_that_fails_for_days_does_not_overflow():
+def test_backoff_does_not_overflow_after_thousands_of_failures():
     backoff = Backoff(1e-9, 1e30)
     waits = [backoff.failed() for _ in range(5000)]
     assert waits[:3] == [1e-9, 2e-9, 4e-9] and waits[30] == waits[-1] == 1e-9 * 2**30

@@ -21,7 +21,7 @@ def own_cache(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
 
 
-def test_it_goes_forwards_and_backwards_so_that_nothing_jumps():
+def test_synthetic_source_plays_forwards_and_backwards():
     source = open_source(f"synthetic:?{SMALL}&moving=1&fps=20", SourceOptions(speed=float("inf")))
     about = source.description
     assert (about.width_px, about.height_px, about.fps, about.frame_count) == (48, 40, 20, None)
@@ -37,7 +37,7 @@ def test_it_goes_forwards_and_backwards_so_that_nothing_jumps():
             np.testing.assert_array_equal(getattr(frame, name), getattr(rendered[index], name))
 
 
-def test_it_is_what_synthesize_writes(tmp_path):
+def test_render_recording_equals_synthesize_output(tmp_path):
     folder = synthesize(tmp_path / "written", frames=2, width_px=48, height_px=40, camera="moving", seed=3)
     written = list(open_recording(folder))
     kept = render_recording(RenderSettings(frames=2, width_px=48, height_px=40, camera="moving", seed=3, stereo=True))
@@ -50,7 +50,7 @@ def test_it_is_what_synthesize_writes(tmp_path):
     assert not np.array_equal(kept.camera_at(1).world_to_camera, kept.camera.world_to_camera)
 
 
-def test_scale_seed_and_eyes_reach_it():
+def test_synthetic_address_applies_scale_seed_and_eyes():
     source = open_source("synthetic:?width=96&height=80&frames=1&eyes=2", SourceOptions(scale=0.5, max_frames=3))
     assert (source.description.width_px, source.description.frame_count) == (48, 3)
     assert "right_image" in source.description.fields
@@ -58,7 +58,7 @@ def test_scale_seed_and_eyes_reach_it():
     assert one.digest != other.digest and (next(iter(one)).image != next(iter(other)).image).any()
 
 
-def test_no_more_frames_are_kept_than_the_memory_may_take(monkeypatch):
+def test_synthetic_frame_count_is_limited_by_memory(monkeypatch):
     monkeypatch.setattr(recording, "MOST_BYTES", 3 * 48 * 40 * 8)
     assert open_source(f"synthetic:?{SMALL}").recording.frame_count == 3
 
@@ -77,6 +77,6 @@ def test_no_more_frames_are_kept_than_the_memory_may_take(monkeypatch):
         ("colour=red", "unknown option 'colour'"),
     ],
 )
-def test_options_that_are_wrong_are_named(query, what):
+def test_synthetic_address_error_names_invalid_option(query, what):
     with pytest.raises(InvalidSetting, match=what):
         open_source(f"synthetic:?{query}")

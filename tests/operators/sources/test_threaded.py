@@ -42,7 +42,7 @@ def all_of(source):
     return seqs
 
 
-def test_it_keeps_the_protocol_and_gives_every_frame_once_in_order(camera, frame):
+def test_threaded_source_delivers_every_frame_once_in_order(camera, frame):
     source = Listed([frame(k) for k in range(50)], camera)
     assert isinstance(source, FrameSource)
     assert source.state is SourceState.ENDED and source.read(0) is None, "not open"
@@ -52,7 +52,7 @@ def test_it_keeps_the_protocol_and_gives_every_frame_once_in_order(camera, frame
     source.close()
 
 
-def test_opening_and_closing_twice_has_no_effect_and_opening_again_begins_again(camera, frame):
+def test_threaded_source_open_and_close_are_idempotent(camera, frame):
     source = Listed([frame(k) for k in range(4)], camera)
     source.close()
     source.open()
@@ -67,7 +67,7 @@ def test_opening_and_closing_twice_has_no_effect_and_opening_again_begins_again(
     source.close()
 
 
-def test_it_is_never_more_than_so_many_frames_ahead(camera, frame):
+def test_threaded_source_reads_at_most_ahead_frames(camera, frame):
     source = Listed([frame(k) for k in range(100)], camera, ahead=3)
     source.open()
     for taken in range(1, 20):
@@ -78,7 +78,7 @@ def test_it_is_never_more_than_so_many_frames_ahead(camera, frame):
     assert source.given < 100
 
 
-def test_an_error_comes_after_the_frames_before_it_and_only_once(camera, frame):
+def test_threaded_source_raises_error_once_after_earlier_frames(camera, frame):
     source = Listed([frame(0), frame(1), ValueError("broken here"), frame(2)], camera, ahead=5)
     source.open()
     assert [source.read(SOON_S).seq for _ in range(2)] == [0, 1]
@@ -88,7 +88,7 @@ def test_an_error_comes_after_the_frames_before_it_and_only_once(camera, frame):
     source.close()
 
 
-def test_a_time_out_is_none_and_the_source_goes_on(camera, frame):
+def test_threaded_source_read_timeout_returns_none(camera, frame):
     go_on = threading.Event()
     source = Listed([frame(0), go_on, frame(1)], camera)
     source.open()
@@ -99,7 +99,7 @@ def test_a_time_out_is_none_and_the_source_goes_on(camera, frame):
     source.close()
 
 
-def test_it_says_when_it_is_stalled(camera, frame):
+def test_threaded_source_reports_stalled_state(camera, frame):
     go_on = threading.Event()
     source = Listed([frame(0), go_on, frame(1)], camera, stalled_after_s=0.0)
     source.open()
@@ -111,7 +111,7 @@ def test_it_says_when_it_is_stalled(camera, frame):
     assert source.state is SourceState.ENDED
 
 
-def test_the_iterator_is_closed_in_the_thread_that_runs_it(camera, frame):
+def test_threaded_source_closes_iterator_in_reader_thread(camera, frame):
     source = Listed([frame(k) for k in range(100)], camera)
     source.open()
     source.read(SOON_S)
@@ -120,9 +120,7 @@ def test_the_iterator_is_closed_in_the_thread_that_runs_it(camera, frame):
     assert thread is not threading.current_thread() and not thread.is_alive()
 
 
-def test_a_reader_that_does_not_end_is_left_behind_and_never_gives_frames_to_a_later_reading(
-    camera, frame, monkeypatch, caplog
-):
+def test_threaded_source_abandons_stuck_reader_thread(camera, frame, monkeypatch, caplog):
     monkeypatch.setattr(ThreadedSource, "close_timeout_s", 0.01)
     stuck = threading.Event()
     source = Listed([frame(0), stuck, frame(1)], camera)
@@ -140,6 +138,6 @@ def test_a_reader_that_does_not_end_is_left_behind_and_never_gives_frames_to_a_l
     source.close()
 
 
-def test_one_frame_ahead_is_the_least(camera):
+def test_threaded_source_refuses_ahead_zero(camera):
     with pytest.raises(InvalidInput, match="ahead is 0; it must be at least 1"):
         Listed([], camera, ahead=0)

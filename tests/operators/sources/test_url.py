@@ -46,7 +46,7 @@ def encoded(path, count=30, codec="mpeg4", container="mpegts", **options):
 
 
 @pytest.mark.slow
-def test_rtsp_in_a_process_of_its_own_gives_live_frames(rtsp_server, reading):
+def test_rtsp_source_in_process_delivers_live_frames(rtsp_server, reading):
     rtsp_server.start()
     source = open_source(rtsp_server.url("camera"), SourceOptions(scale=0.5))
     assert isinstance(source, ProcessSource)
@@ -64,7 +64,7 @@ def test_rtsp_in_a_process_of_its_own_gives_live_frames(rtsp_server, reading):
 
 @pytest.mark.parametrize("fragment", ["", "#transport=udp"])
 @pytest.mark.slow
-def test_rtsp_motion_jpeg_by_tcp_and_udp(rtsp_server, reading, fragment):
+def test_rtsp_motion_jpeg_over_tcp_and_udp(rtsp_server, reading, fragment):
     rtsp_server.start()
     stream = reading(open_source(rtsp_server.url("motion") + fragment, HERE))
     frames = [stream.frame() for _ in range(5)]
@@ -72,7 +72,7 @@ def test_rtsp_motion_jpeg_by_tcp_and_udp(rtsp_server, reading, fragment):
 
 
 @pytest.mark.slow
-def test_a_server_that_is_killed_and_comes_back_after_a_while(rtsp_server, reading):
+def test_rtsp_source_reconnects_after_server_restart(rtsp_server, reading):
     rtsp_server.start()
     stream = reading(open_source(rtsp_server.url("camera"), HERE))
     before = [stream.frame() for _ in range(5)][-1]
@@ -89,7 +89,7 @@ def test_a_server_that_is_killed_and_comes_back_after_a_while(rtsp_server, readi
 
 
 @pytest.mark.slow
-def test_what_piled_up_before_the_source_was_opened_is_not_shown(rtsp_server, reading):
+def test_rtsp_source_discards_frames_buffered_before_open(rtsp_server, reading):
     rtsp_server.start()
     source = open_source(rtsp_server.url("camera"), HERE)
     first = source._connection
@@ -99,7 +99,7 @@ def test_what_piled_up_before_the_source_was_opened_is_not_shown(rtsp_server, re
 
 
 @pytest.mark.slow
-def test_a_server_that_hangs_is_a_stall_and_then_a_lost_connection(rtsp_server, reading):
+def test_rtsp_source_stalls_then_reconnects_if_server_hangs(rtsp_server, reading):
     rtsp_server.start()
     stream = reading(open_source(rtsp_server.url("camera") + "#stall_s=2&open_s=2", HERE))
     stream.frame()
@@ -112,7 +112,7 @@ def test_a_server_that_hangs_is_a_stall_and_then_a_lost_connection(rtsp_server, 
 
 
 @pytest.mark.slow
-def test_another_size_after_a_reconnection_is_passed_on(rtsp_server, reading):
+def test_rtsp_source_passes_other_size_after_reconnection(rtsp_server, reading):
     rtsp_server.start()
     source = open_source(rtsp_server.url("camera"), HERE)
     stream = reading(source)
@@ -128,7 +128,7 @@ def test_another_size_after_a_reconnection_is_passed_on(rtsp_server, reading):
 
 
 @pytest.mark.slow
-def test_a_password_opens_the_stream_and_appears_nowhere(rtsp_server, reading, caplog):
+def test_rtsp_password_is_not_in_messages_or_log(rtsp_server, reading, caplog):
     caplog.set_level(0)
     rtsp_server.start("surgeon:s3cr3t")
     source = open_source(rtsp_server.url("camera", "surgeon:s3cr3t@") + "?token=t0k3n", SourceOptions())
@@ -174,7 +174,7 @@ def web(tmp_path):
         thread.join()
 
 
-def test_a_video_by_http_ends_with_its_last_frame(web, tmp_path, reading):
+def test_http_video_ends_with_last_frame(web, tmp_path, reading):
     encoded(tmp_path / "video.mp4", container="mp4")
     stream = reading(open_source(f"{web}/video.mp4", SourceOptions(process=False, waiting=64)))
     assert [stream.frame().seq for _ in range(30)] == list(range(30))
@@ -183,7 +183,7 @@ def test_a_video_by_http_ends_with_its_last_frame(web, tmp_path, reading):
 
 
 @pytest.mark.slow
-def test_a_transport_stream_by_udp_that_is_joined_in_its_middle(reading, free_port):
+def test_udp_transport_stream_joined_midway_delivers_frames(reading, free_port):
     port, stop = free_port(socket.SOCK_DGRAM), threading.Event()
 
     def send():
@@ -213,7 +213,7 @@ def test_a_transport_stream_by_udp_that_is_joined_in_its_middle(reading, free_po
     assert all(b.seq > a.seq for a, b in itertools.pairwise(frames))
 
 
-def test_max_frames_ends_a_stream(web, tmp_path, reading):
+def test_max_frames_ends_url_stream(web, tmp_path, reading):
     encoded(tmp_path / "video.ts")
     source = open_source(f"{web}/video.ts", SourceOptions(process=False, waiting=64, max_frames=7))
     stream = reading(source)
@@ -221,7 +221,7 @@ def test_max_frames_ends_a_stream(web, tmp_path, reading):
     assert source.read(5) is None and source.state is SourceState.ENDED
 
 
-def test_packets_that_are_lost_mark_pictures_as_damaged_until_the_next_key_frame(web, tmp_path, reading):
+def test_lost_packets_mark_frames_damaged_until_next_key_frame(web, tmp_path, reading):
     data = bytearray(encoded(tmp_path / "video.ts", 40, "mpeg4").read_bytes())
     for packet in range(len(data) // 188 // 3, len(data) // 188 // 3 + 4):
         data[packet * 188 : packet * 188 + 188] = b"\x47\x1f\xff\x10" + 184 * b"\xff"  # a null packet in its place
@@ -233,7 +233,7 @@ def test_packets_that_are_lost_mark_pictures_as_damaged_until_the_next_key_frame
     assert FrameStatus.DAMAGED in status and status[0] is FrameStatus.LIVE and status[-1] is FrameStatus.LIVE
 
 
-def test_damage_spreads_to_the_next_key_frame_and_no_further():
+def test_stream_damage_spreads_to_next_key_frame():
     damage = StreamDamage()
     for number in range(10):
         damage.saw(number, number in (0, 6))
@@ -255,18 +255,18 @@ def test_damage_spreads_to_the_next_key_frame_and_no_further():
         ("rtsp://127.0.0.1/x#speed=1", "unknown option 'speed'"),
     ],
 )
-def test_what_is_no_address_is_a_sentence(address, what):
+def test_invalid_url_is_refused(address, what):
     with pytest.raises(InvalidSetting, match=what):
         open_source(address, HERE)
 
 
-def test_nobody_there_is_a_sentence():
+def test_url_connection_refused_raises_source_unavailable():
     with pytest.raises(SourceUnavailable, match=r"rtsp://127.0.0.1:1/x cannot be opened: Connection refused") as raised:
         open_source("rtsp://127.0.0.1:1/x", HERE)
     assert isinstance(raised.value, UserError)
 
 
-def test_names_without_secrets():
+def test_url_name_contains_no_credentials_or_query():
     name = UrlAddress.parse("https", "me:pa%40ss@host.example:8443/a/b?key=1#stall_s=3").name
     assert name == "https://host.example:8443/a/b"
     assert UrlAddress.parse("rtsp", "u:p@[::1]:554/x").name == "rtsp://[::1]:554/x"
@@ -304,7 +304,7 @@ MALFORMED = [
 
 
 @pytest.mark.parametrize(("address", "says"), MALFORMED)
-def test_a_malformed_address_is_refused_before_anything_is_started(monkeypatch, address, says):
+def test_malformed_url_is_refused_before_starting_process_or_connection(monkeypatch, address, says):
     monkeypatch.setattr(
         "operators.sources.process.ProcessSource", lambda *_, **__: pytest.fail("a process was started")
     )
@@ -322,6 +322,6 @@ def test_a_malformed_address_is_refused_before_anything_is_started(monkeypatch, 
         "https://caméra.example:8443/x?y=z", "srt://[::1]:9000", "rtmp://host/app/key",
     ],
 )  # fmt: skip
-def test_an_address_that_can_be_one_is_taken(address):
+def test_valid_url_is_accepted(address):
     scheme, _, rest = address.partition("://")
     assert UrlAddress.parse(scheme, rest).scheme == scheme

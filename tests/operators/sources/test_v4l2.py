@@ -23,7 +23,7 @@ HERE = SourceOptions(process=False, waiting=64)
 REAL_OPEN = av.open
 
 
-def test_a_camera_of_this_machine_gives_frames(reading):
+def test_v4l2_device_delivers_frames(reading):
     devices = sorted(Path("/dev").glob("video*"))
     if not devices:
         pytest.skip("there is no /dev/video* here: neither a camera nor the v4l2loopback module of the kernel")
@@ -74,7 +74,7 @@ def driver(monkeypatch):
     return Driver(monkeypatch)
 
 
-def test_what_is_asked_of_the_driver_and_what_it_gives(driver, reading):
+def test_v4l2_options_reach_driver_and_frames_have_even_times(driver, reading):
     source = open_source("v4l2:/dev/video0?size=640x480&fps=50&format=uyvy422", HERE)
     assert driver.asked == [("/dev/video0", {"video_size": "640x480", "framerate": "50", "input_format": "uyvy422"})]
     about = source.description
@@ -86,12 +86,12 @@ def test_what_is_asked_of_the_driver_and_what_it_gives(driver, reading):
     assert frames[0].pts_ns >= 0 and (steps == 20_000_000).all()
 
 
-def test_what_is_left_out_is_left_to_the_driver(driver, reading):
+def test_v4l2_without_options_uses_driver_defaults(driver, reading):
     reading(open_source("v4l2:/dev/video0", HERE)).frame()
     assert driver.asked == [("/dev/video0", {})]
 
 
-def test_a_camera_that_is_pulled_out_and_plugged_in_again(driver, reading):
+def test_v4l2_source_reconnects_after_unplugging(driver, reading):
     driver.frames = 3
     source = open_source("v4l2:/dev/video0", HERE)
     driver.unplugged = True
@@ -106,13 +106,13 @@ def test_a_camera_that_is_pulled_out_and_plugged_in_again(driver, reading):
 @pytest.mark.parametrize(
     "path", ["/dev/null", "/dev/../etc/passwd", "/etc/passwd", "video0", "", "/dev/video", "/dev/video0\0x"]
 )
-def test_nothing_but_a_camera_is_opened(driver, path):
+def test_v4l2_refuses_path_that_is_not_a_video_device(driver, path):
     with pytest.raises(InvalidSetting, match="is no camera" if path else "the path is empty"):
         open_source(f"v4l2:{path}", HERE)
     assert driver.asked == []
 
 
-def test_a_camera_that_is_not_there_is_a_sentence(driver):
+def test_v4l2_missing_camera_raises_source_unavailable(driver):
     with pytest.raises(SourceUnavailable, match=r"there is no camera /dev/video7 \(No such file or directory\)"):
         open_source("v4l2:/dev/video7", HERE)
     driver.unplugged = True
@@ -120,7 +120,7 @@ def test_a_camera_that_is_not_there_is_a_sentence(driver):
         open_source("v4l2:/dev/video0", HERE)
 
 
-def test_what_is_a_file_is_no_camera(monkeypatch):
+def test_v4l2_refuses_regular_file(monkeypatch):
     monkeypatch.setattr(url.os, "stat", lambda path: SimpleNamespace(st_mode=stat.S_IFREG))
     with pytest.raises(SourceUnavailable, match="it is no device"):
         url.device_of("/dev/video0")
@@ -130,6 +130,6 @@ def test_what_is_a_file_is_no_camera(monkeypatch):
     ("query", "what"),
     [("size=big", "size is 'big'"), ("format=png", "format is 'png'"), ("rate=3", "unknown option 'rate'")],
 )
-def test_options_that_are_wrong_are_named(query, what):
+def test_v4l2_address_error_names_invalid_option(query, what):
     with pytest.raises(InvalidSetting, match=what):
         open_source(f"v4l2:/dev/video0?{query}", HERE)

@@ -22,7 +22,7 @@ from operators.sources.pipe import Y4mHeader
         ("YUV4MPEG2 W7 H5 W8 H6", (7, 5, None, "yuv420p")),  # the first one of two counts
     ],
 )
-def test_a_header_says_size_rate_and_format(line, header):
+def test_y4m_header_parse_returns_size_rate_and_format(line, header):
     found = Y4mHeader.parse(line.encode())
     assert (found.width_px, found.height_px, found.fps, found.format) == header
 
@@ -42,6 +42,6 @@ def test_a_header_says_size_rate_and_format(line, header):
         ("YUV4MPEG2 W7 H5 C420p10", "kind C420p10 are not read; known are 420, "),
     ],
 )
-def test_a_header_that_cannot_be_used_is_refused(line, said):
+def test_y4m_header_parse_refuses_unusable_header(line, said):
     with pytest.raises(InvalidSetting, match=said):
         Y4mHeader.parse(line.encode())

@@ -74,7 +74,7 @@ def address_of(sender, query=""):
 
 
 @pytest.mark.parametrize("process", [False, True])
-def test_frames_come_as_they_were_sent(sending, reading, process):
+def test_zeromq_source_delivers_frames_unchanged(sending, reading, process):
     def send(publisher, k):
         arrays = {name: array for name, array in ARRAYS.items() if name != "image"}
         publisher.publish(image(k % 256), pts_ns=k * 20_000_000, **arrays)
@@ -93,7 +93,7 @@ def test_frames_come_as_they_were_sent(sending, reading, process):
     assert frames[0].status is FrameStatus.LIVE and frames[0].arrived_ns <= time.monotonic_ns()
 
 
-def test_a_sender_that_goes_and_comes_back(sending, reading, tmp_path):
+def test_zeromq_source_reconnects_after_sender_restart(sending, reading, tmp_path):
     endpoint = f"ipc://{tmp_path}/frames"
     first = sending(endpoint)
     stream = reading(open_source(address_of(first), ALL))
@@ -110,7 +110,7 @@ def test_a_sender_that_goes_and_comes_back(sending, reading, tmp_path):
     second.close()
 
 
-def test_a_slow_reader_gets_the_newest(sending, reading):
+def test_zeromq_slow_reader_gets_newest_frame(sending, reading):
     sender = sending("tcp://127.0.0.1:*")
     stream = reading(open_source(address_of(sender), SourceOptions(waiting=1)))
     first = stream.frame()
@@ -120,7 +120,7 @@ def test_a_slow_reader_gets_the_newest(sending, reading):
     assert stream.frame().seq - first.seq > 6
 
 
-def test_another_size_is_passed_on(sending, reading):
+def test_zeromq_source_passes_frames_of_other_size(sending, reading):
     sizes = [(4, 6), (8, 10)]
     sender = sending("tcp://127.0.0.1:*", lambda p, k: p.publish(image(1, *sizes[k // 40 % 2]), pts_ns=k * 10**7))
     stream = reading(open_source(address_of(sender), ALL))
@@ -130,7 +130,7 @@ def test_another_size_is_passed_on(sending, reading):
     assert seen == set(sizes)
 
 
-def test_nothing_that_comes_is_a_sentence(sending):
+def test_zeromq_source_without_sender_raises_source_unavailable(sending):
     with pytest.raises(SourceUnavailable, match=r"no frame came\. Start what sends to it"):
         open_source("zmq+tcp://127.0.0.1:1?open_s=0.2")
 
@@ -145,7 +145,7 @@ def keys(tmp_path_factory):
     return folder
 
 
-def test_encrypted_frames_come_to_whoever_has_the_keys(sending, reading, keys):
+def test_zeromq_encrypted_frames_require_allowed_keys(sending, reading, keys):
     secret, allowed = str(keys / "server.key_secret"), str(keys / "allowed")
     sender = sending("tcp://127.0.0.1:*", certificate=secret, clients=allowed)
     query = f"?server={keys}/server.key&client={keys}/{{}}.key_secret&open_s={{}}"
@@ -173,7 +173,7 @@ def test_encrypted_frames_come_to_whoever_has_the_keys(sending, reading, keys):
         ("tcp://[::]:5", False),
     ],
 )
-def test_what_stays_on_this_machine(endpoint, here):
+def test_zeromq_endpoint_locality(endpoint, here):
     assert is_of_this_machine(endpoint) is here
     if not here:
         with pytest.raises(InvalidSetting, match="leads to another machine"):
@@ -193,12 +193,12 @@ def test_what_stays_on_this_machine(endpoint, here):
         ("zmq+tcp://127.0.0.1:5?topic=x", "unknown option 'topic'"),
     ],
 )
-def test_addresses_that_are_wrong_are_sentences(address, what):
+def test_invalid_zeromq_address_is_refused(address, what):
     with pytest.raises(InvalidSetting, match=what):
         open_source(address)
 
 
-def test_a_public_key_is_no_secret_one(keys):
+def test_zeromq_refuses_public_key_as_secret_key(keys):
     with pytest.raises(InvalidSetting, match="has no secret key"):
         FramePublisher("tcp://127.0.0.1:*", certificate=str(keys / "server.key"))
     with pytest.raises(InvalidSetting, match="has no secret key"):
