@@ -20,7 +20,7 @@ def test_help_names_every_command(capsys):
     assert "not a medical device" in " ".join(out.split())
 
 
-def test_version(capsys):
+def test_version_option_prints_version(capsys):
     assert run(["--version"]) == 0
     assert capsys.readouterr().out.startswith("intrasplat ")
 
@@ -28,19 +28,19 @@ def test_version(capsys):
 @pytest.mark.parametrize(
     "arguments", [["replya"], ["replay"], ["replay", "x"], ["replay", "x", "--out", "y", "--seed", "one"]]
 )
-def test_a_wrong_command_line_is_2(arguments, capsys):
+def test_wrong_command_line_exits_2_with_one_error_line(arguments, capsys):
     assert run(arguments) == BAD_INPUT
     captured = capsys.readouterr()
     assert captured.out == "" and captured.err.startswith("error: ") and captured.err.count("\n") == 1
     assert captured.err.rstrip().endswith("--help` lists what there is")
 
 
-def test_without_a_command_there_is_help(capsys):
+def test_missing_command_prints_help(capsys):
     assert run([]) == BAD_INPUT
     assert "Usage: intrasplat" in capsys.readouterr().out
 
 
-def test_importing_the_command_is_quick_because_it_imports_nothing_heavy():
+def test_importing_cli_app_imports_no_heavy_libraries():
     code = (
         "import sys, services.cli.app; print(sorted({'torch', 'cv2', 'numpy', 'pydantic', 'fastapi'} & set(sys.modules)))\n"
         "assert services.cli.app.run(['replay', '--help']) == 0; print(sorted({'torch', 'cv2', 'numpy'} & set(sys.modules)))"
@@ -49,7 +49,7 @@ def test_importing_the_command_is_quick_because_it_imports_nothing_heavy():
     assert (done.stdout.splitlines()[0], done.stdout.splitlines()[-1]) == ("[]", "[]")
 
 
-def test_runs_do_not_load_the_database_of_the_service():
+def test_importing_cli_runs_imports_no_database_libraries():
     code = "import sys, services.cli.runs; print(sorted({'sqlalchemy', 'alembic', 'fastapi'} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
@@ -69,7 +69,7 @@ EVERY_COMMAND = dict(commands(CONTEXT.command))
 
 
 @pytest.mark.parametrize("words", EVERY_COMMAND, ids=" ".join)
-def test_an_empty_argument_or_option_of_any_command_is_refused(words, capsys, monkeypatch, tmp_path):
+def test_commands_refuse_empty_arguments_and_options(words, capsys, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)  # an empty path must not stand for the current folder
     options = [each.opts[-1] for each in EVERY_COMMAND[words] if each.opts[-1].startswith("--") and not each.is_flag]
     arguments = sum(each.param_type_name == "argument" for each in EVERY_COMMAND[words])
@@ -93,7 +93,7 @@ def is_numeric(parameter) -> bool:
     return False
 
 
-def test_options_with_numbers_are_recognised():
+def test_is_numeric_recognises_numeric_options():
     numeric = {
         (words[0], each.opts[-1]) for words, every in EVERY_COMMAND.items() for each in every if is_numeric(each)
     }
@@ -109,7 +109,7 @@ def test_options_with_numbers_are_recognised():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("words", EVERY_COMMAND, ids=" ".join)
-def test_numbers_with_underscores_or_digits_of_other_scripts_are_refused(words, capsys, monkeypatch, tmp_path):
+def test_numeric_options_refuse_underscores_and_non_ascii_digits(words, capsys, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     takes = [each for each in EVERY_COMMAND[words] if each.opts[-1].startswith("--") and not each.is_flag]
     for option in (each.opts[-1] for each in takes if is_numeric(each)):
@@ -122,18 +122,18 @@ def test_numbers_with_underscores_or_digits_of_other_scripts_are_refused(words, 
 
 
 @pytest.mark.parametrize("number", ["1_0", "１０", " 10"])
-def test_a_number_in_place_of_a_word_is_plain(number, capsys, tmp_path):
+def test_budget_ms_refuses_unusual_number_spellings(number, capsys, tmp_path):
     assert run(["live", str(tmp_path), "--budget-ms", number]) == BAD_INPUT
     assert "budget_ms is" in capsys.readouterr().err
 
 
-def test_a_whole_number_in_place_of_a_word_is_whole(capsys, tmp_path):
+def test_steps_option_accepts_plain_integer(capsys, tmp_path):
     assert run(["reconstruct", str(tmp_path / "nowhere"), "--out", str(tmp_path / "out"), "--steps", "5"]) == BAD_INPUT
     assert "there is no such file" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("number", ["1_0", "１０", " 10"])
-def test_numbers_inside_texts_are_plain_too(number):
+def test_parsers_of_composite_values_refuse_unusual_number_spellings(number):
     from datetime import datetime
 
     from gsplat_core.errors import InvalidSetting

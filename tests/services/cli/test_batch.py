@@ -67,7 +67,7 @@ NOTHING = "nothing was shown: all frames were withheld"
         (Summary(counts(), 0, [], 1.0, [("x", "is no recording")]), False, BAD_INPUT),
     ],
 )
-def test_the_exit_code(run, summary, asked, code):
+def test_batch_exit_code_follows_summary(run, summary, asked, code):
     assert run(summary, asked=asked) == code
     assert run.seen["out"].name == "recs-replays" and run.seen["out"].parent == run.seen["folder"].parent
 
@@ -77,19 +77,19 @@ def test_the_exit_code(run, summary, asked, code):
     [(8, None, "cpu", (4, 2)), (1, None, "cpu", (1, 1)), (3, None, "cpu", (1, 3)), (8, None, "cuda", (1, 8)),
      (8, 3, "cpu", (3, 2)), (2, 5, "cpu", (5, 1)), (8, 2, "cuda", (2, 4))],
 )  # fmt: skip
-def test_cores_are_shared_by_the_workers(run, cores, workers, device, expected):
+def test_batch_divides_cores_between_workers(run, cores, workers, device, expected):
     run(Summary(counts(done=1), 0, [], 1.0), cores=cores, workers=workers, device=device)
     settings = run.seen["settings"]
     assert (settings.workers, settings.threads) == expected
 
 
-def test_a_reason_that_names_the_operator_is_one_line(capsys):
+def test_batch_prints_multiline_reason_as_one_line(capsys):
     summary = Summary(counts(failed=1), 0, failed("d.npy: 1 pixels are NaN.\n  in operator source"), 1.0)
     batch._print(summary, Path("out"), as_json=False)
     assert capsys.readouterr().err == "failed: r0: d.npy: 1 pixels are NaN. In operator source\n"
 
 
-def test_the_summary_in_words_and_as_json(capsys):
+def test_batch_prints_summary_as_text_and_json(capsys):
     summary = Summary(counts(done=3, failed=1), 1, failed("bad\nname"), 2.04, [("y\x1b", "is no recording")])
     batch._print(summary, Path("out"), as_json=False)
     said = capsys.readouterr()
@@ -103,7 +103,7 @@ def test_the_summary_in_words_and_as_json(capsys):
     }  # fmt: skip
 
 
-def test_progress_is_said_every_few_seconds_and_at_the_end(capsys, monkeypatch):
+def test_batch_progress_is_printed_every_5_s_and_at_end(capsys, monkeypatch):
     now = SimpleNamespace(s=100.0)
     monkeypatch.setattr(batch, "time", SimpleNamespace(monotonic=lambda: now.s))
     tell, quiet = batch._Teller(False), batch._Teller(True)
@@ -122,6 +122,6 @@ def test_progress_is_said_every_few_seconds_and_at_the_end(capsys, monkeypatch):
     assert said(0.1, done=2, failed=1, cancelled=1) == "4/4 recordings, 1 failed\n", "the end is said at once"
 
 
-def test_a_wrong_option_is_named_as_the_command_names_it():
+def test_batch_error_names_invalid_option():
     with pytest.raises(InvalidSetting, match="steps_per_frame is -1; it must be from 1 to"):
         batch._checked({"steps_per_frame": -1})

@@ -80,7 +80,7 @@ def path_of(tmp_path, count=5):
     return tmp_path / "path.json"
 
 
-def test_every_camera_of_the_path_is_rendered_and_measured(scene, tmp_path, recorder, capsys):
+def test_bench_renders_and_measures_every_camera_of_path(scene, tmp_path, recorder, capsys):
     words = [
         "bench",
         str(scene),
@@ -108,7 +108,7 @@ def test_every_camera_of_the_path_is_rendered_and_measured(scene, tmp_path, reco
         assert sum(1 for _ in video.decode(video=0)) == 5
 
 
-def test_render_takes_the_same_path_and_options(scene, tmp_path, recorder, capsys):
+def test_render_uses_path_and_renderer_options(scene, tmp_path, recorder, capsys):
     words = ["render", str(scene), "--renderer", "recorder", "--samples", "3", "--fps", "0.1"]
     words += ["--path", str(path_of(tmp_path)), "--scale", "0.1", "--out", str(tmp_path / "out")]
     assert run([*words, "--view", "orbit"]) == BAD_INPUT
@@ -118,12 +118,12 @@ def test_render_takes_the_same_path_and_options(scene, tmp_path, recorder, capsy
     assert [round(float(camera.position[0]), 6) for camera, _ in recorder.made[-1].frames] == [0, 1, 2, 3, 4]
 
 
-def test_without_a_path_the_camera_moves_around_the_scene(scene, capsys):
+def test_bench_without_path_succeeds(scene, capsys):
     assert run(["bench", str(scene), "--frames", "2", "--width", "40", "--height", "32"]) == OK
     assert "frames/s" in capsys.readouterr().out
 
 
-def test_another_aspect_ratio_keeps_the_vertical_field_of_view():
+def test_camera_fitted_keeps_vertical_field_of_view():
     camera = Camera(np.array([[100.0, 0, 30], [0, 120, 25], [0, 0, 1]]), 64, 48)
     wide = camera.fitted(192, 96)
     assert wide.K.tolist() == [[200, 0, 92], [0, 240, 50], [0, 0, 1]] and (wide.width_px, wide.height_px) == (192, 96)
@@ -145,13 +145,13 @@ def test_another_aspect_ratio_keeps_the_vertical_field_of_view():
         (["--out", "video.avi"], "does not end in .mp4"),
     ],
 )
-def test_a_wrong_option_is_one_sentence(scene, capsys, words, reason):
+def test_bench_prints_one_error_line_for_invalid_option(scene, capsys, words, reason):
     assert run(["bench", str(scene), *words]) == BAD_INPUT
     said = capsys.readouterr().err
     assert said.startswith("error: ") and reason in said and said.count("\n") == 1
 
 
-def test_an_existing_video_is_kept(scene, tmp_path, capsys):
+def test_bench_does_not_overwrite_foreign_video(scene, tmp_path, capsys):
     (tmp_path / "v.mp4").write_bytes(b"mine")
     assert run(["bench", str(scene), "--out", str(tmp_path / "v.mp4"), "--overwrite"]) != OK
     assert (tmp_path / "v.mp4").read_bytes() == b"mine"

@@ -54,7 +54,7 @@ def write(mesh: Mesh, path) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".stl", ".obj"])
-def test_a_model_lies_on_its_own_moved_surface(suffix, tmp_path, capsys):
+def test_compare_registers_moved_mesh_of_same_model(suffix, tmp_path, capsys):
     model = bumpy()
     save_bundle(model, tmp_path / "model")
     mesh = surface()
@@ -70,7 +70,7 @@ def test_a_model_lies_on_its_own_moved_surface(suffix, tmp_path, capsys):
     assert np.allclose(np.array(said["registration"]["transform"])[:3, :3], turn, atol=2e-3)
 
 
-def test_a_model_without_a_unit_takes_its_scale_from_pairs(tmp_path, capsys):
+def test_compare_takes_scale_of_unitless_model_from_pairs(tmp_path, capsys):
     model = bumpy(None)
     save_bundle(model, tmp_path / "model")
     mesh = surface()
@@ -113,7 +113,7 @@ LISTS = (
         ("ct.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "no triangles with an area"),
     ],
 )
-def test_files_that_are_no_meshes_are_refused(name, content, said, tmp_path, capsys):
+def test_compare_refuses_invalid_mesh_files(name, content, said, tmp_path, capsys):
     save_bundle(bumpy(), tmp_path / "model")
     (tmp_path / name).write_bytes(content)
     assert run(["compare", str(tmp_path / "model"), str(tmp_path / name)]) == BAD_INPUT
@@ -129,7 +129,7 @@ def metric_model(tmp_path):
 
 @pytest.mark.parametrize("factor", [1e-30, 1e-12, 1e-7, 1e-3, 0.0254, 39.37, 1e3, 1e7, 1e30])
 @pytest.mark.parametrize("suffix", [".ply", ".stl", ".obj"])
-def test_a_mesh_of_another_unit_is_never_compared(metric_model, tmp_path, capsys, suffix, factor):
+def test_compare_refuses_mesh_in_other_unit(metric_model, tmp_path, capsys, suffix, factor):
     model, mesh = metric_model
     with np.errstate(over="ignore", under="ignore"):
         vertices = (mesh.vertices.astype(np.float64) * factor).astype(np.float32)
@@ -140,7 +140,7 @@ def test_a_mesh_of_another_unit_is_never_compared(metric_model, tmp_path, capsys
 
 
 @pytest.mark.parametrize("factor", [0.001, 0.1, 2.0, 1000.0])
-def test_pairs_that_state_another_unit_are_refused(metric_model, tmp_path, capsys, factor):
+def test_compare_refuses_pairs_in_other_unit(metric_model, tmp_path, capsys, factor):
     model, mesh = metric_model
     write(
         Mesh((mesh.vertices * factor).astype(np.float32), mesh.normals, mesh.colours, mesh.triangles),
@@ -152,7 +152,7 @@ def test_pairs_that_state_another_unit_are_refused(metric_model, tmp_path, capsy
     assert "as far from each other" in capsys.readouterr().err
 
 
-def test_surfaces_that_do_not_lie_on_each_other_end_with_an_error(metric_model, tmp_path, capsys):
+def test_compare_fails_if_surfaces_do_not_match(metric_model, tmp_path, capsys):
     model, mesh = metric_model
     write(Mesh((mesh.vertices * 3).astype(np.float32), mesh.normals, mesh.colours, mesh.triangles), tmp_path / "ct.stl")
     code = run(["compare", str(model), str(tmp_path / "ct.stl"), "--inlier", "0.01", "--json"])
@@ -176,7 +176,7 @@ PLY = "ply\nformat {}\nelement vertex {}\nproperty float x\nproperty float y\npr
     ],
     ids=range(15),
 )  # fmt: skip
-def test_a_damaged_mesh_is_one_sentence(metric_model, tmp_path, capsys, content):
+def test_compare_prints_error_for_damaged_ply_mesh(metric_model, tmp_path, capsys, content):
     (tmp_path / "ct.ply").write_bytes(content)
     assert run(["compare", str(metric_model[0]), str(tmp_path / "ct.ply")]) == BAD_INPUT
     said = capsys.readouterr().err

@@ -97,7 +97,7 @@ def ctl(service: Service, capsys: pytest.CaptureFixture[str]) -> Ctl:
 
 
 @pytest.mark.parametrize("state", ["ready", "rejected"])
-def test_an_upload_ends_with_the_check_of_the_version(ctl: Ctl, service: Service, tmp_path: Path, state: str) -> None:
+def test_ctl_upload_waits_for_check_of_version(ctl: Ctl, service: Service, tmp_path: Path, state: str) -> None:
     (tmp_path / "liver.isplat").write_bytes(b"model")
     service.answers["PUT", "/v1/models/liver/versions"] = [{**VERSION, "state": "uploaded"}]
     checked = {**VERSION, "state": state, "reason": "it is torn"}
@@ -110,7 +110,7 @@ def test_an_upload_ends_with_the_check_of_the_version(ctl: Ctl, service: Service
 
 
 @pytest.mark.parametrize(("suffix", "is_converted"), [("ply", True), ("SPLAT", True), ("isplat", False)])
-def test_only_files_of_other_programs_are_converted(
+def test_ctl_upload_requests_conversion_of_splat_files_only(
     ctl: Ctl, service: Service, tmp_path: Path, suffix: str, is_converted: bool
 ) -> None:
     file = tmp_path / f"liver.{suffix}"
@@ -123,7 +123,7 @@ def test_only_files_of_other_programs_are_converted(
 
 
 @pytest.mark.parametrize("state", ["ready", "rejected"])
-def test_an_upload_of_a_recording_ends_with_its_check(ctl: Ctl, service: Service, tmp_path: Path, state: str) -> None:
+def test_ctl_add_recording_waits_for_check(ctl: Ctl, service: Service, tmp_path: Path, state: str) -> None:
     (tmp_path / "case.mp4").write_bytes(b"video")
     service.answers["PUT", "/v1/recordings/case-7"] = [{**RECORDING, "state": "uploaded"}]
     checked = {**RECORDING, "state": state, "reason": "it is torn"}
@@ -134,7 +134,7 @@ def test_an_upload_of_a_recording_ends_with_its_check(ctl: Ctl, service: Service
 
 
 @pytest.mark.parametrize("stored", [False, True])
-def test_a_snapshot_for_a_model_ends_with_the_check_of_its_version(ctl: Ctl, service: Service, stored: bool) -> None:
+def test_ctl_snapshot_with_model_waits_for_check_of_version(ctl: Ctl, service: Service, stored: bool) -> None:
     taken = {**SNAPSHOT, "id": None, "version": {**VERSION, "state": "uploaded"}} if stored else SNAPSHOT
     service.answers["POST", "/v1/streams/theatre-1/snapshots"] = [taken]
     service.answers["GET", "/v1/models/liver/versions/3"] = [VERSION]
@@ -144,7 +144,7 @@ def test_a_snapshot_for_a_model_ends_with_the_check_of_its_version(ctl: Ctl, ser
     assert len(service.requests) == 1 + stored
 
 
-def test_renderings_and_exports_are_written_under_the_given_name(ctl: Ctl, service: Service, tmp_path: Path) -> None:
+def test_ctl_render_export_and_fetch_write_new_files_only(ctl: Ctl, service: Service, tmp_path: Path) -> None:
     png, ply, packed = (str(tmp_path / name) for name in ("a.PNG", "b.ply", "c.isplat"))
     assert ctl("render", "liver", "3", png, "--view", "orbit", "--time", "1.5", "--option", "layout=row") == (
         OK, f"{png}\n", "",
@@ -171,7 +171,7 @@ def test_renderings_and_exports_are_written_under_the_given_name(ctl: Ctl, servi
         assert len(service.requests) == sent, "nothing is asked for a file that cannot be written"
 
 
-def test_a_virtual_camera_is_turned_as_asked(ctl: Ctl, service: Service) -> None:
+def test_ctl_camera_sends_angles_and_zoom(ctl: Ctl, service: Service) -> None:
     assert ctl("camera", "theatre-1", "--azimuth", "10", "--elevation", "-5", "--zoom", "2")[0] == OK
     wanted = {"azimuth_deg": 10.0, "elevation_deg": -5.0, "zoom": 2.0}
     assert service.requests == [("PUT", "/v1/streams/theatre-1/camera", {"json": wanted})]
@@ -181,7 +181,9 @@ def test_a_virtual_camera_is_turned_as_asked(ctl: Ctl, service: Service) -> None
     ("wait", "states", "code"),
     [(False, ["queued"], OK), (True, ["running", "done"], OK), (True, ["failed"], BAD_INPUT)],
 )
-def test_replays_are_waited_for_if_asked(ctl: Ctl, service: Service, wait: bool, states: list[str], code: int) -> None:
+def test_ctl_replay_waits_for_end_with_wait_option(
+    ctl: Ctl, service: Service, wait: bool, states: list[str], code: int
+) -> None:
     service.answers["POST", "/v1/replays"] = [{"id": None, "batch": "b", "ids": ["1", "2"]}]
     service.answers["GET", "/v1/replays/1"] = [replay("1", "done" if wait else "queued")]
     service.answers["GET", "/v1/replays/2"] = [replay("2", state) for state in states]
@@ -201,7 +203,7 @@ def test_replays_are_waited_for_if_asked(ctl: Ctl, service: Service, wait: bool,
     ids=["snapshot", "key"],
 )  # fmt: skip
 @pytest.mark.parametrize("number", ["1f0c", "2e1d"])
-def test_only_an_existing_resource_is_deleted(
+def test_ctl_deletes_only_existing_snapshots_and_keys(
     ctl: Ctl, service: Service, command: list[str], listing: tuple[str, dict[str, Any]], target: str, number: str
 ) -> None:
     path, row = listing
@@ -213,13 +215,13 @@ def test_only_an_existing_resource_is_deleted(
         assert code == BAD_INPUT and repr(number) in err and service.asked == [("GET", path)]
 
 
-def test_an_ended_replay_is_deleted_after_it_was_found(ctl: Ctl, service: Service) -> None:
+def test_ctl_delete_replay_looks_up_replay_first(ctl: Ctl, service: Service) -> None:
     service.answers["GET", "/v1/replays/1"] = [replay("1", "done")]
     assert ctl("delete", "replay", "1", "--yes")[0] == OK
     assert service.asked == [("GET", "/v1/replays/1"), ("DELETE", "/v1/replays/1")]
 
 
-def test_a_new_key_is_printed_once_with_its_limits_sent(ctl: Ctl, service: Service) -> None:
+def test_ctl_keys_add_sends_limits_and_prints_key(ctl: Ctl, service: Service) -> None:
     made = {"id": "1", "name": "wall", "role": "viewer", "created_at": "then", "key": "intrasplat_1_2"}
     service.answers["POST", "/v1/keys"] = [made]
     begin = datetime.now(UTC)
@@ -240,7 +242,7 @@ def page(entries: list[int], next_before: int | None, head: int) -> dict[str, An
     }
 
 
-def test_a_page_of_the_audit_log_is_filled_by_several_requests(ctl: Ctl, service: Service) -> None:
+def test_ctl_audit_requests_pages_until_count_is_reached(ctl: Ctl, service: Service) -> None:
     service.answers["GET", "/v1/audit"] = [page([9, 8], 8, 9), page([5], 5, 9), page([2, 1], None, 9)]
     code, out, _ = ctl("audit", "--count", "5")
     assert code == OK
@@ -251,7 +253,7 @@ def test_a_page_of_the_audit_log_is_filled_by_several_requests(ctl: Ctl, service
     assert ctl("audit", "--count", "2")[0] == OK and len(service.requests) == 4
 
 
-def test_followed_entries_are_printed_once_in_order(
+def test_ctl_audit_follow_prints_entries_once_in_order(
     ctl: Ctl, service: Service, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     service.answers["GET", "/v1/audit"] = [
@@ -274,14 +276,14 @@ def test_followed_entries_are_printed_once_in_order(
     assert len(service.requests) == 6
 
 
-def test_a_batch_and_json_are_printed(ctl: Ctl, service: Service) -> None:
+def test_ctl_replays_filters_by_batch_and_prints_json(ctl: Ctl, service: Service) -> None:
     service.answers["GET", "/v1/replays"] = [[replay("1", "done")]]
     code, out, _ = ctl("replays", "--batch", "b", "--count", "3", "--json")
     assert code == OK and json.loads(out)[0]["recording"] == "case-1"
     assert service.requests[0][2]["params"] == {"count": 3, "batch": "b"}
 
 
-def test_a_folder_is_uploaded_as_an_archive_of_its_files(ctl: Ctl, service: Service, tmp_path: Path) -> None:
+def test_ctl_add_recording_uploads_folder_as_uncompressed_zip(ctl: Ctl, service: Service, tmp_path: Path) -> None:
     """Nothing is compressed, because pictures are already."""
     folder = tmp_path / "case"
     (folder / "images").mkdir(parents=True)

@@ -27,31 +27,31 @@ def said(monkeypatch):
     return look
 
 
-def test_kernels_that_run(said):
+def test_doctor_reports_working_cuda_kernels(said):
     checks = said(GPU, None)
     assert all(check.ok for check in checks.values())
     assert checks["CUDA kernels"].value == "built by nvcc 13.0 for compute capability 8.0, 9.0"
     assert checks["ops on the GPU"].value == "2: adam_, composite"
 
 
-def test_a_gpu_without_kernels_is_told_how_to_build_them(said):
+def test_doctor_advises_make_cuda_for_gpu_without_kernels(said):
     checks = said(GPU, "not built")
     assert checks["GPU"].ok and not checks["CUDA kernels"].ok
     assert "make cuda" in checks["CUDA kernels"].advice
 
 
-def test_kernels_for_another_gpu_are_told_from_kernels_that_run(said):
+def test_doctor_reports_kernels_that_gpu_refuses(said):
     checks = said(GPU, None, "no kernel image is available for execution on the device")
     assert not checks["CUDA kernels"].ok and "no kernel image" in checks["CUDA kernels"].value
     assert "--device cpu" in checks["CUDA kernels"].advice
 
 
-def test_kernels_without_a_gpu_are_not_tried(said):
+def test_doctor_does_not_run_kernels_without_gpu(said):
     checks = said(NONE, None, "must not be asked")
     assert not checks["GPU"].ok and checks["CUDA kernels"].ok and "must not" not in checks["CUDA kernels"].value
 
 
-def test_neither_is_nothing_to_do(said):
+def test_doctor_gives_no_build_advice_without_gpu_and_kernels(said):
     checks = said(NONE, "not built")
     assert (
         "everything runs on the CPU" in checks["CUDA kernels"].advice
@@ -59,7 +59,7 @@ def test_neither_is_nothing_to_do(said):
     )
 
 
-def test_every_op_with_a_kernel_for_the_cpu_is_listed_once_and_counted():
+def test_doctor_lists_and_counts_cpu_ops():
     value = next(check.value for check in doctor._core() if check.name == "ops on the CPU")
     count, _, names = value.partition(": ")
     listed = names.split(", ")

@@ -23,7 +23,7 @@ main()
 
 
 @pytest.mark.parametrize("module", ["services.cli.terminal", "services.cli.app", "typer"])
-def test_an_interrupt_during_imports_has_no_traceback(module):
+def test_interrupt_during_imports_exits_130_without_traceback(module):
     done = subprocess.run(
         [sys.executable, "-c", PROGRAM, module], capture_output=True, text=True, timeout=300, check=False
     )

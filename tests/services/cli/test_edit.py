@@ -40,7 +40,7 @@ def bundle(gaussians, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_box_is_cut_out_of_a_scene_file(ply, gaussians, tmp_path, capsys):
+def test_edit_deletes_gaussians_outside_box_of_scene_file(ply, gaussians, tmp_path, capsys):
     out = tmp_path / "cut.ply"
     words = ["edit", ply, "--select", "box:-1,-1,8,1,1,10", "--outside", "--delete", "--out", str(out), "--json"]
     assert run(words) == OK
@@ -50,7 +50,7 @@ def test_a_box_is_cut_out_of_a_scene_file(ply, gaussians, tmp_path, capsys):
     torch.testing.assert_close(load_ply(out).means, gaussians.means[inside])
 
 
-def test_a_label_is_deleted_from_a_deforming_model(bundle, tmp_path):
+def test_edit_deletes_label_of_deforming_model(bundle, tmp_path):
     assert run(["edit", bundle, "--select", "label:1", "--delete", "--out", str(tmp_path / "out")]) == OK
     before, after = load_bundle(bundle), load_bundle(tmp_path / "out")
     kept = torch.arange(40) % 4 != 1
@@ -58,7 +58,7 @@ def test_a_label_is_deleted_from_a_deforming_model(bundle, tmp_path):
         torch.testing.assert_close(after.at(time_s).means, before.at(time_s).means[kept])
 
 
-def test_a_part_is_recoloured_and_moved_and_another_scene_added(ply, gaussians, tmp_path):
+def test_edit_recolours_transforms_and_merges_scenes(ply, gaussians, tmp_path):
     out = tmp_path / "out"
     words = ["--select", "sphere:0,0,9,1", "--recolour", "1,0,0.5", "--rotate", "0,0,2,90", "--translate", "1,0,0"]
     assert run(["edit", ply, *words, "--scale", "2", "--merge", ply, "--out", str(out)]) == OK
@@ -92,13 +92,13 @@ def test_a_part_is_recoloured_and_moved_and_another_scene_added(ply, gaussians, 
         (["--recolour", "1,0,0", "--outside"], "the outside of the selection holds none"),
     ],
 )
-def test_wrong_edits_are_one_sentence(ply, tmp_path, capsys, words, reason):
+def test_edit_prints_one_error_line_for_invalid_edit(ply, tmp_path, capsys, words, reason):
     assert run(["edit", ply, *words, "--out", str(tmp_path / "out.ply")]) == BAD_INPUT
     said = capsys.readouterr().err
     assert said.startswith("error: ") and reason in said and said.count("\n") == 1
     assert not (tmp_path / "out.ply").exists()
 
 
-def test_a_deforming_model_is_not_moved(bundle, tmp_path, capsys):
+def test_edit_refuses_to_transform_deforming_model(bundle, tmp_path, capsys):
     assert run(["edit", bundle, "--scale", "2", "--out", str(tmp_path / "out")]) == BAD_INPUT
     assert "export one time" in capsys.readouterr().err

@@ -11,7 +11,7 @@ from gsplat_core.errors import InvalidSetting
 from services.cli import runs
 
 
-def test_two_stays_at_a_place() -> None:
+def test_place_option_parses_two_stays() -> None:
     visits = runs._place("0:2,60:62.5")
     assert visits == runs.Visits((0.0, 2.0), (60.0, 62.5))
 
@@ -19,7 +19,7 @@ def test_two_stays_at_a_place() -> None:
 @pytest.mark.parametrize(
     "text", ["", "0:2", "0:2,60", "0,2:60", "0:2:3,60:62", "0:2,60:nan", "inf:2,3:4", "0:2,3:4,5:6", "a:b,c:d"]
 )
-def test_other_texts_are_no_stays(text: str) -> None:
+def test_place_option_rejects_malformed_text(text: str) -> None:
     with pytest.raises(InvalidSetting, match="give two stays in seconds"):
         runs._place(text)
 
@@ -40,7 +40,7 @@ def report(**facts: Any) -> Any:
     return Facts(**(nothing | facts))
 
 
-def test_a_table_has_each_protocol_with_its_baselines_below_it() -> None:
+def test_evaluation_table_lists_protocols_then_baselines() -> None:
     lines = runs.evaluation_table(report(causal=Facts(score=score(30.0)), baselines=[baseline("previous_frame", 1)]))
     assert [line.split() for line in lines[:1]] == [["frames", "tissue", "dB", "frame", "dB", "SSIM", "worst", "dB"]]
     assert lines[1].startswith("Causal: ") and lines[1].split()[-5:] == ["12", "30.00", "29.00", "0.9000", "25.00"]
@@ -51,12 +51,12 @@ def test_a_table_has_each_protocol_with_its_baselines_below_it() -> None:
     assert ends == [lines[0].index("tissue dB") + 9] * 2, "numbers end below their heading"
 
 
-def test_without_a_protocol_the_baselines_stand_alone() -> None:
+def test_evaluation_table_without_protocol_lists_baselines() -> None:
     lines = runs.evaluation_table(report(baselines=[baseline("future")]))
     assert len(lines) == 2 and lines[1].startswith("  future (sees the future)")
 
 
-def test_ages_of_a_live_run_are_a_line() -> None:
+def test_evaluation_table_of_live_run_ends_with_ages() -> None:
     ages = Facts(p50_ms=50.04, p95_ms=95.0, p99_ms=99.0, max_ms=120.0)
     live = Facts(score=score(30.0, None), settled=score(31.0), age_when_shown=ages)
     lines = runs.evaluation_table(report(live=live))

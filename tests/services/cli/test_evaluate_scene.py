@@ -50,7 +50,7 @@ def scene(tmp_path_factory):
     return folder
 
 
-def test_every_eighth_image_is_compared_with_the_picture_of_its_camera(scene, tmp_path, capsys):
+def test_evaluate_scene_compares_every_eighth_image(scene, tmp_path, capsys):
     words = ["evaluate", str(scene / "scene.ply"), "--scene", str(scene), "--out", str(tmp_path / "out"), "--json"]
     assert run(words) == OK
     said = json.loads(capsys.readouterr().out)
@@ -63,14 +63,14 @@ def test_every_eighth_image_is_compared_with_the_picture_of_its_camera(scene, tm
     assert run(words) == OK
 
 
-def test_another_split_sees_the_other_images(scene, capsys):
+def test_evaluate_scene_every_option_changes_heldout_images(scene, capsys):
     assert run(["evaluate", str(scene / "scene.ply"), "--scene", str(scene), "--every", "4", "--json"]) == OK
     said = json.loads(capsys.readouterr().out)
     assert [each["name"] for each in said["images"]] == ["00.png", "04.png", "08.png"]
     assert said["worst"] == "04.png" and said["worst_db"] < 25
 
 
-def test_smaller_images_are_compared_with_smaller_pictures(scene, capsys):
+def test_evaluate_scene_with_scale_succeeds(scene, capsys):
     assert run(["evaluate", str(scene / "scene.ply"), "--scene", str(scene), "--scale", "0.5"]) == OK
     assert "2 held-out images: PSNR " in capsys.readouterr().out
 
@@ -90,14 +90,14 @@ def test_smaller_images_are_compared_with_smaller_pictures(scene, capsys):
         (["--scene", "{scene}", "--renderer", "none"], "renderer is 'none'; choose alpha"),
     ],
 )
-def test_a_wrong_option_is_one_sentence(scene, capsys, words, reason):
+def test_evaluate_scene_prints_error_for_invalid_option(scene, capsys, words, reason):
     words = [word.format(scene=scene) for word in words]
     assert run(["evaluate", str(scene / "scene.ply"), *words]) == BAD_INPUT
     said = capsys.readouterr().err
     assert said.startswith("error: ") and reason in said and "Traceback" not in said
 
 
-def test_an_image_of_another_shape_is_refused(scene, tmp_path, capsys):
+def test_evaluate_scene_refuses_image_with_other_aspect_ratio(scene, tmp_path, capsys):
     (scene / "others").mkdir()
     cv2.imwrite(str(scene / "others/00.png"), np.zeros((48, 48, 3), np.uint8))
     assert run(["evaluate", str(scene / "scene.ply"), "--scene", str(scene), "--images", "others"]) == BAD_INPUT

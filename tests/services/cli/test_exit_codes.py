@@ -18,7 +18,7 @@ def caused(error, cause):
     return error
 
 
-def test_the_cause_under_an_operator_and_a_run_is_what_the_user_reads(capsys):
+def test_exit_code_of_prints_root_cause_with_operator_and_frame(capsys):
     bad_file = RecordingInvalid("mask 7 is 10x10. Save it at the size of the frames.")
     error = caused(RunFailed("the replay ended early", None), OperatorFailed("source", "compute", bad_file, 7))
     assert exit_code_of(error) == BAD_INPUT
@@ -28,7 +28,7 @@ def test_the_cause_under_an_operator_and_a_run_is_what_the_user_reads(capsys):
     )
 
 
-def test_a_full_disk_and_a_missing_right_are_the_users(capsys):
+def test_full_disk_and_missing_permission_are_bad_input(capsys):
     assert exit_code_of(StorageFull("the disk of /x is full")) == BAD_INPUT
     assert exit_code_of(PermissionError(13, "Permission denied", "/x/y"), ["replay", "/x"]) == BAD_INPUT
     assert "/x/y: Permission denied" in capsys.readouterr().err
@@ -46,12 +46,12 @@ def test_a_full_disk_and_a_missing_right_are_the_users(capsys):
         (None, ["validate", "/data/take"], BUG),
     ],
 )
-def test_a_missing_file_is_the_users_where_they_named_it(named, arguments, code, capsys):
+def test_missing_file_is_bad_input_only_if_named_in_arguments(named, arguments, code, capsys):
     assert exit_code_of(FileNotFoundError(errno.ENOENT, "No such file or directory", named), arguments) == code
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EMFILE, errno.ENOMEM, errno.EIO])
-def test_what_a_machine_lacks_is_never_a_bug(number, capsys):
+def test_resource_errors_of_system_are_bad_input(number, capsys):
     assert exit_code_of(OSError(number, os.strerror(number))) == BAD_INPUT
     assert os.strerror(number) in capsys.readouterr().err
 
@@ -65,7 +65,7 @@ def out_of_memory(call):
 @pytest.mark.parametrize(
     "call", [lambda: bytearray(1 << 62), lambda: torch.empty(1 << 50, dtype=torch.uint8)], ids=["python", "torch"]
 )
-def test_memory_that_is_not_there_is_a_sentence(call, capsys):
+def test_out_of_memory_prints_error_without_traceback(call, capsys):
     error = caused(RunFailed("early", None), OperatorFailed("reconstruct", "compute", out_of_memory(call), 3))
     assert exit_code_of(error) == BAD_INPUT
     err = capsys.readouterr().err
@@ -73,13 +73,13 @@ def test_memory_that_is_not_there_is_a_sentence(call, capsys):
     assert "Traceback" not in err
 
 
-def test_a_refused_thread_is_a_sentence(capsys):
+def test_thread_limit_prints_error_with_advice(capsys):
     assert exit_code_of(caused(RunFailed("early", None), RuntimeError("can't start new thread"))) == BAD_INPUT
     err = capsys.readouterr().err
     assert err.startswith("error: the system refuses another thread") and "ulimit -u" in err
 
 
-def test_every_error_on_purpose_is_either_the_users_or_a_bug():
+def test_user_errors_are_separate_from_programming_errors():
     """InvalidInput, the graph's errors and their like are a program's mistakes: none of them is a UserError."""
 
     def family(kind):
@@ -102,7 +102,7 @@ def test_every_error_on_purpose_is_either_the_users_or_a_bug():
 
 
 @pytest.mark.parametrize("name", ["line\nbreak", "\x1b[31mred", "\r", "caf\u00e9 \udcff"])
-def test_a_name_does_not_steer_the_terminal(name, capsys):
+def test_error_output_escapes_control_characters(name, capsys):
     assert exit_code_of(InvalidSetting(f"{name} is bad")) == BAD_INPUT
     err = capsys.readouterr().err
     assert err.count("\n") == 1 and all(character.isprintable() for character in err.rstrip("\n"))
@@ -119,7 +119,7 @@ def test_a_name_does_not_steer_the_terminal(name, capsys):
         caused(RunFailed("early", None), OperatorFailed("deform", "compute", TypeError("x"), 1)),
     ],
 )
-def test_a_bug_keeps_its_traceback(error, capsys):
+def test_programming_error_prints_traceback(error, capsys):
     try:
         raise error
     except Exception as caught:  # noqa: BLE001 - any error may be a bug
@@ -128,5 +128,5 @@ def test_a_bug_keeps_its_traceback(error, capsys):
     assert "Traceback" in err and "this is a bug in intrasplat" in err
 
 
-def test_an_interrupt_is_130(capsys):
+def test_keyboard_interrupt_exits_130(capsys):
     assert exit_code_of(KeyboardInterrupt()) == INTERRUPTED

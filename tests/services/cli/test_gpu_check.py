@@ -27,7 +27,7 @@ def machine(monkeypatch, tmp_path):
     return make
 
 
-def test_a_gpu_that_torch_sees_is_used(machine, capsys):
+def test_find_graphics_reports_gpus_of_torch(machine, capsys):
     machine("DRIVER DEVICE", ((9, 0), (8, 6)))
     assert doctor.find_graphics() == doctor.Graphics(
         True, "GPU 0 (compute capability 9.0), GPU 1 (compute capability 8.6)"
@@ -36,7 +36,7 @@ def test_a_gpu_that_torch_sees_is_used(machine, capsys):
     assert "GPU 0" in capsys.readouterr().out
 
 
-def test_a_gpu_that_is_too_old_is_named(machine):
+def test_find_graphics_rejects_gpu_with_old_compute_capability(machine):
     machine("DRIVER DEVICE", ((7, 5),))
     assert not doctor.find_graphics().usable
     assert "7.5" in doctor.find_graphics().found and "8.0" in doctor.find_graphics().advice
@@ -50,7 +50,7 @@ def test_a_gpu_that_is_too_old_is_named(machine):
         ("DRIVER", None, "built without CUDA", ""),
     ],
 )
-def test_without_a_gpu_the_reason_is_given(machine, capsys, files, cuda, found, advice):
+def test_find_graphics_gives_reason_for_missing_gpu(machine, capsys, files, cuda, found, advice):
     machine(files, cuda=cuda)
     seen = doctor.find_graphics()
     assert not seen.usable and found in seen.found and advice in seen.advice
@@ -59,7 +59,7 @@ def test_without_a_gpu_the_reason_is_given(machine, capsys, files, cuda, found, 
 
 
 @pytest.mark.parametrize("files", ["DRIVER DEVICE", "WSL"])
-def test_a_gpu_that_torch_cannot_start_is_told_with_what_torch_says(machine, monkeypatch, files):
+def test_find_graphics_reports_cuda_init_error_of_torch(machine, monkeypatch, files):
     machine(files)
 
     def refuse() -> None:

@@ -10,7 +10,7 @@ import pytest
 from services.cli.terminal import InterruptRequest
 
 
-def test_the_first_signal_asks_and_the_second_raises():
+def test_interrupt_request_is_set_by_first_sigint_and_second_raises():
     before = signal.getsignal(signal.SIGINT)
     with InterruptRequest() as interrupt:
         assert not interrupt()
@@ -21,13 +21,13 @@ def test_the_first_signal_asks_and_the_second_raises():
     assert signal.getsignal(signal.SIGINT) is before
 
 
-def test_sigterm_asks_too():
+def test_interrupt_request_is_set_by_sigterm():
     with InterruptRequest() as interrupt:
         os.kill(os.getpid(), signal.SIGTERM)
         assert interrupt()
 
 
-def test_afterwards_signals_are_delivered_as_before():
+def test_interrupt_request_restores_signal_handlers():
     receiver, sender = os.pipe()
     os.set_blocking(sender, False)
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -44,7 +44,7 @@ def test_afterwards_signals_are_delivered_as_before():
         os.close(receiver)
 
 
-def test_a_hangup_that_is_ignored_stays_ignored():
+def test_interrupt_request_keeps_sighup_ignored():
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         with InterruptRequest() as interrupt:

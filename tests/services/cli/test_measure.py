@@ -30,7 +30,7 @@ def wall(tmp_path):
     return save
 
 
-def test_a_distance_in_millimetres(wall, capsys):
+def test_measure_prints_distance_in_millimetres(wall, capsys):
     bundle = wall(DepthSource(DEPTH_ORIGINS["measured"], metric=True))
     assert run(["measure", bundle, "--time", "0.5", "--from", "22,24", "--to", "47,24", "--json"]) == OK
     said = json.loads(capsys.readouterr().out)
@@ -44,7 +44,7 @@ def test_a_distance_in_millimetres(wall, capsys):
     assert len(lines) == 4 and lines[2].startswith("straight: 20.0") and lines[2].endswith(" mm")
 
 
-def test_a_model_without_a_unit_says_so(wall, capsys):
+def test_measure_states_relative_unit_of_unitless_model(wall, capsys):
     assert run(["measure", wall(None), "--from", "22,24"]) == OK
     assert "relative: the model's lengths have no known unit" in capsys.readouterr().out
 
@@ -59,6 +59,6 @@ def test_a_model_without_a_unit_says_so(wall, capsys):
         (["--from", "30,24", "--time", "7"], "its window is"),
     ],
 )
-def test_what_cannot_be_measured_is_refused_in_a_sentence(wall, capsys, options, said):
+def test_measure_prints_error_for_unmeasurable_points(wall, capsys, options, said):
     assert run(["measure", wall(None), *options]) == BAD_INPUT
     assert said in capsys.readouterr().err

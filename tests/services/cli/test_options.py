@@ -84,7 +84,7 @@ values = st.one_of(
 @pytest.mark.parametrize(
     ("command", "option"), [(c, o) for c, options in COMMANDS.items() for o in options if o != "--out"]
 )
-def test_no_value_of_an_option_is_a_traceback(command, option, inputs, tmp_path_factory, capsys):
+def test_invalid_option_values_exit_2_with_one_error_line(command, option, inputs, tmp_path_factory, capsys):
     folder = tmp_path_factory.mktemp("out")
 
     @settings(max_examples=6, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -104,7 +104,7 @@ def test_no_value_of_an_option_is_a_traceback(command, option, inputs, tmp_path_
 
 @pytest.mark.parametrize("command", COMMANDS)
 @pytest.mark.parametrize("value", ["", "\0", "a\0b", ".", "/", "/dev/null/out", "x" * 300, "y/" * 3000, "link"])
-def test_a_place_that_cannot_be_written_is_a_sentence(command, value, inputs, tmp_path, monkeypatch, capsys):
+def test_unwritable_out_path_exits_2_with_one_error_line(command, value, inputs, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "link").symlink_to(tmp_path / "link")
     target = [inputs[command]] if command in inputs else []
@@ -117,7 +117,7 @@ def test_a_place_that_cannot_be_written_is_a_sentence(command, value, inputs, tm
 @pytest.mark.parametrize(
     "value", ["", "\0", "nowhere", "\udcff", "x" * 300, "/dev/null", "/dev/null/x", "pipe", "loop"]
 )
-def test_an_input_that_is_none_is_a_sentence(command, value, tmp_path, monkeypatch, capsys):
+def test_unusable_input_path_exits_2_without_traceback(command, value, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     os.mkfifo("pipe")
     os.symlink("loop", "loop")
@@ -129,7 +129,7 @@ def test_an_input_that_is_none_is_a_sentence(command, value, tmp_path, monkeypat
         assert captured.err.count("error: ") == 1 and not (tmp_path / "out").exists()
 
 
-def test_a_mistake_of_ours_is_not_put_down_to_the_user(inputs, tmp_path, monkeypatch, capsys):
+def test_programming_error_in_operator_exits_1_with_traceback(inputs, tmp_path, monkeypatch, capsys):
     from operators.rasterize import RasterizeOp
 
     def broken(self, op_input, op_output, context):

@@ -14,7 +14,7 @@ from tests.services.registry.made import save_model, sha256
 
 
 @pytest.mark.slow
-def test_a_packed_model_can_be_uploaded(tmp_path, capsys):
+def test_packed_model_is_accepted_by_registry(tmp_path, capsys):
     model, file = save_model(tmp_path / "model"), tmp_path / "liver.isplat"
     assert run(["pack", str(model), str(file), "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
@@ -23,7 +23,7 @@ def test_a_packed_model_can_be_uploaded(tmp_path, capsys):
         assert registry.upload("liver", file, said["sha256"], "surgeon").digest == said["sha256"]
 
 
-def test_a_file_that_is_there_is_replaced_only_on_request(tmp_path, capsys):
+def test_pack_overwrites_only_its_own_files_on_request(tmp_path, capsys):
     model, file = save_model(tmp_path / "model"), tmp_path / "liver.isplat"
     file.write_bytes(b"mine")
     assert run(["pack", str(model), str(file)]) == BAD_INPUT
@@ -46,7 +46,7 @@ def test_a_file_that_is_there_is_replaced_only_on_request(tmp_path, capsys):
         ("broken", "liver.isplat", "has SHA-256"),
     ],
 )
-def test_what_cannot_be_packed_is_said_in_one_sentence(tmp_path, capsys, model, file, said):
+def test_pack_prints_one_error_line_for_invalid_input(tmp_path, capsys, model, file, said):
     save_model(tmp_path / "model")
     broken = save_model(tmp_path / "broken") / "model.safetensors"
     broken.write_bytes(broken.read_bytes()[:-1] + b"x")
@@ -57,7 +57,7 @@ def test_what_cannot_be_packed_is_said_in_one_sentence(tmp_path, capsys, model, 
 
 
 @pytest.mark.parametrize("first", [True, False])
-def test_an_interrupted_save_is_not_packed(tmp_path, capsys, first):
+def test_pack_refuses_incompletely_saved_model(tmp_path, capsys, first):
     """Both bundles can be loaded: their tensors belong to the manifest that was not renamed yet."""
     model = save_model(tmp_path / "model")
     save_model(tmp_path / "other", seed=1)

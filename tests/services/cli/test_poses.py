@@ -51,7 +51,7 @@ def said_of(capsys, clip, *options):
     return json.loads(capsys.readouterr().out)
 
 
-def test_the_file_goes_beside_the_pictures_and_the_recording_is_read_with_it(clip, capsys):
+def test_poses_writes_file_that_recording_is_read_with(clip, capsys):
     folder = clip()
     said = said_of(capsys, folder)
     assert (said["path"], said["frames"], said["not_placed"]) == (str(folder / "poses.npy"), COUNT, [])
@@ -63,12 +63,12 @@ def test_the_file_goes_beside_the_pictures_and_the_recording_is_read_with_it(cli
     assert errors is not None and errors.similarity_share < 0.05
 
 
-def test_the_unit_of_length_is_said_to_be_none(clip, capsys):
+def test_poses_notes_that_lengths_have_no_scale(clip, capsys):
     notes = said_of(capsys, clip())["notes"]
     assert notes == ["lengths have no scale: the first frame's tissue is taken to be 60 away"]
 
 
-def test_without_json_it_is_a_table_and_notes(clip, capsys):
+def test_poses_without_json_prints_table_and_notes(clip, capsys):
     folder = clip()
     assert run(["poses", str(folder), "--out", str(folder / "poses.npy")]) == OK
     lines = capsys.readouterr().out.splitlines()
@@ -77,12 +77,12 @@ def test_without_json_it_is_a_table_and_notes(clip, capsys):
     assert lines[-1].startswith("note: lengths have no scale")
 
 
-def test_only_so_many_frames_are_read(clip, capsys):
+def test_poses_max_frames_limits_frames(clip, capsys):
     assert said_of(capsys, clip(), "--max-frames", "5")["frames"] == 5
 
 
 @pytest.mark.slow
-def test_a_camera_that_is_not_known_is_said(clip, capsys):
+def test_poses_notes_unknown_calibration(clip, capsys):
     said = said_of(capsys, clip(calibrated=False))
     assert any("there is no calibration; a pinhole with f = 144.0 px" in note for note in said["notes"])
     assert any(
@@ -93,7 +93,7 @@ def test_a_camera_that_is_not_known_is_said(clip, capsys):
 
 
 @pytest.mark.slow
-def test_a_focal_length_that_pictures_tell_is_used_and_said(clip, capsys, monkeypatch):
+def test_poses_uses_and_notes_estimated_focal_length(clip, capsys, monkeypatch):
     focal_length_found = FocalLength(144.0, FOCAL, (130.0, 150.0), True)
     monkeypatch.setattr(focal_length, "focal_length_of", lambda frames, camera, found: focal_length_found)
     folder = clip(calibrated=False)
@@ -107,20 +107,20 @@ def test_a_focal_length_that_pictures_tell_is_used_and_said(clip, capsys, monkey
     assert open_recording(folder).camera.K[0, 0] == FOCAL
 
 
-def test_a_calibrated_camera_is_taken_as_it_is(clip, capsys):
+def test_poses_uses_calibrated_focal_length(clip, capsys):
     said = said_of(capsys, clip())
     assert (said["focal_px"], said["focal_px_from"], said["focal_px_range"]) == (FOCAL, "calibration", [])
 
 
 @pytest.mark.slow
-def test_a_scope_that_may_stand_still_is_said(clip, capsys):
+def test_poses_notes_that_scope_may_be_at_rest(clip, capsys):
     said = said_of(capsys, clip(STILL))
     assert said["explained"] < 0.75
     assert any("it may be at rest in front of moving tissue" in note for note in said["notes"])
 
 
 @pytest.mark.slow
-def test_breathing_that_was_told_from_the_way_is_said(clip, capsys, monkeypatch):
+def test_poses_notes_breathing_frequencies_and_uncertainty(clip, capsys, monkeypatch):
     plain = recordings.trajectory_of
 
     def trajectory(frames, camera):
@@ -133,7 +133,7 @@ def test_breathing_that_was_told_from_the_way_is_said(clip, capsys, monkeypatch)
     assert any("0.29 and 1.11 times a second" in note and "2.0% of the trajectory" in note for note in said["notes"])
 
 
-def test_tissue_that_moves_otherwise_is_said(clip, capsys, monkeypatch):
+def test_poses_notes_large_reprojection_error(clip, capsys, monkeypatch):
     plain = recordings.trajectory_of
     monkeypatch.setattr(recordings, "trajectory_of", lambda *given: replace(plain(*given), error_px=1.5))
     said = said_of(capsys, clip())
@@ -141,13 +141,13 @@ def test_tissue_that_moves_otherwise_is_said(clip, capsys, monkeypatch):
     assert any("points are off by 1.5 px: the tissue moves by itself" in note for note in said["notes"])
 
 
-def test_frames_that_show_nothing_are_named(clip, capsys):
+def test_poses_notes_frames_without_texture(clip, capsys):
     said = said_of(capsys, clip(blank=[4]))
     assert said["not_placed"] == [4]
     assert any("1 frames could not be placed" in note and "from frame 4 on" in note for note in said["notes"])
 
 
-def test_a_file_that_is_there_is_replaced_only_on_request(clip, capsys):
+def test_poses_overwrites_only_its_own_files_on_request(clip, capsys):
     folder = clip()
     file = folder.parent / "mine.npy"
     file.write_bytes(b"mine")
@@ -161,7 +161,7 @@ def test_a_file_that_is_there_is_replaced_only_on_request(clip, capsys):
     assert np.load(file).shape == (COUNT, 4, 4)
 
 
-def test_a_folder_is_never_replaced(clip, capsys, tmp_path):
+def test_poses_does_not_overwrite_folder(clip, capsys, tmp_path):
     assert run(["poses", str(clip()), "--out", str(tmp_path), "--overwrite"]) == BAD_INPUT
     assert "does not end in .npy" in capsys.readouterr().err
 
@@ -174,7 +174,7 @@ def test_a_folder_is_never_replaced(clip, capsys, tmp_path):
         ("few", "poses.npy", "at least 3 frames, got 2"),
     ],
 )
-def test_what_cannot_be_done_is_said_in_one_sentence(clip, capsys, tmp_path, recording, file, said):
+def test_poses_prints_error_for_invalid_input(clip, capsys, tmp_path, recording, file, said):
     folder = clip()
     options = ["--max-frames", "2"] if recording == "few" else []
     given = folder if recording == "few" else tmp_path / recording

@@ -43,7 +43,7 @@ def report(**changed: Any) -> Any:
     return Report(**{**given, **changed})
 
 
-def test_a_live_run_is_summed_up(capsys: pytest.CaptureFixture[str]) -> None:
+def test_print_live_prints_summary(capsys: pytest.CaptureFixture[str]) -> None:
     print_live(report(), Path("out"), as_json=False)
     out, err = capsys.readouterr()
     assert err == "note: a note\n"
@@ -70,7 +70,7 @@ def test_a_live_run_is_summed_up(capsys: pytest.CaptureFixture[str]) -> None:
         ({"settled_psnr_tissue_db": None}, "displayed frame (training error): 36"),
     ],
 )
-def test_what_was_not_measured_is_not_printed(
+def test_print_live_omits_missing_figures(
     capsys: pytest.CaptureFixture[str], changed: dict[str, Any], missing: str
 ) -> None:
     print_live(report(), None, as_json=False)
@@ -82,7 +82,7 @@ def test_what_was_not_measured_is_not_printed(
     assert capsys.readouterr().out == ""
 
 
-def test_a_report_is_printed_with_its_baselines(capsys: pytest.CaptureFixture[str]) -> None:
+def test_print_report_prints_figures_with_baselines(capsys: pytest.CaptureFixture[str]) -> None:
     print_report(report(), Path("out"), as_json=False)
     out, err = capsys.readouterr()
     assert err == "note: a note\n" and out.splitlines() == [
@@ -110,7 +110,7 @@ def test_a_report_is_printed_with_its_baselines(capsys: pytest.CaptureFixture[st
 
 
 @pytest.mark.parametrize(("writes", "keep", "printed"), [(True, True, "out/report.html"), (True, False, "passed over"), (False, True, "")])  # fmt: skip
-def test_a_live_run_prints_the_report_that_was_written(
+def test_live_command_prints_report_only_if_written(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], writes: bool, keep: bool, printed: str
 ) -> None:
     def live(settings: Any, *, stop_requested: Any, on_scored: Any, report: Any) -> str:
@@ -137,7 +137,7 @@ def scene_training(**changed: Any) -> SceneTraining:
     return SceneTraining(**{**given, **changed})
 
 
-def test_a_training_is_summed_up(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_training_summary_has_speed_memory_and_heldout_scores(monkeypatch: pytest.MonkeyPatch) -> None:
     heldout = SimpleNamespace(images=[1, 2], psnr_db=25.5, ssim=0.75, worst_db=20.0, worst="8.png")
     assert runs._lines(scene_training(heldout=heldout)) == [
         "50 steps on 7 images in 2.0 s (25.0 steps/s): 90 Gaussians, peak memory 3.0 MiB",
@@ -149,7 +149,7 @@ def test_a_training_is_summed_up(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("as_json", [False, True])
 @pytest.mark.parametrize("ends", ["done", "raised"])
-def test_a_training_is_published_and_printed(
+def test_train_command_publishes_results_and_prints_summary(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, as_json: bool, ends: str
 ) -> None:
     def train(scene: Path, options: Any, folder: Path, *, progress: Any, stop_requested: Any) -> SceneTraining:
@@ -186,7 +186,7 @@ BACKUP = Backup(**{**dict.fromkeys(Backup.__dataclass_fields__, ()), "files": 3,
         ({"elsewhere": ("the key file",)}, OK, ["not in it: the key file"]),
     ],
 )
-def test_what_a_backup_lacks_is_printed(
+def test_backup_command_prints_missing_parts(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, changed: dict[str, Any],
     code: int, sentences: list[str],
 ) -> None:  # fmt: skip
@@ -201,7 +201,7 @@ def test_what_a_backup_lacks_is_printed(
     )
 
 
-def test_a_backup_is_checked_or_restored(
+def test_restore_command_checks_or_restores_backup(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     calls = []

@@ -10,7 +10,7 @@ from operators.applications.session import Progress
 from services.cli.terminal import ProgressPrinter
 
 
-def test_plain_lines_have_counts_rates_and_an_estimate(capsys, monkeypatch):
+def test_progress_lines_have_counts_rates_and_eta(capsys, monkeypatch):
     now = iter([0.0, 4.0, 5.0, 10.0, 13.0, 14.0])
     monkeypatch.setattr("services.cli.terminal.time.monotonic", lambda: next(now))
     with ProgressPrinter() as printer:
@@ -31,13 +31,13 @@ def test_plain_lines_have_counts_rates_and_an_estimate(capsys, monkeypatch):
     assert captured.out == ""
 
 
-def test_quiet_is_quiet(capsys):
+def test_progress_printer_with_quiet_prints_nothing(capsys):
     with ProgressPrinter(quiet=True) as printer:
         printer(Progress("replay", 10, 10))
     assert capsys.readouterr() == ("", "")
 
 
-def test_the_error_of_a_held_out_frame_is_called_that(capsys):
+def test_progress_labels_psnr_of_heldout_frame(capsys):
     with ProgressPrinter() as printer:
         printer(Progress("replay", 1, 1, psnr_tissue_db=33.0, previous_frame_db=36.0, trained=False))
         printer(Progress("evaluate", 1, 1, psnr_tissue_db=33.0))
@@ -47,7 +47,7 @@ def test_the_error_of_a_held_out_frame_is_called_that(capsys):
     ]
 
 
-def test_on_a_terminal_each_stage_has_a_bar_with_its_rate_and_quality(monkeypatch):
+def test_progress_on_terminal_has_bar_per_stage(monkeypatch):
     class Terminal(io.StringIO):
         def isatty(self):
             return True

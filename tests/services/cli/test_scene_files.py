@@ -32,7 +32,7 @@ def cloud(count: int = 200, size: float = 1.0) -> Gaussians:
 
 
 @pytest.mark.parametrize("size", [0.05, 1.0, 1e4])
-def test_the_camera_sees_the_scene_whatever_its_size(tmp_path, size):
+def test_default_camera_of_scene_file_sees_scene_of_any_size(tmp_path, size):
     save_ply(cloud(size=size), tmp_path / "scene.ply")
     model = load_model(tmp_path / "scene.ply")
     camera = model.camera.resized(64, 52)
@@ -44,13 +44,13 @@ def test_the_camera_sees_the_scene_whatever_its_size(tmp_path, size):
     assert ((pixels >= 0) & (pixels < [64, 52])).all(1).mean() > 0.85
 
 
-def test_a_scene_before_the_near_plane_is_refused(tmp_path):
+def test_load_model_refuses_scene_before_near_plane(tmp_path):
     save_ply(cloud(size=1e-3), tmp_path / "scene.ply")
     with pytest.raises(BundleError, match="too small to be shown"):
         load_model(tmp_path / "scene.ply")
 
 
-def test_a_splat_is_read_as_it_was_written(tmp_path):
+def test_splat_file_round_trip(tmp_path):
     save_ply(cloud(), tmp_path / "scene.ply")
     model = load_model(tmp_path / "scene.ply")
     export_model(model, tmp_path / "scene.splat", ExportWish(format_named("splat")))
@@ -66,7 +66,7 @@ def test_a_splat_is_read_as_it_was_written(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["scene.ply", "scene.splat", "scene.compressed.ply", "scene.spz", "SCENE.PLY"])
-def test_commands_take_a_scene_file(tmp_path, name):
+def test_render_export_and_measure_accept_scene_files(tmp_path, name):
     save_ply(cloud(), tmp_path / "scene.ply")
     if name == "SCENE.PLY":
         (tmp_path / "scene.ply").rename(tmp_path / name)
@@ -118,7 +118,7 @@ HOSTILE = {
 @pytest.mark.slow
 @pytest.mark.parametrize("what", HOSTILE)
 @pytest.mark.parametrize("command", ["render", "export", "view", "measure"])
-def test_a_hostile_ply_is_one_sentence(tmp_path, capsys, command, what):
+def test_commands_print_error_for_malformed_ply(tmp_path, capsys, command, what):
     (tmp_path / "scene.ply").write_bytes(HOSTILE[what])
     more = {
         "render": ["--out", str(tmp_path / "o")],
@@ -132,13 +132,13 @@ def test_a_hostile_ply_is_one_sentence(tmp_path, capsys, command, what):
 
 
 @pytest.mark.parametrize("data", [bytes(31), b"x" * 33, np.full(16, np.nan, "<f4").tobytes(), b""])
-def test_a_hostile_splat_is_refused(tmp_path, data):
+def test_load_model_refuses_malformed_splat(tmp_path, data):
     (tmp_path / "scene.splat").write_bytes(data)
     with pytest.raises(BundleError):
         load_model(tmp_path / "scene.splat")
 
 
-def test_negative_scales_of_a_splat_are_counted(tmp_path):
+def test_load_model_counts_negative_scales_of_splat(tmp_path):
     (tmp_path / "scene.splat").write_bytes(np.array([1, 2, 3, -1, -2, 5], "<f4").tobytes() + bytes(8))
     with pytest.raises(BundleError, match=r"2 values of scale .* \(first: -1\)"):
         load_model(tmp_path / "scene.splat")
@@ -147,7 +147,7 @@ def test_negative_scales_of_a_splat_are_counted(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("command", ["render", "export", "pack", "measure", "evaluate", "view"])
 @pytest.mark.parametrize("name", ["model.pt", "scene.obj", "video.mp4", "nosuffix"])
-def test_what_is_no_model_is_one_sentence(tmp_path, capsys, command, name):
+def test_commands_print_error_for_file_that_is_no_model(tmp_path, capsys, command, name):
     (tmp_path / name).write_bytes(b"x")
     more = {
         "render": ["--out", str(tmp_path / "o")],
@@ -162,13 +162,13 @@ def test_what_is_no_model_is_one_sentence(tmp_path, capsys, command, name):
     assert "folder" in said and "Not a directory" not in said and "Traceback" not in said
 
 
-def test_a_scene_of_another_program_without_our_mark_is_read(tmp_path):
+def test_load_ply_reads_file_of_other_program(tmp_path):
     (tmp_path / "scene.ply").write_bytes(_header() + BODY)
     assert load_ply(tmp_path / "scene.ply").count == 2
 
 
 @pytest.mark.parametrize(("name", "least_db"), [("scene.compressed.ply", 38), ("scene.spz", 33)])
-def test_a_compressed_scene_shows_the_same_picture(tmp_path, name, least_db):
+def test_compressed_scene_renders_same_image(tmp_path, name, least_db):
     gaussians = cloud(60)
     # A different colour from each side and a shape that a wrong rotation would change.
     turned = torch.randn(60, 4, generator=torch.Generator().manual_seed(2))
@@ -184,7 +184,7 @@ def test_a_compressed_scene_shows_the_same_picture(tmp_path, name, least_db):
 
 
 @pytest.mark.parametrize("format_name", ["glb", "ply", "compressed-ply", "splat", "spz"])
-def test_the_bytes_of_an_export_do_not_depend_on_its_name(tmp_path, format_name):
+def test_exported_bytes_do_not_depend_on_file_name(tmp_path, format_name):
     save_ply(cloud(), tmp_path / "scene.ply")
     model = load_model(tmp_path / "scene.ply")
     for name in ("a", "another name"):

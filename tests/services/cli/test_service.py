@@ -21,12 +21,12 @@ def clean_environment(monkeypatch):
         monkeypatch.delenv(name)
 
 
-def test_the_schema_is_json(capsys):
+def test_schema_command_prints_json(capsys):
     assert run(["schema"]) == OK
     assert "streams" in json.loads(capsys.readouterr().out)["properties"]
 
 
-def test_a_key_is_made_listed_and_revoked(tmp_path, capsys):
+def test_keys_command_adds_lists_and_revokes_keys(tmp_path, capsys):
     data = ["--data", str(tmp_path)]
     assert run(["keys", "add", "console", "--role", "admin", *data]) == OK
     token = capsys.readouterr().out.strip()
@@ -57,7 +57,7 @@ def test_a_key_is_made_listed_and_revoked(tmp_path, capsys):
     ]
 
 
-def test_a_server_that_runs_writes_what_a_shell_changes(tmp_path, capsys):
+def test_running_server_audits_key_added_by_shell(tmp_path, capsys):
     from services.auth.keys import changed_outside
 
     server = AuditLog(tmp_path / "audit.jsonl")
@@ -72,7 +72,7 @@ def test_a_server_that_runs_writes_what_a_shell_changes(tmp_path, capsys):
     assert entry.detail["key_id"] in capsys.readouterr().out
 
 
-def test_a_key_with_limits(tmp_path, capsys):
+def test_keys_add_with_expiry_and_streams(tmp_path, capsys):
     data = ["--data", str(tmp_path)]
     assert run(["keys", "add", "boss", "--role", "admin", *data]) == OK
     assert run(["keys", "add", "wall", "--expires-days", "1.5", "--stream", "b", "--stream", "a", *data]) == OK
@@ -94,7 +94,7 @@ def test_a_key_with_limits(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("days", ["0", "-1", "nan", "inf", "1e300", "1e-9"])
-def test_a_key_cannot_expire_then(tmp_path, capsys, days):
+def test_keys_add_refuses_invalid_expiry(tmp_path, capsys, days):
     assert run(["keys", "add", "wall", "--expires-days", days, "--data", str(tmp_path)]) == BAD_INPUT
     assert "cannot expire" in capsys.readouterr().err
     assert KeyStore(tmp_path / "keys.json").all() == []
@@ -104,12 +104,12 @@ def test_a_key_cannot_expire_then(tmp_path, capsys, days):
     ("arguments", "said"),
     [(["Console"], "is no name of a key"), (["wall", "--stream", "a/b"], "is no name of a stream"), (["a/b"], "is no name of a key"), (["console", "--role", "public"], "choose viewer")],
 )  # fmt: skip
-def test_refused_keys(tmp_path, capsys, arguments, said):
+def test_keys_add_refuses_invalid_names_and_role(tmp_path, capsys, arguments, said):
     assert run(["keys", "add", *arguments, "--data", str(tmp_path)]) == BAD_INPUT
     assert said in capsys.readouterr().err
 
 
-def test_the_audit_log_is_verified(tmp_path, capsys):
+def test_audit_verify_detects_missing_entries_and_wrong_head(tmp_path, capsys):
     log = AuditLog(tmp_path / "audit.jsonl")
     for number in range(3):
         log.append("model.activate", actor="console", subject=str(number))

@@ -13,7 +13,7 @@ from services.cli import terminal
 from services.cli.terminal import MOST_WORD, WIDEST, sentence, size, table
 
 
-def test_the_first_column_stays_without_values_and_the_others_go():
+def test_table_omits_empty_columns_except_first():
     columns = {"id": "ID", "empty": "EMPTY", "name": "NAME"}
     assert table(columns, [{"name": "a"}, {"empty": None, "name": "bc"}]) == ["ID  NAME", "    a", "    bc"]
     assert table(columns, [{"id": "x", "empty": ""}]) == ["ID", "x"]
@@ -21,11 +21,11 @@ def test_the_first_column_stays_without_values_and_the_others_go():
 
 
 @pytest.mark.parametrize(("length", "shown"), [(WIDEST, WIDEST * "a"), (WIDEST + 1, (WIDEST - 1) * "a" + "…")])
-def test_long_cells_are_cut_except_in_the_last_column(length, shown):
+def test_table_truncates_long_cells_except_in_last_column(length, shown):
     assert table({"a": "A", "b": "B"}, [{"a": length * "a", "b": 200 * "b"}])[1] == f"{shown}  {200 * 'b'}"
 
 
-def test_cells_by_kind_of_value(monkeypatch):
+def test_table_formats_cells_by_field_and_type(monkeypatch):
     monkeypatch.setenv("TZ", "UTC")
     time.tzset()
     cells = {
@@ -51,7 +51,7 @@ def test_cells_by_kind_of_value(monkeypatch):
     time.tzset()
 
 
-def test_a_nested_field_of_something_else_is_empty():
+def test_table_cell_is_empty_if_nested_field_is_missing():
     assert table({"a": "A", "b.c.d": "D"}, [{"a": 1, "b": {"c": {"d": 2}}}, {"a": 1, "b": {"c": 3}}]) == [
         "A  D", "1  2", "1",
     ]  # fmt: skip
@@ -64,11 +64,11 @@ def test_a_nested_field_of_something_else_is_empty():
         (1.5 * 2**30, "1.5 GiB"), (2**41, "2048.0 GiB"),
     ],
 )  # fmt: skip
-def test_sizes_are_in_binary_units(count, text):
+def test_size_uses_binary_units(count, text):
     assert size(count) == text
 
 
-def test_a_long_word_is_shortened_in_the_middle():
+def test_sentence_shortens_long_words_in_middle():
     longest = MOST_WORD * "a"
     assert sentence(f"cannot read {longest} ; free space") == f"cannot read {longest} ; free space"
     assert sentence(f"cannot read /{longest}/end; free space") == (
@@ -77,7 +77,7 @@ def test_a_long_word_is_shortened_in_the_middle():
 
 
 @pytest.mark.parametrize("imported", ["absent", "half imported"])
-def test_an_interrupt_during_an_import_ends_without_a_traceback(imported):
+def test_end_on_interrupt_during_import_exits_130_without_traceback(imported):
     program = (
         "import os, signal, sys, types\n"
         "from services.cli import terminal\n"
@@ -142,26 +142,26 @@ def interrupted(grace_s: float, *signals: str) -> tuple[int, str, str]:
     return done.returncode, done.stdout, done.stderr
 
 
-def test_a_run_that_unwinds_in_time_ends_by_itself():
+def test_second_signal_lets_run_end_within_grace_time():
     code, out, err = interrupted(30, "SIGINT", "SIGINT")
     assert (code, out) == (5, "")
     assert err.startswith("interrupted: finishing the frame") and "Traceback" not in err
 
 
-def test_repeated_hangups_are_one_request_and_other_signals_none():
+def test_repeated_sighup_is_one_request_and_sigusr1_none():
     code, out, err = interrupted(30, "SIGUSR1", "SIGHUP", "SIGUSR1", "SIGHUP", "SIGHUP")
     assert (code, out) == (0, "") and err.count("interrupted") == 1
     assert interrupted(30, "SIGUSR1") == (0, "", "")
 
 
-def test_a_run_that_does_not_unwind_is_ended_without_its_unfinished_files():
+def test_second_signal_ends_hanging_run_and_removes_unfinished_files():
     code, out, err = interrupted(0, "SIGTERM", "SIGINT")
     assert (code, out) == (130, "removed\n")
     assert err.count("interrupted") == 2 and "interrupted again: ending at once" in err
 
 
 @pytest.mark.parametrize(("byte", "written"), [(0x80, b"\x80"), (0xFF, b"\xff"), (0xE4, b"\xe4")])
-def test_bytes_of_file_names_are_written_as_they_are_and_other_characters_as_escapes(byte, written):
+def test_output_keeps_bytes_of_file_names_and_escapes_other_characters(byte, written):
     name = os.fsdecode(b"a" + bytes([byte]) + b"b")
     error = UnicodeEncodeError("ascii", name, 1, 2, "")
     assert terminal._as_the_system_spells_it(error) == (written, 2)

@@ -49,7 +49,7 @@ def scene(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_a_scene_is_trained_saved_and_evaluated(scene, tmp_path, capsys):
+def test_train_saves_and_evaluates_scene(scene, tmp_path, capsys):
     out = tmp_path / "out"
     words = ["train", str(scene), "--out", str(out), "--steps", "40", "--sh-degree", "1", "--strategy", "mcmc"]
     assert run([*words, "--max-gaussians", "90", "--json"]) == OK
@@ -65,7 +65,7 @@ def test_a_scene_is_trained_saved_and_evaluated(scene, tmp_path, capsys):
         assert found["psnr_db"] == pytest.approx(said["heldout"]["psnr_db"], abs=0.01)
 
 
-def test_an_interrupted_training_leaves_the_steps_so_far(scene, tmp_path):
+def test_interrupted_train_scene_saves_model_so_far(scene, tmp_path):
     polled = iter([False, False, True])
     options = TrainOptions(steps=40, sh_degree=0)
     result = train_scene(scene, options, tmp_path, stop_requested=lambda: next(polled))
@@ -73,7 +73,7 @@ def test_an_interrupted_training_leaves_the_steps_so_far(scene, tmp_path):
     assert torch.equal(load_bundle(tmp_path / "model").gaussians.means, load_ply(tmp_path / "scene.ply").means)
 
 
-def test_the_model_is_saved_during_the_training(scene, tmp_path):
+def test_train_scene_saves_model_during_training(scene, tmp_path):
     class Killed(Exception):
         pass
 
@@ -109,7 +109,7 @@ def test_the_model_is_saved_during_the_training(scene, tmp_path):
         (lambda _: None, ["--scale", "0.01"], "nothing is left"),
     ],
 )
-def test_what_cannot_be_trained_is_one_sentence(scene, tmp_path, capsys, damage, words, reason):
+def test_train_prints_one_error_line_for_invalid_scene_or_option(scene, tmp_path, capsys, damage, words, reason):
     broken = tmp_path / "scene"
     shutil.copytree(scene, broken)
     damage(broken)

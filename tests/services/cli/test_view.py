@@ -63,7 +63,9 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
     return Server.made
 
 
-def test_a_model_is_served_until_an_interrupt(model: Path, made: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
+def test_view_command_serves_model_with_and_without_renderer(
+    model: Path, made: list[Any], capsys: pytest.CaptureFixture[str]
+) -> None:
     assert view_command(model, "127.0.0.1", 8, renderer=None, **HERE) == OK
     ((shown, host, port),) = made
     assert (host, port) == ("127.0.0.1", 8) and shown.gaussians.count == random_model(field=False).gaussians.count
@@ -83,7 +85,7 @@ def test_a_model_is_served_until_an_interrupt(model: Path, made: list[Any], caps
         ({"host": "0.0.0.0", "renderer": "alpha"}, "beyond this machine"),
     ],
 )
-def test_a_view_is_refused_before_the_model_is_read(
+def test_view_command_checks_options_before_reading_model(
     made: list[Any], tmp_path: Path, changed: dict[str, Any], reason: str
 ) -> None:
     given = {"host": "127.0.0.1", "port": 8, "renderer": None, **HERE, **changed}
@@ -92,7 +94,7 @@ def test_a_view_is_refused_before_the_model_is_read(
     assert made == []
 
 
-def test_pictures_are_sent_to_clients_and_the_counts_printed(
+def test_igtl_command_sends_pictures_and_prints_counts(
     made: list[Any], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     sent = []
@@ -121,7 +123,7 @@ def test_pictures_are_sent_to_clients_and_the_counts_printed(
     assert len(made) == 2
 
 
-def test_a_server_is_closed_when_sending_fails(
+def test_igtl_command_closes_server_if_sending_fails(
     made: list[Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     servers = []
@@ -137,7 +139,7 @@ def test_a_server_is_closed_when_sending_fails(
     assert servers[0].closed
 
 
-def test_a_folder_is_used_in_place_and_a_packed_model_is_unpacked_for_the_time_of_use(
+def test_bundle_in_yields_folder_or_temporarily_unpacked_file(
     model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with bundle_in(model) as folder:
@@ -160,7 +162,7 @@ def test_a_folder_is_used_in_place_and_a_packed_model_is_unpacked_for_the_time_o
         pass
 
 
-def test_the_help_states_the_samples_of_a_view(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_view_help_states_default_samples(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Pictures of `view` have fewer samples than those of other commands, because they add up while the camera stands still."""
     made = []
     monkeypatch.setattr(models, "view_command", lambda *arguments, options, **others: made.append(options) or OK)

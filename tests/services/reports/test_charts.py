@@ -15,7 +15,7 @@ def chart(*lines, **options):
     return Chart("title", "what it shows", "x", "y", lines, **options)
 
 
-def test_a_line_is_drawn_from_left_to_right_and_upwards():
+def test_chart_draws_rising_line_left_to_right_and_upwards():
     svg = ElementTree.fromstring(chart(Line("a", [0, 1, 2], [10.0, 20.0, 30.0], "main")).svg())
     (line,) = svg.iter("polyline")
     points = [tuple(map(float, pair.split(","))) for pair in line.get("points").split()]
@@ -24,23 +24,23 @@ def test_a_line_is_drawn_from_left_to_right_and_upwards():
     assert svg.get("role") == "img" and "what it shows" in svg.get("aria-label")
 
 
-def test_a_missing_value_breaks_the_line_and_a_lonely_one_is_a_point():
+def test_chart_breaks_line_at_missing_value_and_marks_single_point():
     svg = ElementTree.fromstring(chart(Line("a", [0, 1, 2, 3, 4], [1.0, 2.0, None, 3.0, None], "main")).svg())
     assert len(list(svg.iter("polyline"))) == 1
     assert len([c for c in svg.iter("circle") if c.get("class") == "mark main"]) == 1
 
 
 @pytest.mark.parametrize("values", [[], [5.0], [None], [3.0, 3.0]])
-def test_any_data_gives_a_chart(values):
+def test_chart_of_empty_single_or_constant_data_is_valid_svg(values):
     ElementTree.fromstring(chart(Line("a", list(range(len(values))), values, "main")).svg())
 
 
-def test_text_is_escaped():
+def test_chart_escapes_text():
     page = chart(Line("<b>", [0, 1], [0.0, 1.0], "main")).figure()
     assert "<b>" not in page and "&lt;b&gt;" in page
 
 
-def test_ticks_are_round_and_inside():
+def test_axis_ticks_are_round_and_span_data():
     axis = _axis(33.2, 38.9, 5, tight=False)
     assert axis.ticks[0] == axis.low and axis.ticks[-1] == pytest.approx(axis.high)
     assert axis.low <= 33.2 and axis.high >= 38.9
@@ -48,7 +48,7 @@ def test_ticks_are_round_and_inside():
     assert (axis.position(axis.low), axis.position(axis.high)) == (0.0, 1.0)
 
 
-def test_a_logarithmic_axis_spaces_decades_evenly():
+def test_log_axis_spaces_decades_evenly():
     axis = _log_axis(1.0, 100.0)
     assert {1.0, 10.0, 100.0} <= set(axis.ticks)
     assert axis.position(10) - axis.position(1) == pytest.approx(axis.position(100) - axis.position(10))
@@ -58,13 +58,13 @@ def test_a_logarithmic_axis_spaces_decades_evenly():
     ("value", "text"),
     [(0, "0"), (1234.5, "1,234"), (0.25, "0.25"), (37.2468, "37.25"), (-3.0, "-3"), (1000000, "1,000,000")],
 )
-def test_numbers_have_four_digits_at_most(value, text):
+def test_number_has_at_most_four_significant_digits(value, text):
     assert _number(value) == text
 
 
 @pytest.mark.parametrize("x_log", [False, True])
 @pytest.mark.parametrize("width", [WIDE, NARROW])
-def test_points_are_where_the_axes_say(x_log, width):
+def test_chart_points_match_axis_ticks(x_log, width):
     """Pixel positions of the curve against those of the labelled ticks, as a reader sees them."""
     x, y = [0.5, 2.0, 7.0, 30.0, 80.0], [31.0, 34.5, None, 36.25, 33.0]
     chart = Chart(
@@ -117,13 +117,13 @@ def test_points_are_where_the_axes_say(x_log, width):
         ((-0.03, 0.04), ["-0.04", "-0.02", "0", "0.02", "0.04"]),
     ],
 )
-def test_a_loose_axis_ends_at_round_ticks(values, ticks):
+def test_chart_y_axis_ends_at_round_ticks(values, ticks):
     svg = ElementTree.fromstring(Chart("T", "D", "x", "y", (Line("a", [0.0, 1.0], values, "main"),)).svg())
     shown = [each.text for each in svg.find("g").findall("text") if each.attrib.get("text-anchor") == "end"]
     assert shown == ticks
 
 
-def test_marks_are_points_without_a_line_and_have_a_round_key():
+def test_chart_marks_are_points_with_round_key():
     chart = Chart("T", "D", "x", "y", (Line("a", [0.0, 1.0], [2.0, 3.0], "second", marks=True),))
     svg = ElementTree.fromstring(chart.svg())
     assert svg.find("polyline") is None

@@ -38,7 +38,7 @@ def view(ssim: float | None, psnr_db: float = 30.0) -> Any:
     )  # fmt: skip
 
 
-def test_the_depth_along_the_rays_has_rows_of_its_own() -> None:
+def test_geometry_rows_list_ray_depth_separately() -> None:
     normals = Facts(mean_deg=5, plane_mean_deg=12, level_mean_deg=None)
     found = rows(depth=depth(), ray_depth=depth(), normals=normals, ray_normals=normals)
     names = [what.split(",")[0] for what, *_ in found]
@@ -47,13 +47,13 @@ def test_the_depth_along_the_rays_has_rows_of_its_own() -> None:
     ]  # fmt: skip
 
 
-def test_nothing_measured_gives_no_row_and_no_section() -> None:
+def test_geometry_without_measures_has_no_rows_and_section() -> None:
     assert rows() == []
     for report in (Facts(geometry=None), Facts(geometry=geometry())):
         assert geometry_section(report) == "" and geometry_lines(report) == []  # type: ignore[arg-type]
 
 
-def test_depth_has_both_planes_beside_it() -> None:
+def test_depth_rows_have_both_plane_baselines() -> None:
     planes = "level plane 20.00 %, best-fit plane 12.50 %"
     assert rows(depth=depth()) == [
         ("Depth, root mean squared error, share of the median depth", "1.23 %", planes, False),
@@ -64,12 +64,12 @@ def test_depth_has_both_planes_beside_it() -> None:
 @pytest.mark.parametrize(
     ("level", "baselines"), [(None, "best-fit plane 12.4°"), (40.0, "level plane 40.0°, best-fit plane 12.4°")]
 )
-def test_normals_have_a_row_with_their_baselines(level: float | None, baselines: str) -> None:
+def test_normals_row_has_plane_baselines(level: float | None, baselines: str) -> None:
     normals = Facts(mean_deg=5.04, plane_mean_deg=12.41, level_mean_deg=level)
     assert rows(normals=normals) == [("Normals, mean angle", "5.0°", baselines, True)]
 
 
-def test_views_after_one_scale_are_named_only_where_they_differ() -> None:
+def test_scaled_view_row_appears_only_if_different() -> None:
     baselines = "left picture 20.00 dB, shifted 25.50 dB"
     first = ("View of the right camera", "30.00 dB, SSIM 0.9000", baselines, False)
     assert rows(views=[view(0.9)], scaled_views=[view(0.9)]) == [first]
@@ -79,7 +79,7 @@ def test_views_after_one_scale_are_named_only_where_they_differ() -> None:
     ]
 
 
-def test_followed_points_have_rows_with_their_baselines() -> None:
+def test_tracking_rows_have_no_motion_baseline() -> None:
     facts = Facts(model=track(1.0, 4.0), scaled=track(0.9, 3.0), still=track(2.0, 8.0))
     still = "no motion 2.00 mm, 2.50 mm"
     assert rows(tracking=facts) == [
@@ -89,7 +89,7 @@ def test_followed_points_have_rows_with_their_baselines() -> None:
     ]  # fmt: skip
 
 
-def test_flow_in_space_only_where_the_recording_knows_it() -> None:
+def test_scene_flow_rows_appear_only_with_ground_truth() -> None:
     what = "from frame to frame, median and mean error"
     picture = (f"Flow {what}", "4.000 px, 4.250 px", "no motion 8.000 px, 8.250 px", True)
     whole = Facts(model=track(1.0, 4.0), scaled=track(0.9, 3.0), still=track(2.0, 8.0))
@@ -104,7 +104,7 @@ def test_flow_in_space_only_where_the_recording_knows_it() -> None:
     assert rows(flow=whole) == [picture]
 
 
-def test_trajectory_and_parts_are_shares() -> None:
+def test_trajectory_and_parts_rows_are_percentages() -> None:
     way = Facts(rigid_share=0.02, similarity_share=0.01, still_share=0.5)
     parts = Facts(motion=0.6, colour=0.3, size=0.05, explained=0.9)
     assert rows(trajectory=way, parts=parts) == [
@@ -119,14 +119,14 @@ def test_trajectory_and_parts_are_shares() -> None:
 @pytest.mark.parametrize(
     ("scale", "calibrated"), [(1.0, True), (1.04, True), (0.96, True), (1.06, False), (0.94, False), (8.0, False)]
 )
-def test_a_model_without_scale_is_said_to_have_none(scale: float, calibrated: bool) -> None:
+def test_scale_sentence_says_uncalibrated_beyond_5_percent(scale: float, calibrated: bool) -> None:
     said = scale_sentence(geometry(depth=depth(scale)))
     assert said is not None and said.startswith(f"the factor from the model's lengths to true ones is {scale:g}"[:54])
     assert ("uncalibrated" in said) is not calibrated
     assert scale_sentence(geometry()) is None
 
 
-def test_the_page_and_the_terminal_have_the_rows_and_the_scale() -> None:
+def test_geometry_section_and_lines_contain_rows_and_scale() -> None:
     report: Any = Facts(
         geometry=geometry(depth=depth(2.0), normals=Facts(mean_deg=5, plane_mean_deg=12, level_mean_deg=None))
     )

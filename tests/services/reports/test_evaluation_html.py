@@ -100,7 +100,7 @@ def report(content) -> EvaluationReport:
     return EvaluationReport.model_validate(content)
 
 
-def test_nothing_is_fetched_from_anywhere_and_nothing_can_be_injected(report):
+def test_evaluation_html_loads_nothing_and_escapes_text(report):
     text = render_evaluation(report)
     assert not re.findall(r"<(script|link|iframe|object|embed|base|form|video|img)\b", text)
     assert not re.findall(r"(?:https?:)?//[a-z0-9.-]+\.[a-z]{2,}", text) and "default-src 'none'" in text
@@ -109,7 +109,7 @@ def test_nothing_is_fetched_from_anywhere_and_nothing_can_be_injected(report):
     assert "take &lt;7&gt;" in text and "no &lt;mask&gt;" in text
 
 
-def test_each_protocol_stands_beside_its_baselines(report):
+def test_evaluation_html_contains_protocols_and_baselines(report):
     text = render_evaluation(report)
     for said in (
         "42.50", "39.25", "38.50", "36.50", "+1.00 dB", "+5.50 dB", "+6.00 dB", "-3.25 dB", "+16.00 dB", "41.75", "(sees the future)", "37.00",
@@ -120,7 +120,7 @@ def test_each_protocol_stands_beside_its_baselines(report):
     assert text.count("<svg") == 5 and text.count("Research use only, not a medical device.") >= 2
 
 
-def test_the_table_for_the_terminal_has_equal_columns(report):
+def test_evaluation_table_rows_have_expected_columns(report):
     lines = evaluation_table(report)
     assert lines[0].split() == ["frames", "tissue", "dB", "frame", "dB", "SSIM", "worst", "dB"]
     (causal,) = [line for line in lines if line.startswith("Causal")]
@@ -129,7 +129,7 @@ def test_the_table_for_the_terminal_has_equal_columns(report):
     assert "1: 37.00, 2: 33.00, 3: 31.00" in lines[-2] and "p99 21.0" in lines[-1]
 
 
-def test_without_any_protocol_there_are_the_baselines(content):
+def test_evaluation_without_protocols_lists_baselines(content):
     bare = content | {"heldout": None, "causal": None, "live": None, "retention": None, "returns": {}, "series": {}}
     report = EvaluationReport.model_validate(bare)
     assert "label of half_way_flow" in render_evaluation(report) and any(
@@ -139,18 +139,18 @@ def test_without_any_protocol_there_are_the_baselines(content):
     assert "<table" in render_evaluation(nothing) and len(evaluation_table(nothing)) == 1
 
 
-def test_an_interrupted_evaluation_says_so(report):
+def test_evaluation_html_shows_alert_if_interrupted(report):
     evaluated = report.evaluated.model_copy(update={"interrupted": True})
     assert 'role="alert"' in render_evaluation(report.model_copy(update={"evaluated": evaluated}))
     assert 'role="alert"' not in render_evaluation(report)
 
 
-def test_the_hold_curve_between_and_beyond_the_measured_ages(report):
+def test_at_age_interpolates_measured_ages_and_is_none_beyond(report):
     assert [at_age(report, age) for age in (0.0, 1.0, 1.5, 3.0, 3.1)] == [37.0, 37.0, 35.0, 31.0, None]
     assert at_age(report.model_copy(update={"baselines": []}), 1.0) is None
 
 
-def test_the_file_is_read_back_as_it_was(tmp_path, report, content):
+def test_evaluation_json_round_trips_and_rejects_unknown_and_nan(tmp_path, report, content):
     report.write(tmp_path / "evaluation.json")
     assert EvaluationReport.read(tmp_path / "evaluation.json") == report
     write_evaluation_html(report, tmp_path / "evaluation.html")
@@ -162,7 +162,7 @@ def test_the_file_is_read_back_as_it_was(tmp_path, report, content):
         EvaluationReport.model_validate(content)
 
 
-def test_dots_are_placed_between_a_decibel_below_the_worst_and_above_the_best(report):
+def test_table_section_places_dots_proportionally_to_scores(report):
     text = table_section(report)
     rows = [
         (float(cells[1]), float(left))

@@ -45,7 +45,7 @@ def pixels(uri):
     return cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1].astype(int)
 
 
-def test_from_the_side_the_model_is_seen_and_what_it_has_not_is_grey(scored, model):
+def test_side_view_shows_model_and_grey_background(scored, model):
     pictures = hidden_pictures(scored, model)
     aside = pixels(pictures.aside)
     height, width = aside.shape[:2]
@@ -55,7 +55,7 @@ def test_from_the_side_the_model_is_seen_and_what_it_has_not_is_grey(scored, mod
     assert (pictures.seq, pictures.time_s) == (1, 0.04)
 
 
-def test_the_outline_of_a_tool_is_drawn_and_no_more(scored, model):
+def test_behind_tools_picture_has_outline_of_tool(scored, model):
     from dataclasses import replace
 
     mask = np.ones((16, 24), np.uint8)
@@ -69,14 +69,14 @@ def test_the_outline_of_a_tool_is_drawn_and_no_more(scored, model):
     assert dark.image.max() == 20, "the run's own picture is not drawn into"
 
 
-def test_where_nothing_is_in_front_of_the_camera_there_are_no_pictures(scored, model):
+def test_hidden_pictures_is_none_for_empty_alpha(scored, model):
     from dataclasses import replace
 
     empty = replace(scored.rendered, alpha=np.zeros((16, 24), np.float32))
     assert hidden_pictures(replace(scored, rendered=empty), model) is None
 
 
-def test_figures_stand_beside_their_baselines(report, scored, model):
+def test_hidden_section_shows_figures_with_baselines(report, scored, model):
     quality = report.quality.model_copy(update={"truth": TRUTH})
     page = render_html(report.model_copy(update={"quality": quality}), [], None, hidden_pictures(scored, model))
     section = page[page.index("What the camera does not show") :]
@@ -90,5 +90,5 @@ def test_figures_stand_beside_their_baselines(report, scored, model):
     assert "Depth behind tools" not in text
 
 
-def test_a_run_without_either_has_no_such_section(report):
+def test_report_without_truth_and_pictures_has_no_hidden_section(report):
     assert "What the camera does not show" not in render_html(report, [])

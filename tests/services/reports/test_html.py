@@ -44,7 +44,7 @@ def text(report, scored) -> str:
     return render_html(report, [keyframe_pictures(scored)], worst_seq=1)
 
 
-def test_nothing_is_fetched_from_anywhere(text):
+def test_report_html_loads_nothing(text):
     page = Page(text)
     for tag, attributes in page.elements:
         assert tag not in ("script", "link", "iframe", "object", "embed", "base", "form", "video", "audio"), tag
@@ -58,13 +58,13 @@ def test_nothing_is_fetched_from_anywhere(text):
     assert "default-src 'none'" in policy
 
 
-def test_the_four_pictures_are_there_and_described(text):
+def test_report_html_has_four_pictures_with_alt_text(text):
     pictures = Page(text).all("img")
     assert [p["alt"] for p in pictures] == [f"frame 1, {name}" for name in ("raw", "reconstruction", "error", "depth")]
     assert all(p["src"].startswith("data:image/jpeg;base64,") for p in pictures)
 
 
-def test_it_says_what_it_must(text):
+def test_report_html_contains_notice_scores_and_labels(text):
     assert text.count("Research use only, not a medical device.") >= 2
     for value in ("38.50", "37.25", "+1.25 dB", "33.00", "24.50", "1,200", "lowest PSNR", "held out", "22.5", "1.25"):
         assert value in text, value
@@ -74,7 +74,7 @@ def test_it_says_what_it_must(text):
     assert "prefers-color-scheme: dark" in text
 
 
-def test_held_out_frames_with_one_neighbour_are_told_apart(report, text):
+def test_heldout_frames_with_both_neighbours_have_own_row(report, text):
     assert "with both neighbours" not in text
     quality = report.quality.model_dump() | {"heldout_between": {"psnr_tissue_db": 26.125, "frames": 2}}
     quality["heldout"]["frames"] = 3
@@ -86,37 +86,37 @@ def test_held_out_frames_with_one_neighbour_are_told_apart(report, text):
     )
 
 
-def test_a_series_that_is_summed_up_says_so(report, text):
+def test_report_html_notes_binned_series(report, text):
     binned = report.model_copy(update={"series_frames_per_entry": 12})
     assert "Each point is the mean of 12 frames." in render_html(binned, [])
     assert "Each point is the mean" not in text
 
 
-def test_a_stream_without_an_end_has_a_page(report):
+def test_report_html_of_endless_stream(report):
     recording = report.recording.model_copy(update={"frames": None})
     run = report.run.model_copy(update={"stop_reason": "end of stream"})
     text = render_html(report.model_copy(update={"recording": recording, "run": run}), [])
     assert "a stream without an end, 24 x 16 px" in text and 'role="alert"' not in text
 
 
-def test_names_and_notes_are_escaped(text):
+def test_report_html_escapes_names_and_notes(text):
     assert "take &lt;7&gt;" in text and "take <7>" not in text
     assert "no &lt;mask&gt;" in text
 
 
-def test_a_run_that_was_interrupted_says_so(report):
+def test_report_html_shows_alert_if_interrupted(report):
     run = report.run.model_copy(update={"stop_reason": "interrupted", "interrupted": True})
     text = render_html(report.model_copy(update={"run": run}), [])
     assert 'role="alert"' in text and "interrupted" in text
 
 
-def test_damaged_frames_are_counted_where_there_are_any(report, text):
+def test_report_html_counts_damaged_frames_only_if_any(report, text):
     assert "damaged" not in text
     frames = report.frames.model_copy(update={"damaged": 3})
     assert "0 dropped, 3 damaged" in render_html(report.model_copy(update={"frames": frames}), [])
 
 
-def test_an_empty_run_still_has_a_page(report):
+def test_report_html_of_empty_run_is_valid(report):
     content = report.model_dump() | {
         "latency_ms": {},
         "latency_quantiles_ms": {},
@@ -128,13 +128,13 @@ def test_an_empty_run_still_has_a_page(report):
     Page(render_html(type(report).model_validate(content), []))
 
 
-def test_the_file_is_written_whole(tmp_path, report, scored):
+def test_write_html_leaves_only_complete_file(tmp_path, report, scored):
     write_html(report, [keyframe_pictures(scored)], tmp_path / "report.html")
     assert (tmp_path / "report.html").read_text().endswith("</html>\n")
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
 
 
-def test_scores_are_placed_on_their_rail_in_proportion(text):
+def test_report_html_places_dots_proportionally_to_scores(text):
     """The lowest score is one decibel from the left end, the highest one from the right end."""
     rows = re.findall(r'<td class="n">([0-9.]+)</td><td class="track">.*?left:([0-9.-]+)%', text)
     values, places = ([float(row[part]) for row in rows] for part in (0, 1))
@@ -143,7 +143,7 @@ def test_scores_are_placed_on_their_rail_in_proportion(text):
     assert places == pytest.approx([100 * (value - low) / (high - low) for value in values], abs=0.2)
 
 
-def test_quality_is_drawn_over_the_mean_age_of_each_group(report):
+def test_quality_over_age_chart_sorts_frames_by_age(report):
     ages = [40.0, 10.0, 30.0, 20.0]
     measured = [
         entry.model_copy(update={"age_ms": age, "psnr_tissue_db": 20 + age, "previous_frame_db": 5.0})

@@ -25,7 +25,7 @@ def live(report) -> RunReport:
     return report.model_copy(update={"live": facts, "series": series})
 
 
-def test_its_ages_quality_and_counts_are_there(live):
+def test_live_section_contains_ages_quality_and_counts(live):
     text = render_html(live, [])
     for said in ("43.21", "+6.21 dB", "38.76", "12.3", "p99 21.5, max 66.6 ms", "222", "source -&gt; reconstruct 3", "blur 4", "&lt;lost&gt; 2",
                  "black 5", "20.0 steps each", "1,234", "6 frames", "Quality over age", "Age over time", f"in {AGE_GROUPS} groups"):  # fmt: skip
@@ -33,11 +33,11 @@ def test_its_ages_quality_and_counts_are_there(live):
     assert "<lost>" not in text
 
 
-def test_another_run_has_nothing_of_it(report):
+def test_live_section_is_empty_for_replay_run(report):
     assert live_section(report) == "" and "Quality over age" not in render_html(report, [])
 
 
-def test_few_frames_and_missing_figures_are_drawn_as_far_as_they_go(live):
+def test_live_section_omits_charts_without_enough_data(live):
     one = live.model_copy(update={"series": live.series[:1]})
     assert "Age over time" in live_section(one) and "Quality over age" not in live_section(one)
     bare = live.model_copy(update={"series": [entry.model_copy(update={"age_ms": None}) for entry in live.series]})
@@ -50,7 +50,7 @@ def test_few_frames_and_missing_figures_are_drawn_as_far_as_they_go(live):
     assert "Quality over age" in live_section(live.model_copy(update={"series": live.series[:3]}))
 
 
-def test_each_place_where_frames_end_is_named_once_and_the_age_stands_for_the_latency(live):
+def test_latency_section_of_live_run_names_each_sink_once(live):
     ways = {
         "source,analysis,display,recorded": 239.0,
         "source,metrics,progress": 41.0,

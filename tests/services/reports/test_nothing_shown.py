@@ -59,7 +59,7 @@ def sentence(outcome):
     return str(error.value)
 
 
-def test_withheld_frames_are_counted_by_reason_with_what_changes_it():
+def test_nothing_shown_counts_withheld_frames_by_reason_with_remedies():
     gate = OutOfBodyFrames("withhold", 10, {"even light, no red": 30, "not yet certain again": 10})
     said = sentence(ended("live", source(50), withheld(out_of_body=40, no_tissue=6, blur=4), gate))
     assert said == (
@@ -69,12 +69,12 @@ def test_withheld_frames_are_counted_by_reason_with_what_changes_it():
     )
 
 
-def test_only_the_remedies_of_the_reasons_that_occurred_are_named():
+def test_nothing_shown_names_remedies_of_occurred_reasons_only():
     said = sentence(ended("live", source(1), withheld(black=1)))
     assert said == "nothing was shown: 1 frame came, 1 withheld (black: 1); check what the source sends"
 
 
-def test_a_source_that_never_gave_a_frame_says_what_state_it_was_in():
+def test_nothing_shown_states_source_state_if_no_frame_came():
     said = sentence(ended("live", source(0, state_sentence="no data since 3 s"), withheld()))
     assert said.startswith(
         "nothing was shown: no frame came from theatre 3 in 3.0 s (no data since 3 s); check that it"
@@ -83,12 +83,12 @@ def test_a_source_that_never_gave_a_frame_says_what_state_it_was_in():
     assert sentence(ended("replay", source(0))).endswith("check that it holds frames")
 
 
-def test_frames_that_never_reached_the_screen():
+def test_nothing_shown_if_run_ended_before_first_picture():
     said = sentence(ended("live", source(3), withheld(), stop_reason="end of the time asked for"))
     assert "3 frames came, and the run ended before one was on the screen (end of the time asked for)" in said
 
 
-def test_a_replayed_session_says_that_its_frames_were_withheld_before():
+def test_nothing_shown_in_replay_names_frames_withheld_in_recording():
     said = sentence(ended("replay", source(8, withheld={"out of body": 8}), DisplayResult(0)))
     assert said.startswith(
         "nothing was shown: 8 frames came, 8 withheld when they were recorded (out of body: 8); record"
@@ -104,23 +104,23 @@ def test_a_replayed_session_says_that_its_frames_were_withheld_before():
         (QualityResult(None, None, (), 1, "", 1),),
     ],
 )
-def test_a_run_that_showed_a_frame_is_left_alone(parts):
+def test_require_shown_accepts_run_that_showed_frame(parts):
     require_shown(ended("live", source(5), withheld(blur=4), *parts))
 
 
-def test_a_run_that_was_interrupted_before_its_first_picture_is_no_failure_unless_frames_were_withheld():
+def test_require_shown_accepts_interrupted_run_without_withheld_frames():
     require_shown(ended("live", source(0), withheld(), interrupted=True))
     require_shown(ended("live", source(2), withheld(), interrupted=True))
     assert "withheld (blur: 2)" in sentence(ended("live", source(2), withheld(blur=2), interrupted=True))
 
 
-def test_another_error_of_the_user_keeps_its_exit_code(capsys):
+def test_invalid_setting_exits_with_bad_input(capsys):
     from gsplat_core.errors import InvalidSetting
 
     assert exit_code_of(InvalidSetting("fps is nan")) == BAD_INPUT
 
 
-def test_every_reason_of_a_gate_has_a_remedy():
+def test_every_withholding_reason_has_remedy():
     """The reasons are the words returned by the functions of the stages' modules that return `str | None`."""
     import ast
     import inspect
@@ -149,7 +149,7 @@ def test_every_reason_of_a_gate_has_a_remedy():
 @pytest.mark.parametrize(
     ("command", "hint"), [("live", "give more --seconds"), ("replay", "check that it holds frames")]
 )
-def test_a_run_that_ended_before_its_source_was_read(command, hint):
+def test_nothing_shown_if_run_ended_before_source_was_read(command, hint):
     said = sentence(ended(command, stop_reason="a failure"))
     assert said.startswith("nothing was shown: no frame came from the source in 3.0 s (a failure)") and hint in said
     assert hint not in sentence(ended("replay", source(2))) and "check the recording" in sentence(

@@ -24,13 +24,13 @@ def bytes_of(uri: str) -> bytes:
         ((210, 100), (420, 200)), ((140, 100), (420, 300)), ((24, 16), (408, 272)), ((4200, 1), (420, 1)),
     ],
 )  # fmt: skip
-def test_pictures_are_at_most_420_pixels_wide_and_small_ones_enlarged_by_whole_factors(size, shown):
+def test_data_uri_limits_width_to_420_px_and_enlarges_by_whole_factors(size, shown):
     image = np.zeros((size[1], size[0], 3), np.uint8)
     decoded = cv2.imdecode(np.frombuffer(bytes_of(data_uri(image)), np.uint8), cv2.IMREAD_COLOR)
     assert decoded.shape[1::-1] == shown
 
 
-def test_colours_stay_and_the_quality_is_88():
+def test_data_uri_keeps_colours_at_jpeg_quality_88():
     """The standard table of luminance begins with 16, 11 and 12, and a quality of 88 multiplies it by 0.24."""
     image = np.empty((32, 48, 3), np.uint8)
     image[:] = 200, 90, 40
@@ -42,7 +42,7 @@ def test_colours_stay_and_the_quality_is_88():
 
 
 @pytest.mark.parametrize(("height", "width_px"), [(90, 1), (440, 1), (600, 2)])
-def test_the_border_of_a_tool_is_a_light_grey_line_of_a_three_hundredth_of_the_height(height, width_px):
+def test_outlined_draws_grey_line_with_width_of_height_over_300(height, width_px):
     picture = np.full((height, 400, 3), 20, np.uint8)
     mask = np.ones((height, 400), np.uint8)
     mask[30:70, 100:300] = 0

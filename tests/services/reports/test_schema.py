@@ -21,13 +21,13 @@ PROMISED = {
 }
 
 
-def test_what_is_written_reads_back_equal(tmp_path, report):
+def test_run_report_round_trips_through_json(tmp_path, report):
     report.write(tmp_path / "report.json")
     assert RunReport.read(tmp_path / "report.json") == report
     assert [p.name for p in tmp_path.iterdir()] == ["report.json"]
 
 
-def test_a_long_runs_series_of_bins_reads_back_equal(tmp_path, report):
+def test_run_report_with_binned_series_round_trips(tmp_path, report):
     content = report.model_dump()
     bins = [{**entry, "frames": 3, "psnr_tissue_min_db": 21.5} for entry in content["series"]]
     binned = RunReport.model_validate({**content, "series": bins, "series_frames_per_entry": 3})
@@ -40,13 +40,13 @@ def test_a_long_runs_series_of_bins_reads_back_equal(tmp_path, report):
         RunReport.model_validate({**content, "series": [{**bins[0], "psnr_tissue_min_db": "low"}]})
 
 
-def test_what_earlier_reports_did_not_have_is_not_asked_for(report):
+def test_run_report_reads_older_reports_without_new_fields(report):
     content = report.model_dump()
     del content["series_frames_per_entry"], content["run"]["renderer"]
     assert RunReport.model_validate(content) == report
 
 
-def test_every_promised_field_is_there(tmp_path, report):
+def test_report_json_contains_promised_fields(tmp_path, report):
     report.write(tmp_path / "report.json")
     content = json.loads((tmp_path / "report.json").read_text())
     for part, names in PROMISED.items():
@@ -58,7 +58,7 @@ def test_every_promised_field_is_there(tmp_path, report):
     assert content["notice"] == "Research use only, not a medical device."
 
 
-def test_not_a_number_is_refused(report):
+def test_run_report_rejects_nan(report):
     content = report.model_dump()
     content["quality"]["live"]["ssim"] = float("nan")
     with pytest.raises(ValidationError, match="finite"):
@@ -66,19 +66,19 @@ def test_not_a_number_is_refused(report):
 
 
 @pytest.mark.parametrize(("part", "field"), [("run", "wall_s"), ("frames", "dropped"), ("recording", "fps")])
-def test_a_missing_field_is_refused(report, part, field):
+def test_run_report_rejects_missing_field(report, part, field):
     content = report.model_dump()
     del content[part][field]
     with pytest.raises(ValidationError, match=field):
         RunReport.model_validate(content)
 
 
-def test_an_unknown_field_is_refused(report):
+def test_run_report_rejects_unknown_field(report):
     with pytest.raises(ValidationError, match="surprise"):
         RunReport.model_validate(report.model_dump() | {"surprise": 1})
 
 
-def test_the_json_schema_can_be_given_out():
+def test_run_report_has_json_schema():
     schema = RunReport.model_json_schema()
     assert "frames_sha256" in schema["required"]
 
@@ -93,7 +93,7 @@ def test_the_json_schema_can_be_given_out():
         (None, "", "a machine"),
     ],
 )
-def test_the_processor_has_its_own_name_if_the_system_knows_it(monkeypatch, lines, processor, name):
+def test_processor_name_prefers_model_name_of_cpuinfo(monkeypatch, lines, processor, name):
     def opened(path, **_):
         if lines is None:
             raise FileNotFoundError(path)

@@ -37,7 +37,7 @@ def text_of(page: str) -> str:
 
 
 @pytest.mark.parametrize("figure", ["38.50"])
-def test_wherever_the_page_shows_a_training_error_it_says_so(predicted, scored, figure):
+def test_report_html_labels_training_error_everywhere(predicted, scored, figure):
     lines = [
         line for line in text_of(render_html(predicted, [keyframe_pictures(scored)])).splitlines() if figure in line
     ]
@@ -45,7 +45,7 @@ def test_wherever_the_page_shows_a_training_error_it_says_so(predicted, scored, 
     assert all("training error" in line.lower() for line in lines), lines
 
 
-def test_the_page_shows_the_prediction_and_its_baseline_beside_it(predicted):
+def test_report_html_shows_next_frame_prediction_with_baseline(predicted):
     page = text_of(render_html(predicted, []))
     tile = next(line for line in page.splitlines() if "Next frame, predicted" in line)
     assert "36.12" in tile and "+0.22 dB" in tile and "35.90" in tile and "before training on the frame" in tile
@@ -55,12 +55,12 @@ def test_the_page_shows_the_prediction_and_its_baseline_beside_it(predicted):
     assert 'class="line third"' in render_html(predicted, [])
 
 
-def test_a_run_without_predictions_has_no_empty_place_for_them(report):
+def test_report_html_without_predictions_omits_next_frame(report):
     page = render_html(report, [])
     assert "Next frame" not in page and "next frame predicted" not in page
 
 
-def test_each_picture_names_the_kind_of_its_error_and_the_baseline(report, scored):
+def test_report_pictures_label_training_error_and_baseline(report, scored):
     shown = lambda trained: text_of(
         render_html(report, [keyframe_pictures(replace(scored, rendered=replace(scored.rendered, trained=trained)))])
     )
@@ -68,7 +68,7 @@ def test_each_picture_names_the_kind_of_its_error_and_the_baseline(report, score
     assert re.search(r"33\.00 dB tissue\s+previous frame 36\.00 dB", shown(False))
 
 
-def test_the_command_prints_every_figure_with_its_kind_and_baseline(predicted, tmp_path, capsys):
+def test_print_report_labels_figures_and_prints_baselines(predicted, tmp_path, capsys):
     print_report(predicted, tmp_path, as_json=False)
     lines = capsys.readouterr().out.splitlines()
     assert "tissue PSNR, displayed frame (training error): 38.50 dB (previous frame shown instead: 37.25 dB)" in lines
@@ -82,7 +82,7 @@ def test_the_command_prints_every_figure_with_its_kind_and_baseline(predicted, t
     )
 
 
-def test_a_live_run_prints_the_same(predicted):
+def test_live_summary_labels_figures_and_prints_baselines(predicted):
     facts = LiveFacts(
         settled_psnr_tissue_db=43.21, worst_psnr_tissue_db=38.76, previous_frame_db=37.0, pictures=149, age_p50_ms=12.3,
         age_p95_ms=18.4, age_p99_ms=21.5, age_max_ms=66.6, first_picture_ms=222.0, states={}, dropped={}, withheld={}, scenes={},
@@ -100,7 +100,7 @@ def test_a_live_run_prints_the_same(predicted):
 
 
 @pytest.mark.parametrize(("previous_db", "text"), [(36.0, "36.00 dB"), (np.nan, "    - dB")])
-def test_the_status_line_says_it_too(scored, capsys, previous_db, text):
+def test_live_status_line_labels_training_error_with_baseline(scored, capsys, previous_db, text):
     graph = SimpleNamespace(
         display=SimpleNamespace(pictures=3, state=PictureState.LIVE, age_p50_ms=12.0),
         reconstruct=SimpleNamespace(newest_gaussians=99),
@@ -110,14 +110,14 @@ def test_the_status_line_says_it_too(scored, capsys, previous_db, text):
     assert f"training error 33.00 dB (previous frame {text})" in capsys.readouterr().err
 
 
-def test_a_result_without_frames_is_no_figure():
+def test_next_frame_quality_is_none_without_frames():
     assert _next_frame(None) is None and _next_frame(NextFrameResult(None, None, 0)) is None
     assert _next_frame(NextFrameResult(36.0, 35.0, 2)) == NextFrameQuality(
         psnr_tissue_db=36.0, previous_frame_db=35.0, frames=2
     )
 
 
-def test_pictures_of_a_stream_say_what_the_newest_scored_frame_is_compared_with(scored):
+def test_screen_headers_contain_scores_of_newest_scored_frame(scored):
     from dataclasses import replace
 
     headers = []

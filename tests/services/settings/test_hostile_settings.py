@@ -42,7 +42,7 @@ BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
         ("\x00", "not YAML"),
     ],
 )
-def test_a_file_that_is_no_settings_file_gets_one_sentence(tmp_path, text, said):
+def test_load_settings_rejects_malformed_file_with_short_error(tmp_path, text, said):
     path = tmp_path / "s.yaml"
     path.write_text(text)
     with pytest.raises(SettingsInvalid, match=said) as refused:
@@ -51,12 +51,12 @@ def test_a_file_that_is_no_settings_file_gets_one_sentence(tmp_path, text, said)
 
 
 @pytest.mark.parametrize("text", ["[" * 50_000, BOMB, "1: 2", "9" * 5000])
-def test_flags_are_read_by_the_same_rules(text):
+def test_load_settings_rejects_malformed_flag_values(text):
     with pytest.raises(SettingsInvalid):
         load_settings(None, {"server.port": text})
 
 
-def test_a_variable_of_nested_lists_gets_one_sentence(monkeypatch):
+def test_load_settings_rejects_deeply_nested_environment_variable(monkeypatch):
     monkeypatch.setenv("INTRASPLAT_SERVER", "[" * 20_000)
     with pytest.raises(SettingsInvalid):
         load_settings()
@@ -78,24 +78,24 @@ def _numbers(kind: str) -> list[str]:
 
 @pytest.mark.parametrize("place", _numbers("number"))
 @pytest.mark.parametrize("value", ["true", "false", ".inf", ".nan", "1e300", "'x'"])
-def test_a_number_is_a_number_in_its_range(place, value):
+def test_number_settings_reject_other_types_and_non_finite_values(place, value):
     with pytest.raises(SettingsInvalid, match=place):
         load_settings(None, {place: value})
 
 
 @pytest.mark.parametrize("place", _numbers("flag"))
 @pytest.mark.parametrize("value", ["1", "0", "1.0", "[]"])
-def test_a_flag_is_true_or_false(place, value):
+def test_boolean_settings_reject_numbers_and_lists(place, value):
     with pytest.raises(SettingsInvalid, match=place):
         load_settings(None, {place: value})
 
 
-def test_a_whole_number_has_no_point():
+def test_integer_setting_rejects_float():
     with pytest.raises(SettingsInvalid, match="whole number"):
         load_settings(None, {"server.port": "8000.0"})
 
 
-def test_aliases_and_text_of_variables_still_work(monkeypatch, tmp_path):
+def test_load_settings_accepts_yaml_aliases_and_variables(monkeypatch, tmp_path):
     monkeypatch.setenv("INTRASPLAT_SERVER__PORT", "8001")
     path = tmp_path / "s.yaml"
     path.write_text("streams:\n  a: &s {source: 'synthetic:'}\n  b: *s\n")

@@ -28,7 +28,7 @@ def file(tmp_path):
     return write
 
 
-def test_flags_win_over_the_environment_over_the_file_over_defaults(file, monkeypatch):
+def test_flags_override_environment_file_and_defaults(file, monkeypatch):
     path = file("server: {port: 1, host: 127.0.0.2, drain_s: 3}\nlog: {level: debug}\n")
     monkeypatch.setenv("INTRASPLAT_SERVER__PORT", "2")
     monkeypatch.setenv("INTRASPLAT_SERVER__HOST", "127.0.0.3")
@@ -41,7 +41,7 @@ def test_flags_win_over_the_environment_over_the_file_over_defaults(file, monkey
     assert "endoscope" in settings.streams
 
 
-def test_without_anything_it_listens_on_loopback_and_shows_the_synthetic_endoscope():
+def test_default_settings_use_loopback_and_synthetic_stream():
     settings = load_settings()
     assert (settings.server.host, settings.server.port) == ("127.0.0.1", 8000)
     assert settings.streams["endoscope"].source.startswith("synthetic:")
@@ -65,13 +65,13 @@ def test_without_anything_it_listens_on_loopback_and_shows_the_synthetic_endosco
         ("a: !!python/object/apply:os.system [id]", "is not YAML"),
     ],
 )  # fmt: skip
-def test_what_is_wrong_in_a_file(file, text, said):
+def test_settings_error_names_line_and_key_of_file(file, text, said):
     with pytest.raises(SettingsInvalid) as refused:
         load_settings(file(text))
     assert said in str(refused.value)
 
 
-def test_every_mistake_is_said_at_once(file):
+def test_settings_error_lists_all_mistakes(file):
     with pytest.raises(SettingsInvalid) as refused:
         load_settings(file("server: {prt: 1}\nlimits: {uploads: 0}\n"))
     assert len(str(refused.value).splitlines()) == 2
@@ -86,14 +86,14 @@ def test_every_mistake_is_said_at_once(file):
         ("INTRASPLAT_SERVER__TRUSTED_PROXIES", "10.0.0.1", "give lists and tables as JSON"),
     ],
 )  # fmt: skip
-def test_what_is_wrong_in_the_environment(monkeypatch, name, value, said):
+def test_settings_error_names_environment_variable(monkeypatch, name, value, said):
     monkeypatch.setenv(name, value)
     with pytest.raises(SettingsInvalid) as refused:
         load_settings()
     assert said in str(refused.value)
 
 
-def test_what_is_wrong_in_flags(tmp_path):
+def test_settings_error_names_flag_or_missing_file(tmp_path):
     for flags, said in (
         ({"server.prt": "1"}, "--set server.prt: there is no key 'prt' in server"),
         ({"server": "1", "server.port": "2"}, "--set server.port: server is given as a value, too"),
@@ -106,7 +106,7 @@ def test_what_is_wrong_in_flags(tmp_path):
         load_settings(tmp_path / "none.yaml")
 
 
-def test_a_secret_is_not_repeated(file):
+def test_settings_errors_and_output_hide_secrets(file):
     with pytest.raises(SettingsInvalid) as refused:
         load_settings(file("registry: {database: [pa55word]}"))
     assert "pa55word" not in str(refused.value)
@@ -125,11 +125,11 @@ def test_a_secret_is_not_repeated(file):
         ("synthetic:?moving=1", "synthetic:?moving=1"),
     ],
 )  # fmt: skip
-def test_addresses_are_shown_without_credentials(address, shown):
+def test_masked_address_hides_credentials(address, shown):
     assert masked_address(address) == shown
 
 
-def test_the_schema_names_every_key():
+def test_settings_schema_describes_every_key():
     schema = ServiceSettings.model_json_schema()
     assert set(schema["properties"]) == set(ServiceSettings.model_fields)
     assert schema["$defs"]["ServerSettings"]["additionalProperties"] is False
@@ -178,7 +178,7 @@ NUMBERS = {
 
 
 @pytest.mark.parametrize("name", NUMBERS)
-def test_numbers_have_their_defaults_and_are_refused_beyond_their_bounds(name):
+def test_number_settings_have_documented_defaults_and_limits(name):
     usual, accepted, refused = NUMBERS[name]
     section, key = name.split(".")
     assert getattr(getattr(ServiceSettings(), section), key) == usual
@@ -189,12 +189,12 @@ def test_numbers_have_their_defaults_and_are_refused_beyond_their_bounds(name):
             ServiceSettings(**{section: {key: value}})
 
 
-def test_the_folder_of_recordings_that_tests_read_is_no_setting(monkeypatch):
+def test_recordings_folder_variable_of_tests_is_not_a_setting(monkeypatch):
     monkeypatch.setenv("INTRASPLAT_RECORDINGS", "/somewhere/recordings")
     assert load_settings(None, {}).uploaded_recordings == ServiceSettings().uploaded_recordings
 
 
-def test_the_data_folder_follows_the_desktop_standard(tmp_path, monkeypatch):
+def test_data_dir_follows_xdg_data_home(tmp_path, monkeypatch):
     """$XDG_DATA_HOME, or ~/.local/share if it is not set or empty (XDG Base Directory Specification)."""
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))

@@ -17,7 +17,7 @@ def refused(file: Path | None = None, flags: dict[str, str] | None = None) -> st
     return str(error.value)
 
 
-def test_the_winning_place_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_settings_error_names_overriding_source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = tmp_path / "settings.yaml"
     file.write_text("log:\n  level: x\nserver:\n  port: no\n")
     assert "settings.yaml, line 4: server.port" in refused(file)
@@ -27,12 +27,12 @@ def test_the_winning_place_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.parametrize("name", ["server", "server.port.more"])
-def test_a_flag_of_a_whole_section_or_of_something_inside_is_named(name: str) -> None:
+def test_settings_error_names_flag_of_section_or_inner_key(name: str) -> None:
     value = "{port: none}" if name == "server" else "1"
     assert refused(None, {name: value}).startswith(f"--set {name}: server.port")
 
 
-def test_a_flag_with_a_longer_name_is_not_blamed(tmp_path: Path) -> None:
+def test_settings_error_names_file_if_flag_has_longer_name(tmp_path: Path) -> None:
     file = tmp_path / "settings.yaml"
     file.write_text("server:\n  por: 1\n")
     said = refused(file, {"server.port": "8080"})
@@ -48,7 +48,7 @@ def test_a_flag_with_a_longer_name_is_not_blamed(tmp_path: Path) -> None:
         ({"server": "1", "server.port": "2"}, "--set server.port: server is given as a value, too"),
     ],
 )  # fmt: skip
-def test_a_misspelt_key_gets_the_nearest_one(flags: dict[str, str], said: str) -> None:
+def test_settings_error_suggests_nearest_key(flags: dict[str, str], said: str) -> None:
     assert said in refused(None, flags)
 
 
@@ -56,7 +56,7 @@ def test_a_misspelt_key_gets_the_nearest_one(flags: dict[str, str], said: str) -
     ("variable", "is_refused"),
     [("INTRASPLAT_SERVR__PORT", True), ("INTRASPLAT_RECORDINGS", False), ("OTHER_SERVR__PORT", False)],
 )
-def test_only_our_variables_of_sections_are_looked_at(
+def test_only_variables_with_prefix_and_section_are_checked(
     variable: str, is_refused: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(variable, "1")
@@ -71,13 +71,11 @@ def test_only_our_variables_of_sections_are_looked_at(
     [(("auth", "oidc"), "issuer"), (("server",), "port"), (("server", "port"), None), (("auth", "oidc", "roles"), None),
      (("none",), None), (("auth", "oidc", "roles", "more"), None)],
 )  # fmt: skip
-def test_only_sections_have_keys(location: tuple[str, ...], keys: str | None) -> None:
+def test_keys_of_location_are_empty_unless_section(location: tuple[str, ...], keys: str | None) -> None:
     assert _keys(location) == [] if keys is None else keys in _keys(location)
 
 
-def test_data_and_sockets_are_where_the_settings_or_the_desktop_say(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_data_and_runtime_dirs_follow_settings_then_xdg(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("XDG_DATA_HOME", "XDG_RUNTIME_DIR"):
         monkeypatch.setenv(name, "")
     monkeypatch.setattr(Path, "home", lambda: tmp_path)

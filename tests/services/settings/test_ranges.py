@@ -39,7 +39,7 @@ RANGES = {
 @pytest.mark.parametrize(
     ("section", "name"), [(section, name) for section, fields in RANGES.items() for name in fields]
 )
-def test_a_number_has_a_default_and_is_accepted_in_its_range(section, name):
+def test_number_setting_has_default_and_accepts_only_its_range(section, name):
     kind, (default, least, most) = getattr(settings, section), RANGES[section][name]
     field = kind.model_fields[name]
     assert field.get_default() == default
