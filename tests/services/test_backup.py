@@ -110,7 +110,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def test_everything_comes_back(service, tmp_path):
+def test_backup_and_restore_round_trip(service, tmp_path):
     made = make_backup(service.settings, tmp_path / "backup")
     assert (made.missing, made.elsewhere, made.audit) == ((), (), "intact")
     assert check_backup(tmp_path / "backup") == made
@@ -135,7 +135,7 @@ def test_everything_comes_back(service, tmp_path):
     archive.replays._store.close()
 
 
-def test_folders_elsewhere_are_in_it_and_are_restored_elsewhere(tmp_path):
+def test_backup_includes_and_restores_folders_outside_data(tmp_path):
     service = filled(tmp_path / "data", recordings=tmp_path / "rec", replays=tmp_path / "rep")
     make_backup(service.settings, tmp_path / "backup")
     service.close()
@@ -148,7 +148,7 @@ def test_folders_elsewhere_are_in_it_and_are_restored_elsewhere(tmp_path):
     assert not list(tmp_path.rglob(".restore-*"))
 
 
-def test_a_service_that_writes_meanwhile_gives_a_backup_that_fits(service, tmp_path, monkeypatch):
+def test_backup_is_consistent_while_service_writes(service, tmp_path, monkeypatch):
     """During the copy an upload is checked, another one ends, and audit entries are written."""
     real, calls = backups._copy_files, []
     database, files = service.archive.files._database, service.archive.files._files
@@ -177,7 +177,7 @@ def test_a_service_that_writes_meanwhile_gives_a_backup_that_fits(service, tmp_p
     check_backup(tmp_path / "backup")
 
 
-def test_files_that_are_missing_in_the_service_are_said(service, tmp_path, capsys):
+def test_backup_lists_files_missing_in_service(service, tmp_path, capsys):
     shutil.rmtree(tmp_path / "data" / "replays" / "r1")
     (tmp_path / "data" / "registry" / "blobs" / "abc.isplat").write_bytes(b"mode")
     assert backup_command(tmp_path / "backup", None, tmp_path / "data", as_json=False) == 2
@@ -247,7 +247,7 @@ def damaged(folder: Path, how: str) -> None:
         ("the database is none", "the database of the backup cannot be read: file is not a database"),
     ],
 )  # fmt: skip
-def test_a_backup_that_is_not_whole_is_not_restored(service, tmp_path, how, said):
+def test_restore_refuses_damaged_backup(service, tmp_path, how, said):
     make_backup(service.settings, tmp_path / "backup")
     damaged(tmp_path / "backup", how)
     with pytest.raises(BackupFailed, match=said):
@@ -258,7 +258,7 @@ def test_a_backup_that_is_not_whole_is_not_restored(service, tmp_path, how, said
 
 
 @pytest.mark.parametrize("there", ["data", "a file", "recordings", "itself", "inside"])
-def test_a_restore_replaces_nothing(service, tmp_path, there):
+def test_restore_does_not_overwrite_existing_files(service, tmp_path, there):
     make_backup(service.settings, tmp_path / "backup")
     new, recordings = tmp_path / "new", tmp_path / "rec"
     if there == "data":
@@ -302,7 +302,7 @@ backup.restore_backup(ServiceSettings(paths={"data": Path(sys.argv[2])}), Path(s
 
 @pytest.mark.slow
 @pytest.mark.parametrize("when", ["copy", "move"])
-def test_a_restore_that_was_killed_is_noticed_by_the_next_start_and_restore(service, tmp_path, when):
+def test_killed_restore_is_detected_by_start_and_next_restore(service, tmp_path, when):
     make_backup(service.settings, tmp_path / "backup")
     new = tmp_path / "new"
     settings = ServiceSettings(paths={"data": new})
@@ -320,7 +320,7 @@ def test_a_restore_that_was_killed_is_noticed_by_the_next_start_and_restore(serv
     assert not list(new.glob(".restore-*"))
 
 
-def test_a_restore_beside_a_running_one_is_refused(service, tmp_path):
+def test_concurrent_restore_is_refused(service, tmp_path):
     make_backup(service.settings, tmp_path / "backup")
     stage = tmp_path / "new" / ".restore-7"
     stage.mkdir(parents=True)
@@ -331,7 +331,7 @@ def test_a_restore_beside_a_running_one_is_refused(service, tmp_path):
     os.close(held)
 
 
-def test_a_restore_onto_a_full_disk_leaves_nothing(service, tmp_path, monkeypatch):
+def test_restore_on_full_disk_leaves_no_files(service, tmp_path, monkeypatch):
     make_backup(service.settings, tmp_path / "backup")
     monkeypatch.setattr(os, "fsync", lambda descriptor: (_ for _ in ()).throw(OSError(28, "No space left on device")))
     with pytest.raises(BackupFailed, match=r"No space left .* nothing is left of it"):
@@ -340,7 +340,7 @@ def test_a_restore_onto_a_full_disk_leaves_nothing(service, tmp_path, monkeypatc
 
 
 @pytest.mark.parametrize("target", ["data", "data/backup", "there", "a file", "no/such", "data/recordings/x"])
-def test_a_backup_replaces_nothing(service, tmp_path, target):
+def test_backup_does_not_overwrite_existing_target(service, tmp_path, target):
     (tmp_path / "there").mkdir()
     (tmp_path / "a file").write_text("mine")
     before = contents(tmp_path)
@@ -349,7 +349,7 @@ def test_a_backup_replaces_nothing(service, tmp_path, target):
     assert contents(tmp_path) == before
 
 
-def test_a_full_disk_leaves_nothing(service, tmp_path, monkeypatch):
+def test_backup_on_full_disk_leaves_no_files(service, tmp_path, monkeypatch):
     monkeypatch.setattr(os, "fsync", lambda descriptor: (_ for _ in ()).throw(OSError(28, "No space left on device")))
     with pytest.raises(BackupFailed, match="No space left"):
         make_backup(service.settings, tmp_path / "backup")
@@ -360,7 +360,7 @@ def test_a_full_disk_leaves_nothing(service, tmp_path, monkeypatch):
         make_backup(service.settings, tmp_path / "backup")
 
 
-def test_a_place_without_a_service_is_no_backup(tmp_path):
+def test_backup_refuses_folder_without_service_data(tmp_path):
     with pytest.raises(BackupFailed, match="no data of a service"):
         make_backup(ServiceSettings(paths={"data": tmp_path / "nope"}), tmp_path / "backup")
     (tmp_path / "empty").mkdir()  # the mount point of a disk that is not mounted
@@ -369,7 +369,7 @@ def test_a_place_without_a_service_is_no_backup(tmp_path):
     assert not (tmp_path / "backup").exists()
 
 
-def test_what_other_stores_keep_is_said(tmp_path):
+def test_backup_lists_external_database_and_object_store(tmp_path):
     settings = ServiceSettings(
         paths={"data": tmp_path / "data"}, registry={"database": "postgresql://a@b/c", "blobs": "s3://bucket/x"}
     )
@@ -380,7 +380,7 @@ def test_what_other_stores_keep_is_said(tmp_path):
     restore_backup(ServiceSettings(paths={"data": tmp_path / "new"}), tmp_path / "backup")
 
 
-def test_a_service_without_its_files_says_so(service, tmp_path, caplog):
+def test_service_reports_missing_files_until_restored(service, tmp_path, caplog):
     data = tmp_path / "data"
     for folder in ("recordings", "replays"):
         shutil.move(data / folder, tmp_path / folder)
@@ -419,7 +419,7 @@ def test_a_service_without_its_files_says_so(service, tmp_path, caplog):
     archive.replays._store.close()
 
 
-def test_a_damaged_database_is_not_backed_up_as_if_it_were_well(service, tmp_path):
+def test_backup_refuses_damaged_database(service, tmp_path):
     service.close()
     path = tmp_path / "data" / "registry" / "registry.sqlite"
     with sqlite3.connect(path) as connection:

@@ -34,7 +34,7 @@ def clock():
     return Clock()
 
 
-def test_a_service_that_runs_every_day_believes_its_clock(tmp_path, clock):
+def test_clock_is_trusted_if_service_runs_daily(tmp_path, clock):
     for _ in range(3):
         guard = clock.guard(tmp_path)
         for _ in range(100):
@@ -44,7 +44,7 @@ def test_a_service_that_runs_every_day_believes_its_clock(tmp_path, clock):
 
 
 @pytest.mark.parametrize("days", [400, 30, 1.1])
-def test_a_jump_between_two_runs_is_not_believed_until_a_day_has_passed(tmp_path, clock, days):
+def test_clock_jump_between_runs_is_not_trusted_for_a_day(tmp_path, clock, days):
     assert clock.guard(tmp_path).trusts_ages()
     clock.wall_s += days * DAY_S
     for _ in range(3):  # to start again makes it no truer
@@ -58,7 +58,7 @@ def test_a_jump_between_two_runs_is_not_believed_until_a_day_has_passed(tmp_path
 
 
 @pytest.mark.parametrize("days", [400, 2, -400])
-def test_a_jump_while_it_runs_is_not_believed(tmp_path, clock, days):
+def test_clock_jump_during_run_is_not_trusted(tmp_path, clock, days):
     guard = clock.guard(tmp_path)
     assert guard.trusts_ages()
     clock.wall_s += days * DAY_S
@@ -70,7 +70,7 @@ def test_a_jump_while_it_runs_is_not_believed(tmp_path, clock, days):
     assert guard.trusts_ages()
 
 
-def test_a_clock_that_was_ahead_and_is_right_again_is_believed_at_the_next_start(tmp_path, clock):
+def test_corrected_clock_is_trusted_at_next_start(tmp_path, clock):
     assert clock.guard(tmp_path).trusts_ages()
     clock.wall_s += 400 * DAY_S
     assert not clock.guard(tmp_path).trusts_ages()
@@ -78,7 +78,7 @@ def test_a_clock_that_was_ahead_and_is_right_again_is_believed_at_the_next_start
     assert clock.guard(tmp_path).trusts_ages()
 
 
-def test_somebody_can_confirm_the_clock(tmp_path, clock):
+def test_deleting_clock_file_confirms_clock(tmp_path, clock):
     assert clock.guard(tmp_path).trusts_ages()
     clock.wall_s += 400 * DAY_S
     (tmp_path / FILE).unlink()
@@ -88,7 +88,7 @@ def test_somebody_can_confirm_the_clock(tmp_path, clock):
 
 
 @pytest.mark.parametrize("content", ["", "{}", "[]", '{"seen_s": "x"}', 100_000 * "["])
-def test_a_time_that_cannot_be_read_is_not_believed(tmp_path, clock, content):
+def test_clock_is_not_trusted_if_clock_file_is_unreadable(tmp_path, clock, content):
     (tmp_path / FILE).write_text(content)
     assert not clock.guard(tmp_path).trusts_ages()
 
@@ -105,7 +105,7 @@ class Store:
 
 
 @pytest.mark.parametrize("retention", [RecordingRetention, ReplayRetention])
-def test_retention_goes_by_size_alone_while_the_clock_is_not_believed(retention):
+def test_retention_ignores_age_while_clock_is_not_trusted(retention):
     store, trusted = Store(), [True]
     kept = retention(store, 2.0, 7, SystemEvents(), lambda: trusted[0])
     asyncio.run(kept.enforce())
@@ -114,7 +114,7 @@ def test_retention_goes_by_size_alone_while_the_clock_is_not_believed(retention)
     assert store.asked == [(2 * DAY_S, 7), (None, 7)]
 
 
-def test_the_audit_log_stays_while_the_clock_is_not_believed(tmp_path, monkeypatch):
+def test_audit_segments_are_kept_while_clock_is_not_trusted(tmp_path, monkeypatch):
     path, trusted = tmp_path / "audit.jsonl", [False]
     keeping = Keeping(segment_bytes=500, days=1, trusts_ages=lambda: trusted[0])
     log = AuditLog(path, keeping)

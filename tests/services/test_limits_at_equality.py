@@ -59,7 +59,7 @@ def test_lengths_up_to_the_limit_are_accepted(
 
 
 @pytest.mark.parametrize("length", [0, 1])
-def test_nothing_is_no_name_no_key_and_no_recording(length: int) -> None:
+def test_empty_names_keys_and_recording_lists_are_refused(length: int) -> None:
     for act, refusal in (
         (lambda: models.check_by("x" * length), Rejected), (lambda: requests.checked_key("x" * length), ClientError),
         (lambda: submit(length), Rejected),
@@ -75,9 +75,7 @@ def token(number: int) -> str:
     return f"{keys.PREFIX}_{number:08d}_{'s' * 32}"
 
 
-def test_a_name_and_a_store_have_so_many_keys_and_a_key_so_many_streams(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_key_store_limits_keys_per_name_total_keys_and_streams(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(keys, "MOST_KEYS", keys.MOST_LIVE + 2)
     kept = KeyStore(tmp_path / "keys.json")
     names = ["wall"] * keys.MOST_LIVE + ["one", "two"]
@@ -98,14 +96,14 @@ def test_a_name_and_a_store_have_so_many_keys_and_a_key_so_many_streams(
                 other.add(f"n{count}", Role.VIEWER, **limited)
 
 
-def test_the_oldest_ticket_makes_room(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tickets_over_limit_evict_oldest(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(keys, "MOST_TICKETS", 3)
     tickets = Tickets(60.0, clock=lambda: 0.0)
     made = [tickets.give(f"caller {number}", "/path") for number in range(4)]
     assert [tickets.use(each, "/path") for each in made] == [None, "caller 1", "caller 2", "caller 3"]
 
 
-def test_the_least_recently_used_bucket_makes_room(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_token_buckets_over_limit_evict_least_recently_used(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(state, "MOST_BUCKETS", 2)
     buckets = state.TokenBuckets(1, 60, clock=lambda: 0.0)
     for caller in ("a", "b", "a", "c"):
@@ -113,7 +111,7 @@ def test_the_least_recently_used_bucket_makes_room(monkeypatch: pytest.MonkeyPat
     assert list(buckets._buckets) == ["a", "c"]
 
 
-def test_the_oldest_answer_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_repeated_answers_over_limit_evict_oldest(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(state, "MOST_KEPT", 2)
     made = []
 

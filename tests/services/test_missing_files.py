@@ -48,7 +48,7 @@ def found(database: Database, files: StoredFiles) -> list[str]:
         return [str(each) for each in missing_files(connection, files)]
 
 
-def test_a_model_needs_a_file_of_its_size(database, files):
+def test_missing_files_lists_models_without_file_of_their_size(database, files):
     create(database, MODELS, VERSIONS)
     files.blobs.mkdir()
     (files.blobs / "whole").write_bytes(b"1234")
@@ -63,7 +63,7 @@ def test_a_model_needs_a_file_of_its_size(database, files):
     assert found(database, StoredFiles(files.recordings, files.replays, None)) == []
 
 
-def test_a_recording_needs_its_upload_until_it_is_checked_and_then_its_file(database, files):
+def test_missing_files_lists_recordings_without_upload_or_checked_file(database, files):
     create(database, RECORDINGS)
     rows = {
         "uploaded": (State.UPLOADED, UPLOAD), "unchecked": (State.UPLOADED, "unchecked.mp4"),
@@ -78,7 +78,7 @@ def test_a_recording_needs_its_upload_until_it_is_checked_and_then_its_file(data
     assert found(database, files) == ["recording unchecked", "recording raw"]
 
 
-def test_a_finished_replay_needs_its_report(database, files):
+def test_missing_files_lists_finished_replays_without_report(database, files):
     create(database, JOBS)
     rows = {"whole": JobState.DONE, "lost": JobState.DONE, "running": JobState.RUNNING}
     with database.writing() as connection:
@@ -89,12 +89,12 @@ def test_a_finished_replay_needs_its_report(database, files):
     assert found(database, files) == ["replay lost"]
 
 
-def test_files_are_counted_by_kind(tmp_path):
+def test_count_by_kind_counts_missing_files(tmp_path):
     missing = [MissingFile(kind, "x", tmp_path) for kind in ("replay", "model", "replay")]
     assert count_by_kind(missing) == {"model": 1, "recording": 0, "replay": 2}
 
 
-def test_the_disk_is_looked_at_again_when_the_last_look_is_old(database, files):
+def test_stored_files_watch_checks_disk_again_after_60_s(database, files):
     create(database, JOBS)
     clock = [1000.0]
     watch = StoredFilesWatch(database, files, SystemEvents(), lambda: clock[0])
@@ -112,7 +112,7 @@ def test_the_disk_is_looked_at_again_when_the_last_look_is_old(database, files):
     assert watch.missing() == []
 
 
-def test_missing_files_are_in_the_readiness_and_in_the_metrics(database, files, tmp_path):
+def test_missing_files_appear_in_readiness_and_metrics(database, files, tmp_path):
     create(database, JOBS)
     watch = StoredFilesWatch(database, files, SystemEvents())
     with_none = asyncio.run(watch.check())
@@ -128,7 +128,7 @@ def test_missing_files_are_in_the_readiness_and_in_the_metrics(database, files, 
     assert counts == {"model": 0, "recording": 0, "replay": 2}
 
 
-def test_a_database_that_does_not_answer_is_no_missing_file(files, tmp_path):
+def test_unreachable_database_fails_check_without_missing_files(files, tmp_path):
     watch = StoredFilesWatch(Database(f"sqlite:///{tmp_path / 'none' / 'db'}"), files, SystemEvents())
     check = asyncio.run(watch.check())
     assert not check.ok and check.needed and "missing:" not in check.detail

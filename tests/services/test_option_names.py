@@ -87,7 +87,7 @@ def given(monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize(("option", "name"), NAMES)
-def test_every_name_is_accepted_everywhere(option, name, given, network, tmp_path):
+def test_registered_names_are_accepted_by_cli_settings_api_and_jobs(option, name, given, network, tmp_path):
     value = network.of(name)
     for command, kind in KINDS.items():
         if option in options_for(kind, command):
@@ -108,7 +108,7 @@ def test_every_name_is_accepted_everywhere(option, name, given, network, tmp_pat
 @pytest.mark.parametrize(
     "option", ["field", "renderer", "depth", "tool_mask", "poses", "eyes", "out_of_body", "device"]
 )
-def test_a_name_that_there_is_not_is_refused_everywhere(option, tmp_path, capsys):
+def test_unknown_names_are_refused_by_cli_settings_and_api(option, tmp_path, capsys):
     flag = f"--{option.replace('_', '-')}"
     for command, kind in KINDS.items():
         if option in options_for(kind, command):
@@ -126,7 +126,7 @@ def test_a_name_that_there_is_not_is_refused_everywhere(option, tmp_path, capsys
         specs_of("a", settings)
 
 
-def test_names_that_are_added_at_run_time_are_accepted_and_documented():
+def test_names_registered_at_run_time_are_accepted_and_in_schema():
     RENDERERS.add("dots", "nowhere:Dots")
     try:
         assert ReplayOptions(renderer="dots").renderer == "dots"
@@ -157,7 +157,7 @@ def test_losses_with_and_without_weights_are_accepted(value, given):
 
 
 @pytest.mark.parametrize("name", LOSSES)
-def test_every_loss_is_accepted_everywhere(name, given, tmp_path):
+def test_losses_are_accepted_by_cli_api_and_jobs(name, given, tmp_path):
     for command in KINDS:
         assert given(command, "--losses", name).losses == (name,)
     wanted = ReplayRequest.model_validate({"recording": "a", "options": {"losses": [name]}})
@@ -174,7 +174,7 @@ OF_STILL_MODELS = [("progressive", True), ("storage", "prepared")]
 
 
 @pytest.mark.parametrize(("option", "value"), [*RENDERED, *OF_STILL_MODELS])
-def test_the_options_of_a_renderer_are_accepted_everywhere(option, value, given):
+def test_renderer_options_are_accepted_by_cli_api_and_jobs(option, value, given):
     options = {"renderer": "stochastic", option: value}
     if (option, value) in RENDERED:
         for command in KINDS:
@@ -195,7 +195,7 @@ def test_the_options_of_a_renderer_are_accepted_everywhere(option, value, given)
         ({"renderer": "weighted_sum", "losses": ["flow"]}, "choose renderer alpha, or leave the losses flow out"),
     ],
 )
-def test_a_combination_that_does_not_work_is_refused_everywhere_with_one_that_does(options, message, tmp_path):
+def test_incompatible_options_are_refused_with_working_alternative(options, message, tmp_path):
     with pytest.raises(InvalidSetting, match=message):
         ReplayOptions(**options)
     with pytest.raises(ValidationError, match=message):
@@ -212,20 +212,20 @@ def test_a_combination_that_does_not_work_is_refused_everywhere_with_one_that_do
 @pytest.mark.parametrize(
     ("value", "message"), [("nope", "choose photometric"), ("depth:x", "as in depth:0.1"), ("depth:0", "positive")]
 )
-def test_losses_that_there_are_not_are_refused(value, message):
+def test_unknown_losses_and_weights_are_refused(value, message):
     with pytest.raises(InvalidSetting, match=message):
         ReplayOptions(losses=value)
 
 
 @pytest.mark.parametrize("name", STRATEGIES)
-def test_every_strategy_reaches_the_reconstructor(name, given, tmp_path):
+def test_strategy_option_reaches_reconstructor_config(name, given, tmp_path):
     assert given("reconstruct", "--strategy", name).strategy == name
     settings = ReconstructSettings(tmp_path, tmp_path / "out", strategy=name)
     assert settings.reconstructor_config(offline=True).strategy == name
 
 
 @pytest.mark.parametrize("name", [*SINKS, ",".join(SINKS), "none"])
-def test_every_sink_is_accepted_by_runs_and_jobs(name, given):
+def test_sinks_are_accepted_by_runs_and_jobs(name, given):
     sinks = () if name == "none" else tuple(name.split(","))
     for command in ("replay", "batch", "reconstruct"):
         assert given(command, "--sinks", name).sinks == sinks
@@ -238,7 +238,7 @@ def test_every_sink_is_accepted_by_runs_and_jobs(name, given):
         JobOptions(sinks=3)
 
 
-def test_every_source_has_a_rule():
+def test_every_source_scheme_has_rule():
     """A scheme without a rule could not be allowed by the settings."""
     known = streams.OF_NETWORKS | streams.OF_FOLDERS | streams.OF_DEVICES | streams.OF_NOTHING
     assert set(SOURCES) == known
@@ -247,6 +247,6 @@ def test_every_source_has_a_rule():
 @pytest.mark.parametrize(
     "registry", [FIELDS, RENDERERS, LOSSES, OUTPUTS, DEPTHS, TOOL_MASKS, SINKS], ids=lambda each: each.what
 )
-def test_every_entry_can_be_imported(registry):
+def test_registry_entries_are_importable(registry):
     for name in registry:
         assert registry[name] is not None

@@ -51,7 +51,7 @@ ENTRIES = [
 
 
 @pytest.mark.parametrize(("module", "function"), ENTRIES)
-def test_every_process_begins_with_a_umask_of_its_own(monkeypatch, module, function):
+def test_service_programs_set_private_umask_first(monkeypatch, module, function):
     """Nothing else happens before: no argument is looked at."""
 
     class Begun(BaseException):
@@ -70,18 +70,18 @@ def test_every_process_begins_with_a_umask_of_its_own(monkeypatch, module, funct
         })  # fmt: skip
 
 
-def test_an_attempt_on_ray_begins_with_a_umask_of_its_own(monkeypatch, tmp_path, open_umask):
+def test_ray_attempt_sets_private_umask(monkeypatch, tmp_path, open_umask):
     masks = []
     monkeypatch.setattr(runners, "work", lambda task: masks.append(os.umask(0o022)))
     runners._attempt(asdict(Task("job", "recording", str(tmp_path))))
     assert masks == [0o077]
 
 
-def test_the_programs_are_found():
+def test_programs_lists_service_programs():
     assert {"launcher", "capture", "engine", "pool", "check", "files"} <= {path.stem for path in programs()}
 
 
-def test_a_process_and_what_it_starts_create_private_files(tmp_path, open_umask):
+def test_process_and_its_children_create_private_files(tmp_path, open_umask):
     program = (
         "import subprocess, sys, os\n"
         "from services.private_files import keep_files_private\n"
@@ -96,7 +96,7 @@ def test_a_process_and_what_it_starts_create_private_files(tmp_path, open_umask)
     assert open_to_others(tmp_path / "folder") == set()
 
 
-def test_state_of_an_earlier_version_is_closed(tmp_path, open_umask):
+def test_make_state_private_closes_existing_service_files(tmp_path, open_umask):
     data, elsewhere = tmp_path / "data", tmp_path / "elsewhere"
     for folder in (data, elsewhere):
         (folder / "replays" / "a" / "model").mkdir(parents=True)
@@ -113,13 +113,13 @@ def test_state_of_an_earlier_version_is_closed(tmp_path, open_umask):
     assert os.access(data / "registry" / "registry.sqlite", os.W_OK)
 
 
-def test_a_missing_folder_is_made_for_its_owner_alone(tmp_path, open_umask):
+def test_make_state_private_creates_private_folders(tmp_path, open_umask):
     assert make_state_private(tmp_path / "a" / "data", tmp_path / "b") == 0
     for folder in (tmp_path / "a" / "data", tmp_path / "b"):
         assert stat.S_IMODE(folder.stat().st_mode) == 0o700
 
 
-def test_an_open_folder_with_other_files_is_refused_and_stays_as_it_is(tmp_path, open_umask):
+def test_make_state_private_refuses_open_folder_with_foreign_files(tmp_path, open_umask):
     home = tmp_path / "home"
     home.mkdir()
     (home / "letter").write_text("x")
@@ -131,7 +131,7 @@ def test_an_open_folder_with_other_files_is_refused_and_stays_as_it_is(tmp_path,
     assert stat.S_IMODE((home / "letter").stat().st_mode) == 0o644
 
 
-def test_a_folder_of_another_user_is_refused(tmp_path, monkeypatch):
+def test_make_state_private_refuses_folder_of_other_user(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "geteuid", lambda: tmp_path.stat().st_uid + 4711)
     monkeypatch.setattr(os, "access", lambda *_: False)
     with pytest.raises(FolderNotPrivate, match="belongs to user"):
@@ -139,14 +139,14 @@ def test_a_folder_of_another_user_is_refused(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("kind", ["a file", "in a file"])
-def test_what_is_no_folder_is_refused(tmp_path, kind):
+def test_make_state_private_refuses_path_that_is_no_folder(tmp_path, kind):
     (tmp_path / "file").write_text("x")
     with pytest.raises(FolderNotPrivate, match="folder that its user owns"):
         make_state_private(tmp_path / "file" if kind == "a file" else tmp_path / "file" / "data")
 
 
 @pytest.mark.slow
-def test_every_folder_of_the_service_is_known():
+def test_kept_lists_all_entries_of_data_folder():
     """A name that the service gives below its data folder and that is not listed would keep its rights."""
     named = set()
     for path in SERVICES.rglob("*.py"):

@@ -33,7 +33,7 @@ def lines(path: Path) -> list[bytes]:
     return path.read_bytes().splitlines(keepends=True)
 
 
-def test_an_untouched_log_is_intact(path):
+def test_verify_finds_untouched_log_intact(path):
     verdict = verify(path)
     assert verdict.intact and not verdict.cut_by_a_crash and verdict.entries == ENTRIES
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
@@ -44,7 +44,7 @@ def test_an_untouched_log_is_intact(path):
 
 @pytest.mark.parametrize("line", [0, 5, ENTRIES - 1])
 @pytest.mark.parametrize("key", ["actor", "outcome", "subject", "at", "seq", "event", "role"])
-def test_a_changed_line_is_found(path, line, key):
+def test_verify_finds_changed_line(path, line, key):
     all_lines = lines(path)
     values = json.loads(all_lines[line])
     values[key] = {"outcome": "refused", "seq": 77}.get(key, "other")
@@ -54,7 +54,7 @@ def test_a_changed_line_is_found(path, line, key):
 
 
 @pytest.mark.parametrize("line", [0, 5, ENTRIES - 2])
-def test_a_changed_line_with_a_new_digest_is_found(path, line):
+def test_verify_finds_changed_line_with_recomputed_digest(path, line):
     all_lines = lines(path)
     entry, _ = parse_line(all_lines[line])
     all_lines[line] = replace(entry, actor="somebody else").line()
@@ -62,7 +62,7 @@ def test_a_changed_line_with_a_new_digest_is_found(path, line):
     assert any("does not follow" in finding.what for finding in verify(path).findings)
 
 
-def test_the_last_line_with_a_new_digest_is_found_by_the_head(path):
+def test_verify_finds_recomputed_last_line_by_head(path):
     all_lines = lines(path)
     entry, _ = parse_line(all_lines[-1])
     path.write_bytes(b"".join(all_lines[:-1]) + replace(entry, actor="somebody else").line())
@@ -70,7 +70,7 @@ def test_the_last_line_with_a_new_digest_is_found_by_the_head(path):
 
 
 @pytest.mark.parametrize("line", range(ENTRIES))
-def test_a_removed_line_is_found(path, line):
+def test_verify_finds_removed_line(path, line):
     all_lines = lines(path)
     del all_lines[line]
     path.write_bytes(b"".join(all_lines))
@@ -78,14 +78,14 @@ def test_a_removed_line_is_found(path, line):
 
 
 @pytest.mark.parametrize("count", [1, 3, ENTRIES])
-def test_lines_cut_off_the_end_are_found(path, count):
+def test_verify_counts_lines_cut_off_end(path, count):
     path.write_bytes(b"".join(lines(path)[:-count]))
     assert verify(path).findings[0].what == f"{count} entries were cut off the end"
 
 
 @pytest.mark.parametrize("place", [0, 4, ENTRIES])
 @pytest.mark.parametrize("kind", ["a copy", "forged", "no entry", "an empty line"])
-def test_an_inserted_line_is_found(path, place, kind):
+def test_verify_finds_inserted_line(path, place, kind):
     all_lines = lines(path)
     before, _ = parse_line(all_lines[max(0, place - 1)])
     forged = replace(before, seq=before.seq, previous=digest_of_entry(before)).line()
@@ -94,7 +94,7 @@ def test_an_inserted_line_is_found(path, place, kind):
     assert not verify(path).intact
 
 
-def test_entries_that_something_else_added_are_found(path):
+def test_verify_finds_entries_appended_by_other_program(path):
     with path.open("ab") as file:
         for _ in range(2):
             entry, _ = parse_line(lines(path)[-1])
@@ -103,14 +103,14 @@ def test_entries_that_something_else_added_are_found(path):
     assert "added by something else" in verify(path).findings[0].what
 
 
-def test_two_lines_in_another_order_are_found(path):
+def test_verify_finds_swapped_lines(path):
     all_lines = lines(path)
     all_lines[4], all_lines[5] = all_lines[5], all_lines[4]
     path.write_bytes(b"".join(all_lines))
     assert not verify(path).intact
 
 
-def test_a_line_that_a_crash_cut_is_told_apart_and_taken_off(path):
+def test_line_cut_by_crash_is_accepted_and_removed_on_open(path):
     whole = path.read_bytes()
     path.write_bytes(whole + b'{"actor":"console')
     verdict = verify(path)
@@ -121,14 +121,14 @@ def test_a_line_that_a_crash_cut_is_told_apart_and_taken_off(path):
     assert verify(path).intact and path.read_bytes().startswith(whole)
 
 
-def test_a_finished_line_that_was_cut_is_no_crash(path):
+def test_verify_does_not_take_cut_confirmed_line_for_crash(path):
     path.write_bytes(path.read_bytes()[:-20])
     verdict = verify(path)
     assert not verdict.intact and not verdict.cut_by_a_crash
     assert verdict.findings[0].what == "1 entries were cut off the end, the last one in the middle"
 
 
-def test_a_crash_between_the_line_and_its_head(path):
+def test_verify_accepts_crash_between_line_and_head(path):
     head = head_path(path).read_bytes()
     log = AuditLog(path)
     log.append("model.rollback", actor="console")
@@ -142,7 +142,7 @@ def test_a_crash_between_the_line_and_its_head(path):
 
 
 @pytest.mark.parametrize("entries", [1, 2, 3])
-def test_entries_after_the_head_are_those_of_a_crash_only_if_there_is_one(path, entries):
+def test_verify_accepts_at_most_one_entry_after_head(path, entries):
     head = head_path(path).read_bytes()
     log = AuditLog(path)
     for _ in range(entries):
@@ -156,7 +156,7 @@ def test_entries_after_the_head_are_those_of_a_crash_only_if_there_is_one(path, 
         assert findings[0].what.startswith(f"{entries} entries follow the newest one that the service confirmed")
 
 
-def test_entries_that_are_written_during_the_verification_are_no_finding(path, monkeypatch):
+def test_verify_accepts_entries_written_during_verification(path, monkeypatch):
     log = AuditLog(path)
 
     def read_anchor_late(of):
@@ -171,7 +171,7 @@ def test_entries_that_are_written_during_the_verification_are_no_finding(path, m
     assert verdict.intact and verdict.entries == ENTRIES + 3
 
 
-def test_findings_name_the_entry_and_how_many_are_missing(path):
+def test_verify_findings_name_line_and_missing_entries(path):
     all_lines = lines(path)
     path.write_bytes(b"".join([*all_lines[:3], *all_lines[6:], all_lines[4]]))
     findings = verify(path).findings
@@ -184,13 +184,13 @@ def test_findings_name_the_entry_and_how_many_are_missing(path):
 
 
 @pytest.mark.parametrize("count", [99, 100, 101])
-def test_findings_are_bounded(tmp_path, count):
+def test_verify_returns_at_most_100_findings(tmp_path, count):
     path = tmp_path / "audit.jsonl"
     path.write_bytes(count * b"{}\n")
     assert len(verify(path).findings) == min(count, 100)
 
 
-def test_an_empty_log_is_intact_without_a_head(tmp_path):
+def test_verify_accepts_empty_log_and_missing_first_head(tmp_path):
     path = tmp_path / "audit.jsonl"
     AuditLog(path).close()
     assert verify(path).intact and verify(path).head.seq == -1
@@ -205,14 +205,14 @@ def test_an_empty_log_is_intact_without_a_head(tmp_path):
     assert [each.what for each in verify(path).findings] == ["entry 0 is not the one that was written"]
 
 
-def test_a_lost_head_is_found(path):
+def test_verify_finds_missing_or_unreadable_head(path):
     head_path(path).unlink()
     assert "head file next to the log is missing" in verify(path).findings[0].what
     head_path(path).write_text("[]")
     assert "cannot be read" in verify(path).findings[0].what
 
 
-def test_a_broken_log_is_put_aside_and_the_service_goes_on(path):
+def test_broken_log_is_put_aside_on_open(path):
     path.write_bytes(b"".join(lines(path)[:-2]))
     log = AuditLog(path)
     entry = search(log.path, Wanted(), 1).entries[0]
@@ -223,14 +223,14 @@ def test_a_broken_log_is_put_aside_and_the_service_goes_on(path):
     assert verify(path).intact
 
 
-def test_one_writer_at_a_time(path):
+def test_second_audit_log_of_same_file_raises(path):
     log = AuditLog(path)
     with pytest.raises(AuditError, match="another process"):
         AuditLog(path)
     log.close()
 
 
-def test_many_threads_make_one_chain(tmp_path):
+def test_concurrent_appends_form_one_chain(tmp_path):
     log = AuditLog(tmp_path / "audit.jsonl")
     threads = [
         threading.Thread(target=lambda: [log.append("x", actor="a", subject=str(n)) for n in range(10)]) for _ in range(8)
@@ -243,7 +243,7 @@ def test_many_threads_make_one_chain(tmp_path):
     assert verify(log.path).intact and verify(log.path).entries == 80
 
 
-def test_a_full_disk_is_an_error_and_leaves_whole_lines(path, monkeypatch):
+def test_append_on_full_disk_raises_and_leaves_complete_lines(path, monkeypatch):
     log = AuditLog(path)
     whole = path.read_bytes()
     real = os.write
@@ -260,7 +260,7 @@ def test_a_full_disk_is_an_error_and_leaves_whole_lines(path, monkeypatch):
 @pytest.mark.parametrize(
     "values", [{"actor": "a\nb"}, {"subject": 'x"y'}, {"detail": {"a": "\x1b[0m"}}, {"subject": 500 * "a"}, {"event": "é"}]
 )  # fmt: skip
-def test_only_short_plain_texts_get_in(path, values):
+def test_append_rejects_long_or_non_plain_text(path, values):
     log = AuditLog(path)
     with pytest.raises(ValueError, match="audit"):
         log.append(**{"event": "x", "actor": "a", **values})
@@ -269,7 +269,7 @@ def test_only_short_plain_texts_get_in(path, values):
 
 
 @pytest.mark.slow
-def test_pages_are_read_from_the_end(tmp_path):
+def test_search_returns_newest_entries_first(tmp_path):
     log = AuditLog(tmp_path / "audit.jsonl")
     for number in range(400):
         log.append("x", actor="a", detail={"padding": 300 * "p", "number": number})
@@ -289,7 +289,7 @@ while True:
 """
 
 
-def test_kill_at_any_moment_loses_no_entry_that_was_confirmed(tmp_path):
+def test_killed_writer_loses_no_confirmed_audit_entry(tmp_path):
     path = tmp_path / "audit.jsonl"
     for round_ in range(5):
         process = subprocess.Popen([sys.executable, "-c", WRITER, str(path)], stdout=subprocess.PIPE, text=True)
@@ -304,7 +304,7 @@ def test_kill_at_any_moment_loses_no_entry_that_was_confirmed(tmp_path):
         assert verdict.head.seq >= int(confirmed[-1])
 
 
-def test_entries_are_what_their_line_says():
+def test_entry_round_trips_through_line():
     entry = Entry(
         0, "2026-01-01T00:00:00.000+00:00", "x", "a", "", "", "done", detail={"n": 1, "b": True, "s": "t", "z": None}
     )
@@ -312,7 +312,7 @@ def test_entries_are_what_their_line_says():
 
 
 @pytest.mark.parametrize("short_by", [0, 1])
-def test_the_longest_entry_is_written_and_a_longer_one_is_not(tmp_path, monkeypatch, short_by):
+def test_append_rejects_entry_longer_than_line_limit(tmp_path, monkeypatch, short_by):
     audit = AuditLog(tmp_path / "audit.jsonl")
     audit.append("key.create", actor="a", subject="first")
     length = len((tmp_path / "audit.jsonl").read_bytes())

@@ -82,7 +82,7 @@ def reopened(path: Path, keeping: Keeping) -> AuditLog:
     [(errno.ENOSPC, 1), (errno.EIO, 2), (errno.EDQUOT, 1000)],
     ids=["once", "twice", "from then on"],
 )
-def test_an_error_at_any_step_is_refused_and_leaves_a_log_that_fits(tmp_path, wire, keeping, number, times):
+def test_disk_error_at_any_call_of_append_leaves_intact_log(tmp_path, wire, keeping, number, times):
     for step in range(100):
         path = tmp_path / str(step) / "audit.jsonl"
         log = AuditLog(path, keeping)
@@ -121,7 +121,7 @@ def test_an_error_at_any_step_is_refused_and_leaves_a_log_that_fits(tmp_path, wi
 @pytest.mark.slow
 @pytest.mark.parametrize("keeping", [ONE_FILE, MANY_FILES], ids=["one file", "many files"])
 @pytest.mark.parametrize("after", [False, True], ids=["before the call", "after the call"])
-def test_a_kill_at_any_step_loses_no_entry_that_was_confirmed(tmp_path, wire, keeping, after):
+def test_kill_at_any_disk_call_loses_no_confirmed_audit_entry(tmp_path, wire, keeping, after):
     for step in range(200):
         path = tmp_path / str(step) / "audit.jsonl"
         confirmed = -1
@@ -151,7 +151,7 @@ def test_a_kill_at_any_step_loses_no_entry_that_was_confirmed(tmp_path, wire, ke
 
 @pytest.mark.parametrize("keeping", [ONE_FILE, MANY_FILES], ids=["one file", "many files"])
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EIO, errno.EDQUOT])
-def test_an_error_while_the_log_is_opened_is_a_sentence(tmp_path, wire, keeping, number):
+def test_disk_error_on_opening_audit_log_raises_audit_unwritable(tmp_path, wire, keeping, number):
     path = tmp_path / "audit.jsonl"
     AuditLog(path, keeping).close()
     log = AuditLog(path, keeping)
@@ -173,7 +173,7 @@ def test_an_error_while_the_log_is_opened_is_a_sentence(tmp_path, wire, keeping,
     assert step > 3
 
 
-def test_a_valid_chain_that_is_ahead_of_its_head_is_taken_over(tmp_path):
+def test_valid_entries_after_head_are_recovered_on_open(tmp_path):
     for keeping in (ONE_FILE, replace(MANY_FILES, segments=None)):
         path = tmp_path / str(keeping.segment_bytes) / "audit.jsonl"
         log = AuditLog(path, keeping)
@@ -194,7 +194,7 @@ def test_a_valid_chain_that_is_ahead_of_its_head_is_taken_over(tmp_path):
 
 @pytest.mark.parametrize("which", ["the first", "one in the middle", "the last"])
 @pytest.mark.parametrize("change", ["changed", "changed with a new digest", "removed"])
-def test_a_chain_that_is_ahead_and_does_not_fit_is_put_aside(tmp_path, which, change):
+def test_inconsistent_entries_after_head_are_put_aside_on_open(tmp_path, which, change):
     path = tmp_path / "audit.jsonl"
     log = AuditLog(path)
     log.append("model.activate", actor="x", subject="a")

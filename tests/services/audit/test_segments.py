@@ -35,7 +35,7 @@ def path(tmp_path) -> Path:
     return written(tmp_path / "audit.jsonl").path
 
 
-def test_the_chain_goes_on_over_files(path):
+def test_chain_continues_over_segments(path):
     closed = closed_segments(path)
     assert len(closed) > 3 and closed[0].first_seq == 0
     assert all(each.path.stat().st_mode & 0o777 == 0o600 for each in closed)
@@ -51,19 +51,19 @@ def test_the_chain_goes_on_over_files(path):
 
 
 @pytest.mark.parametrize("which", [0, 1, -1])
-def test_a_segment_that_is_missing_is_found(path, which):
+def test_verify_finds_missing_segment(path, which):
     closed_segments(path)[which].path.unlink()
     assert any("are missing before entry" in finding.what for finding in verify(path).findings)
 
 
 @pytest.mark.parametrize("which", [0, 1, -1])
-def test_a_segment_that_was_changed_is_found_with_its_name(path, which):
+def test_verify_names_changed_segment(path, which):
     segment = closed_segments(path)[which].path
     segment.write_bytes(segment.read_bytes().replace(b"console", b"nobody", 1))
     assert verify(path).findings[0].file == segment.name
 
 
-def test_a_segment_that_was_cut_or_swapped_is_found(path):
+def test_verify_finds_cut_or_swapped_segments(path):
     one, two = (each.path for each in closed_segments(path)[:2])
     whole = one.read_bytes()
     one.write_bytes(whole[:-5])
@@ -74,7 +74,7 @@ def test_a_segment_that_was_cut_or_swapped_is_found(path):
 
 
 @pytest.mark.slow
-def test_old_segments_go_and_an_anchor_is_kept(tmp_path):
+def test_segments_over_limit_are_removed_and_anchor_is_kept(tmp_path):
     log = written(tmp_path / "audit.jsonl", replace(SMALL, segments=2), 60)
     closed, anchor = closed_segments(log.path), read_anchor(log.path)
     assert len(closed) == 2 and anchor is not None and anchor.seq == closed[0].first_seq - 1
@@ -85,7 +85,7 @@ def test_old_segments_go_and_an_anchor_is_kept(tmp_path):
     assert not list(tmp_path.glob("*.000000000000.jsonl"))
 
 
-def test_segments_go_by_their_age(tmp_path, monkeypatch):
+def test_segments_are_removed_by_age(tmp_path, monkeypatch):
     log = written(tmp_path / "audit.jsonl")
     keeping = replace(SMALL, days=1)
     AuditLog(log.path, keeping).close()
@@ -101,7 +101,7 @@ def test_segments_go_by_their_age(tmp_path, monkeypatch):
     assert closed_segments(log.path) == [] and verify(log.path).intact
 
 
-def test_whoever_removes_segments_and_moves_the_anchor_is_found(path):
+def test_verify_finds_removed_segment_with_moved_anchor(path):
     first = closed_segments(path)[0]
     entry, digest = first.last()
     write_anchor(path, type(read_anchor(path) or verify(path).head)(entry.seq, digest))
@@ -109,19 +109,19 @@ def test_whoever_removes_segments_and_moves_the_anchor_is_found(path):
     assert "no entry says that the service removed them" in verify(path).findings[0].what
 
 
-def test_an_anchor_that_is_none_is_found(path):
+def test_verify_finds_unreadable_anchor(path):
     anchor_path(path).write_text("[]")
     assert "cannot be read" in verify(path).findings[0].what
 
 
-def test_a_lost_anchor_is_found(tmp_path):
+def test_verify_finds_missing_anchor(tmp_path):
     log = written(tmp_path / "audit.jsonl", replace(SMALL, segments=1))
     anchor_path(log.path).unlink()
     assert "are missing before entry" in verify(log.path).findings[0].what
 
 
 @pytest.mark.parametrize("left", ["no file", "an empty file", "a cut line"])
-def test_a_crash_while_a_segment_is_closed(path, left):
+def test_log_is_intact_after_crash_while_closing_segment(path, left):
     log = AuditLog(path, SMALL)
     first = parse_line(path.read_bytes().splitlines(keepends=True)[0])[0].seq
     log.close()
@@ -136,7 +136,7 @@ def test_a_crash_while_a_segment_is_closed(path, left):
 
 
 @pytest.mark.parametrize("step", ["write_anchor", "unlink"])
-def test_a_crash_while_segments_are_removed(path, step, monkeypatch):
+def test_log_is_intact_after_crash_while_removing_segments(path, step, monkeypatch):
     class Killed(BaseException):
         pass
 
@@ -153,7 +153,7 @@ def test_a_crash_while_segments_are_removed(path, step, monkeypatch):
     assert len(list(path.parent.glob("audit.0*"))) == 1
 
 
-def test_a_broken_log_is_put_aside_with_its_segments(path):
+def test_broken_log_is_put_aside_with_its_segments(path):
     path.write_bytes(b"")
     log = AuditLog(path, SMALL)
     entry = search(log.path, Wanted(), 1).entries[0]
@@ -175,7 +175,7 @@ while True:
 
 
 @pytest.mark.slow
-def test_kill_at_any_moment_leaves_a_log_that_fits(tmp_path):
+def test_killed_writer_leaves_intact_segmented_log(tmp_path):
     path = tmp_path / "audit.jsonl"
     for round_ in range(6):
         process = subprocess.Popen([sys.executable, "-c", WRITER, str(path)], stdout=subprocess.PIPE, text=True)
@@ -191,7 +191,7 @@ def test_kill_at_any_moment_leaves_a_log_that_fits(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_file_that_is_replaced_after_it_was_opened_is_read_to_its_end(tmp_path, monkeypatch):
+def test_lines_backwards_reads_file_replaced_after_open(tmp_path, monkeypatch):
     log = tmp_path / "audit.jsonl"
     log.write_bytes(b"first line\nsecond line\nunfinished")
     opened = audit_log.open_regular
@@ -206,7 +206,7 @@ def test_a_file_that_is_replaced_after_it_was_opened_is_read_to_its_end(tmp_path
     assert list(audit_log.lines_backwards(log)) == [b"second line", b"first line"]
 
 
-def test_a_log_is_read_and_verified_while_it_is_written(tmp_path):
+def test_search_returns_consecutive_entries_during_writes(tmp_path):
     log = AuditLog(tmp_path / "audit.jsonl", Keeping(segment_bytes=600, segments=3))
     ended = threading.Event()
 

@@ -34,7 +34,7 @@ def endpoint(runtime):
     server.close()
 
 
-def test_a_command_returns_the_answer_of_its_handler(endpoint):
+def test_ask_returns_result_of_command_handler(endpoint):
     assert ask(endpoint, "echo", x=1, y="z") == {"x": 1, "y": "z"}
     assert ask(endpoint, "silent") == {}
     assert asyncio.run(ask_async(endpoint, "echo", x=2)) == {"x": 2}
@@ -44,7 +44,7 @@ def test_a_command_returns_the_answer_of_its_handler(endpoint):
     ("command", "why"),
     [("refuse", "it must be 8"), ("fail", "RuntimeError: oh"), ("nan", "JSON"), ("what", "echo, silent")],
 )
-def test_refusals_say_why_and_the_server_goes_on(endpoint, command, why):
+def test_command_refused_states_reason_and_server_continues(endpoint, command, why):
     with pytest.raises(CommandRefused, match=why):
         ask(endpoint, command)
     with pytest.raises(CommandRefused, match=why):
@@ -52,7 +52,7 @@ def test_refusals_say_why_and_the_server_goes_on(endpoint, command, why):
     assert ask(endpoint, "silent") == {}
 
 
-def test_nobody_is_waited_for_without_end(runtime):
+def test_ask_raises_no_answer_after_timeout(runtime):
     nobody = runtime.stream("a").commands("capture")
     with pytest.raises(NoAnswer, match=r"'echo' within 0\.05 s"):
         ask(nobody, "echo", timeout_s=0.05)
@@ -61,14 +61,14 @@ def test_nobody_is_waited_for_without_end(runtime):
 
 
 @pytest.mark.parametrize("data", [b"", b"nonsense", b"[]", b'{"command": 3}', b'{"command": ["echo"]}', b"\x80\x04."])
-def test_nonsense_is_refused(endpoint, data):
+def test_command_server_refuses_malformed_requests(endpoint, data):
     with zmq.Context() as context, context.socket(zmq.REQ) as socket:
         socket.connect(endpoint)
         socket.send(data)
         assert json.loads(socket.recv())["ok"] is False
 
 
-def test_a_giant_is_not_read(endpoint):
+def test_oversized_commands_are_not_sent_or_read(endpoint):
     with pytest.raises(BadMessage):
         ask(endpoint, "echo", x="y" * MOST_BYTES)
     with zmq.Context() as context, context.socket(zmq.REQ) as socket:
@@ -79,7 +79,7 @@ def test_a_giant_is_not_read(endpoint):
     assert ask(endpoint, "silent") == {}
 
 
-def test_arguments_are_texts():
+def test_text_of_raises_unless_non_empty_text():
     assert text_of({"folder": "x"}, "folder") == "x"
     for wrong in ({}, {"folder": 3}, {"folder": ""}):
         with pytest.raises(BadMessage, match="folder"):

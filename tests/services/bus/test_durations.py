@@ -5,7 +5,7 @@ import pytest
 from services.bus.messages import BOUNDS_S, Durations, cumulative
 
 
-def test_durations_are_counted_by_bucket():
+def test_durations_count_values_by_bucket():
     durations = Durations()
     for value in (0.0, 0.001, 0.0011, 0.0333, 0.0334, 7.0):
         durations.add(value)
@@ -31,5 +31,5 @@ def test_durations_are_counted_by_bucket():
     ],
     ids=repr,
 )
-def test_malformed_durations_give_no_buckets(sent):
+def test_cumulative_returns_none_for_malformed_durations(sent):
     assert cumulative(sent) is None

@@ -7,7 +7,7 @@ import zmq
 from services.bus.messages import Heartbeats, subscribe
 
 
-def test_changes_and_the_last_state_are_heard(runtime):
+def test_heartbeats_send_first_changed_and_last_state(runtime):
     endpoint = runtime.stream("a").status("capture")
     said = {"state": "starting"}
     with zmq.Context() as context, subscribe(context.socket(zmq.SUB), endpoint, waiting=100) as socket:

@@ -9,13 +9,13 @@ from services.bus.messages import MOST_BYTES, MOST_NESTING, packed_json, parsed_
 from services.errors import BadMessage
 
 
-def test_round_trip():
+def test_json_message_round_trip():
     content = {"state": "live", "counts": {"frames": 3}, "nothing": None}
     assert parsed_json(packed_json(content)) == content
 
 
 @pytest.mark.parametrize("content", [{"x": math.nan}, {"x": math.inf}, {"x": object()}, {"x": "y" * MOST_BYTES}])
-def test_what_cannot_be_sent(content):
+def test_packed_json_raises_for_unsendable_content(content):
     with pytest.raises(BadMessage):
         packed_json(content)
 
@@ -37,13 +37,13 @@ def test_what_cannot_be_sent(content):
     ],
     ids=lambda data: repr(data[:12]),
 )
-def test_what_is_not_read(data):
+def test_parsed_json_raises_for_malformed_data(data):
     with pytest.raises(BadMessage):
         parsed_json(data)
 
 
 @pytest.mark.parametrize("pair", [(b'{"x":', b"}"), (b"[", b"]")], ids=["objects", "lists"])
-def test_nesting_is_limited_in_every_version_of_python(pair):
+def test_parsed_json_limits_nesting_depth(pair):
     def nested(depth):
         return b'{"y":0,"x":' + pair[0] * (depth - 1) + b"1" + pair[1] * (depth - 1) + b"}"
 

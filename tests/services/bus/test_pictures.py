@@ -54,7 +54,7 @@ def connected(publisher: PicturePublisher, *sockets: zmq.Socket) -> None:
             socket.recv_multipart()
 
 
-def test_a_shown_picture_arrives_as_it_was(runtime, context):
+def test_picture_and_frame_arrive_unchanged(runtime, context):
     endpoint = runtime.stream("a").pictures("engine")
     publisher = PicturePublisher(endpoint, context)
     with subscribe(context.socket(zmq.SUB), endpoint) as socket:
@@ -72,7 +72,7 @@ def test_a_shown_picture_arrives_as_it_was(runtime, context):
     publisher.close()
 
 
-def test_a_reader_that_was_there_before_the_sender_hears_it(runtime, context):
+def test_subscriber_receives_from_later_publishers(runtime, context):
     endpoint = runtime.stream("a").pictures("engine")
     with subscribe(context.socket(zmq.SUB), endpoint) as socket:
         for value in (1, 2):  # the second one after the first has gone
@@ -94,7 +94,7 @@ while True:
 """
 
 
-def test_a_stopped_reader_slows_nobody(runtime, context):
+def test_stopped_reader_does_not_slow_other_reader(runtime, context):
     endpoint = runtime.stream("a").pictures("engine")
     publisher = PicturePublisher(endpoint, context)
     process = subprocess.Popen([sys.executable, "-c", READER, endpoint], stdout=subprocess.PIPE, text=True)
@@ -122,7 +122,7 @@ def select_line(process: subprocess.Popen) -> bool:
     return bool(select.select([process.stdout], [], [], 0.01)[0])
 
 
-def test_a_slow_reader_gets_few_of_many(runtime, context):
+def test_slow_reader_queues_few_pictures(runtime, context):
     endpoint = runtime.stream("a").pictures("engine")
     publisher = PicturePublisher(endpoint, context)
     with subscribe(context.socket(zmq.SUB), endpoint) as socket:
@@ -166,13 +166,13 @@ FRAME = [bytes(piece) for piece in encode(Frame(0, 0, np.zeros((2, 2, 3), np.uin
     ],
     ids=lambda parts: repr(parts[0][:40]),
 )
-def test_what_is_no_picture(parts):
+def test_picture_from_raises_for_malformed_message(parts):
     with pytest.raises(BadMessage):
         picture_from([zmq.Frame(part) for part in parts])
 
 
 @pytest.mark.parametrize(("more", "is_read"), [(0, True), (1, False)])
-def test_messages_and_headers_of_the_largest_size_are_sent_and_read(more, is_read):
+def test_messages_and_headers_are_limited_to_most_bytes(more, is_read):
     """One byte more is refused by the sender and by the reader."""
     text = {"text": "x" * (MOST_BYTES - len(packed_json({"text": ""})) + more)}
     data = b'{"text":"' + b"x" * (MOST_BYTES - len(b'{"text":""}') + more) + b'"}'
@@ -190,7 +190,7 @@ def test_messages_and_headers_of_the_largest_size_are_sent_and_read(more, is_rea
 
 
 @pytest.mark.parametrize(("count", "is_read"), [(1, False), (2, True), (MAX_PARTS, True), (MAX_PARTS + 1, False)])
-def test_a_picture_has_a_header_and_some_parts(count, is_read):
+def test_split_accepts_2_to_max_parts(count, is_read):
     parts = [zmq.Frame(b"{}"), *(zmq.Frame(b"x") for _ in range(count - 1))]
     if is_read:
         header, pixels = split(parts)

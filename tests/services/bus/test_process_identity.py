@@ -11,13 +11,13 @@ from services.bus.runtime import ProcessIdentity
 SLEEP = [sys.executable, "-c", "import time; time.sleep(60)"]
 
 
-def test_a_process_is_known_by_its_number_and_its_start():
+def test_process_identity_compares_pid_and_start_time():
     me = ProcessIdentity.of(os.getpid())
     assert me is not None and me.is_alive
     assert not ProcessIdentity(me.pid, "another boot 1").is_alive
 
 
-def test_a_process_that_nobody_has_waited_for_is_dead():
+def test_zombie_process_is_not_alive():
     process = subprocess.Popen(SLEEP)
     identity = ProcessIdentity.of(process.pid)
     assert identity is not None and identity.is_alive
@@ -29,14 +29,14 @@ def test_a_process_that_nobody_has_waited_for_is_dead():
     assert ProcessIdentity.of(process.pid) is None
 
 
-def test_no_other_process_is_signalled():
+def test_signal_is_not_sent_to_other_process_with_same_pid():
     with subprocess.Popen(SLEEP) as process:
         assert not ProcessIdentity(process.pid, "another boot 1").signal(signal.SIGKILL)
         assert process.poll() is None
         process.kill()
 
 
-def test_the_end_is_waited_for():
+def test_ended_waits_for_end_of_process():
     async def run() -> None:
         process = subprocess.Popen(SLEEP)
         identity = ProcessIdentity.of(process.pid)

@@ -17,7 +17,7 @@ def mode(path: Path) -> int:
     return stat.S_IMODE(path.stat().st_mode)
 
 
-def test_folders_are_for_their_owner_alone(runtime):
+def test_runtime_folders_and_files_are_private(runtime):
     path = runtime.path / "inside"
     stream = RuntimeFolder(path).stream("room-1")
     assert (mode(path), mode(stream.path)) == (0o700, 0o700)
@@ -26,27 +26,27 @@ def test_folders_are_for_their_owner_alone(runtime):
     assert RuntimeFolder(path).streams() == ["room-1"]
 
 
-def test_a_folder_that_others_may_look_into_is_refused(runtime):
+def test_runtime_folder_open_to_others_is_refused(runtime):
     runtime.path.chmod(0o750)
     with pytest.raises(RuntimeFolderUnusable, match=r"0750.*chmod 700"):
         RuntimeFolder(runtime.path)
 
 
-def test_a_link_to_a_folder_is_refused(runtime):
+def test_runtime_folder_refuses_symbolic_link(runtime):
     (runtime.path / "real").mkdir(mode=0o700)
     (runtime.path / "link").symlink_to(runtime.path / "real")
     with pytest.raises(RuntimeFolderUnusable, match="no folder"):
         RuntimeFolder(runtime.path / "link")
 
 
-def test_a_file_in_its_place_is_refused(runtime):
+def test_runtime_folder_refuses_file_at_its_path(runtime):
     (runtime.path / "file").touch()
     with pytest.raises(RuntimeFolderUnusable, match="cannot be made"):
         RuntimeFolder(runtime.path / "file")
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a folder away")
-def test_somebody_elses_folder_is_refused(runtime):
+def test_runtime_folder_of_other_user_is_refused(runtime):
     other = runtime.path / "other"
     other.mkdir(mode=0o700)
     os.chown(other, 12345, -1)
@@ -54,12 +54,12 @@ def test_somebody_elses_folder_is_refused(runtime):
         RuntimeFolder(other)
 
 
-def test_a_path_too_long_for_a_socket_is_refused(runtime):
+def test_stream_path_too_long_for_socket_is_refused(runtime):
     with pytest.raises(RuntimeFolderUnusable, match="bytes"):
         runtime.stream("x" * 80)
 
 
-def test_the_record_of_a_running_process_is_kept(runtime):
+def test_record_of_running_process_is_returned(runtime):
     stream = runtime.stream("a")
     stream.write_record("engine", "abc")
     record = stream.record("engine")
@@ -67,7 +67,7 @@ def test_the_record_of_a_running_process_is_kept(runtime):
     assert (record.identity.pid, record.spec_digest) == (os.getpid(), "abc")
 
 
-def test_what_a_dead_process_left_is_removed_though_another_has_its_number(runtime):
+def test_leftovers_of_dead_process_are_removed_despite_reused_pid(runtime):
     stream = runtime.stream("a")
     now = ProcessIdentity.of(os.getpid())
     assert now is not None
@@ -81,7 +81,7 @@ def test_what_a_dead_process_left_is_removed_though_another_has_its_number(runti
     assert [path.name for path in stream.path.iterdir()] == ["engine.log"]
 
 
-def test_one_process_serves_a_part(runtime):
+def test_role_lock_is_held_by_one_process(runtime):
     stream = runtime.stream("a")
     held = stream.lock("capture")
     program = (
@@ -95,7 +95,7 @@ def test_one_process_serves_a_part(runtime):
     assert subprocess.run(command).returncode == 0
 
 
-def test_nothing_is_left_of_a_stream_that_is_removed(runtime):
+def test_remove_deletes_all_files_of_stream(runtime):
     stream = runtime.stream("a")
     os.close(stream.lock("capture"))
     stream.write_record("capture", "")

@@ -19,7 +19,7 @@ def becomes(publisher: WatchedPublisher, watched: bool) -> None:
         wait_for_readers([publisher], 0.05)
 
 
-def test_it_hears_of_the_first_reader_and_of_the_last_one_that_leaves(runtime):
+def test_publisher_is_watched_from_first_to_last_reader(runtime):
     endpoint = runtime.stream("a").endpoint("depth")
     with zmq.Context() as context:
         publisher = WatchedPublisher(endpoint, context)
@@ -36,7 +36,7 @@ def test_it_hears_of_the_first_reader_and_of_the_last_one_that_leaves(runtime):
         publisher.close()
 
 
-def test_a_reader_that_waits_is_heard_as_soon_as_there_is_a_publisher(runtime):
+def test_publisher_is_watched_by_reader_that_subscribed_before(runtime):
     endpoint = runtime.stream("a").endpoint("orbit")
     with zmq.Context() as context, subscribe(context.socket(zmq.SUB), endpoint):
         publisher = WatchedPublisher(endpoint, context)

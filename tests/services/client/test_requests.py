@@ -54,7 +54,7 @@ def digest_of(content: bytes) -> str:
 @pytest.mark.parametrize(
     "url", ["http://a", "https://a:8000", "http://[::1]:80", "https://a.example/base", "http://127.0.0.1:65535"]
 )
-def test_addresses_of_servers(url: str) -> None:
+def test_checked_url_accepts_server_urls(url: str) -> None:
     assert checked_url(url) == checked_url(url + "/") == checked_url(url + "//") == url
 
 
@@ -63,12 +63,12 @@ def test_addresses_of_servers(url: str) -> None:
     ["", "a:8000", "ftp://a", "http://", "http://a:0", "http://a:65536", "http://a?b=c", "http://a#b", "http://a b",
      "http://[::1", "http://a\n", "http://a:x", "http:///path"],
 )  # fmt: skip
-def test_other_texts_are_no_addresses(url: str) -> None:
+def test_checked_url_rejects_other_texts(url: str) -> None:
     with pytest.raises(ClientError, match="is no address of a server"):
         checked_url(url)
 
 
-def test_a_key_is_one_line_of_bounded_length() -> None:
+def test_checked_key_accepts_one_line_of_limited_length() -> None:
     longest = "k" * MOST_KEY_CHARACTERS
     assert checked_key(f"  {longest}\n") == longest
     for wrong in (longest + "k", "a b", "ä", "a\nb", "a\x00"):
@@ -79,7 +79,7 @@ def test_a_key_is_one_line_of_bounded_length() -> None:
             checked_key(empty)
 
 
-def test_json_or_nothing_is_returned_and_the_key_is_sent() -> None:
+def test_request_sends_key_and_returns_json_or_none() -> None:
     client = Client(httpx2.Response(200, json={"a": 1}))
     assert client._ask("GET", "/v1/x") == {"a": 1}
     assert client.asked[0].headers["authorization"] == "Bearer key"
@@ -89,7 +89,7 @@ def test_json_or_nothing_is_returned_and_the_key_is_sent() -> None:
         Client(httpx2.Response(200, content=b"<html>"))._ask("GET", "/")
 
 
-def test_an_answer_has_a_bounded_length_and_time(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_client_limits_length_and_time_of_response(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(requests, "MOST_ANSWER_BYTES", 10)
     assert Client(httpx2.Response(200, content=b"1" * 10))._ask("GET", "/") == 1111111111
     with pytest.raises(ClientError, match="has more than"):
@@ -115,7 +115,7 @@ def test_an_answer_has_a_bounded_length_and_time(monkeypatch: pytest.MonkeyPatch
         (httpx2.Response(301, headers={"location": "/x"}), 301, "is no problem document"),
     ],
 )
-def test_refusals_have_their_status_and_sentence(
+def test_refused_has_status_and_detail_of_response(
     answer: httpx2.Response, status: int, sentence: str, tmp_path: Path
 ) -> None:
     content, headers = answer.read(), answer.headers
@@ -129,7 +129,7 @@ def test_refusals_have_their_status_and_sentence(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_server_that_does_not_answer_is_unreachable(tmp_path: Path) -> None:
+def test_connection_error_raises_unreachable(tmp_path: Path) -> None:
     for ask in (
         lambda client: client._ask("GET", "/"),
         lambda client: client._get_file("/", tmp_path / "file"),
@@ -138,7 +138,7 @@ def test_a_server_that_does_not_answer_is_unreachable(tmp_path: Path) -> None:
             ask(Client(httpx2.ConnectError("refused by the machine")))
 
 
-def test_a_file_is_sent_with_its_digest_and_length(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_put_file_sends_digest_and_length(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(requests, "CHUNK_BYTES", 4)
     (tmp_path / "file").write_bytes(b"0123456789")
     client = Client(httpx2.Response(201, json={}))
@@ -153,7 +153,7 @@ def test_a_file_is_sent_with_its_digest_and_length(tmp_path: Path, monkeypatch: 
 
 
 @pytest.mark.parametrize(("size", "changed"), [(9, True), (10, False), (11, True)])
-def test_a_file_that_changes_while_it_is_sent_is_noticed(size: int, changed: bool) -> None:
+def test_upload_raises_if_file_changes_size(size: int, changed: bool) -> None:
     pieces = requests._pieces(io.BytesIO(b"0123456789"), size, Path("file"))
     if changed:
         with pytest.raises(ClientError, match="changed while it was sent"):
@@ -175,7 +175,7 @@ def test_a_file_that_changes_while_it_is_sent_is_noticed(size: int, changed: boo
         ({}, "neither the length nor the digest"),
     ],
 )
-def test_a_fetched_file_is_as_the_server_announced_it(headers: dict[str, str], why: str | None) -> None:
+def test_download_is_checked_by_announced_length_and_digest(headers: dict[str, str], why: str | None) -> None:
     answer = httpx2.Response(200, headers=headers)
     if why is None:
         requests._check_whole(answer, hashlib.sha256(b"whole").digest(), 5, "file")
@@ -184,7 +184,7 @@ def test_a_fetched_file_is_as_the_server_announced_it(headers: dict[str, str], w
             requests._check_whole(answer, hashlib.sha256(b"whole").digest(), 5, "file")
 
 
-def test_a_fetched_file_replaces_another_only_when_asked(tmp_path: Path) -> None:
+def test_download_overwrites_file_only_on_request(tmp_path: Path) -> None:
     file = tmp_path / "file"
 
     def get(content: bytes, **options: bool) -> int:
@@ -199,13 +199,13 @@ def test_a_fetched_file_replaces_another_only_when_asked(tmp_path: Path) -> None
         Client(httpx2.Response(200, content=b"x"))._get_file("/", tmp_path / "none" / "file")
 
 
-def test_a_refusal_is_read_up_to_a_bound() -> None:
+def test_error_body_is_read_up_to_limit() -> None:
     exact = httpx2.Response(400, content=b"x" * MOST_PROBLEM_BYTES)
     assert len(requests._read_some(exact)) == MOST_PROBLEM_BYTES
     assert len(requests._read_some(httpx2.Response(400, content=b"x" * (3 * MOST_PROBLEM_BYTES)))) == MOST_PROBLEM_BYTES
 
 
-def test_waiting_asks_less_and_less_often_and_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_waited_for_polls_with_growing_interval_until_timeout(monkeypatch: pytest.MonkeyPatch) -> None:
     now_s, waits = [0.0], []
 
     def sleep(seconds: float) -> None:
@@ -227,13 +227,13 @@ def test_waiting_asks_less_and_less_often_and_ends(monkeypatch: pytest.MonkeyPat
     assert waits == [0.1], "the moment itself is still in time"
 
 
-def test_a_picture_is_a_header_and_the_rest() -> None:
+def test_picture_of_splits_header_and_jpeg() -> None:
     header = b'{"sequence": 7}'
     picture = picture_of(struct.pack(">I", len(header)) + header + b"\xff\xd8jpeg")
     assert picture.header == {"sequence": 7} and picture.jpeg == b"\xff\xd8jpeg"
 
 
-def test_a_certificate_is_checked_unless_it_is_said_otherwise(tmp_path: Path) -> None:
+def test_tls_context_verifies_certificate_unless_disabled(tmp_path: Path) -> None:
     checked, unchecked = tls_context(True), tls_context(False)
     assert checked.verify_mode == ssl.CERT_REQUIRED and checked.check_hostname
     assert unchecked.verify_mode == ssl.CERT_NONE and not unchecked.check_hostname

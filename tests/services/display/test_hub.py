@@ -47,7 +47,7 @@ def run(scenario) -> None:
     asyncio.run(within())
 
 
-def test_viewers_get_the_same_picture_encoded_once(runtime):
+def test_hub_encodes_picture_once_for_all_viewers(runtime):
     async def scenario() -> None:
         async with published(runtime) as (hub, _), hub.subscribe("shown") as one, hub.subscribe("shown") as other:
             seen = [(await anext(one), await anext(other))]
@@ -64,7 +64,7 @@ def test_viewers_get_the_same_picture_encoded_once(runtime):
     run(scenario)
 
 
-def test_each_quality_is_encoded_for_those_who_want_it(runtime):
+def test_hub_encodes_each_requested_quality(runtime):
     async def scenario() -> None:
         async with (
             published(runtime) as (hub, _),
@@ -76,7 +76,7 @@ def test_each_quality_is_encoded_for_those_who_want_it(runtime):
     run(scenario)
 
 
-def test_nothing_is_encoded_without_viewers(runtime):
+def test_hub_encodes_nothing_without_viewers(runtime):
     async def scenario() -> None:
         async with published(runtime) as (hub, _):
             async with hub.subscribe("shown") as viewer:
@@ -91,7 +91,7 @@ def test_nothing_is_encoded_without_viewers(runtime):
     run(scenario)
 
 
-def test_a_viewer_who_takes_nothing_misses_pictures_and_nobody_else_does(runtime):
+def test_slow_viewer_misses_pictures_and_other_viewer_does_not(runtime):
     async def scenario() -> None:
         async with published(runtime) as (hub, _), hub.subscribe("shown") as slow, hub.subscribe("shown") as quick:
             last = -1
@@ -106,7 +106,7 @@ def test_a_viewer_who_takes_nothing_misses_pictures_and_nobody_else_does(runtime
     run(scenario)
 
 
-def test_a_dead_viewer_is_dropped(runtime, monkeypatch):
+def test_hub_drops_dead_viewer(runtime, monkeypatch):
     monkeypatch.setattr("services.display.DEAD_S", 0.1)
 
     async def scenario() -> None:
@@ -121,7 +121,7 @@ def test_a_dead_viewer_is_dropped(runtime, monkeypatch):
     run(scenario)
 
 
-def test_a_picture_whose_process_has_died_is_not_shown_as_live(runtime, monkeypatch):
+def test_hub_repeats_last_picture_as_frozen_if_process_died(runtime, monkeypatch):
     monkeypatch.setattr(hubs, "REPEAT_S", 0.05)
 
     async def scenario() -> None:
@@ -142,7 +142,7 @@ def test_a_picture_whose_process_has_died_is_not_shown_as_live(runtime, monkeypa
     run(scenario)
 
 
-def test_closing_ends_every_viewer(runtime):
+def test_hub_close_ends_waiting_viewer(runtime):
     async def scenario() -> None:
         async with published(runtime) as (hub, _):
             viewers = [hub.subscribe("raw"), hub.subscribe("shown")]
@@ -154,7 +154,7 @@ def test_closing_ends_every_viewer(runtime):
     run(scenario)
 
 
-def test_a_quality_out_of_range_is_refused(runtime):
+def test_subscribe_rejects_quality_out_of_range(runtime):
     async def scenario() -> None:
         hub = DisplayHub(runtime.stream("a"))
         with pytest.raises(InvalidSetting):

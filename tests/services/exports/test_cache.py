@@ -39,13 +39,13 @@ def content(cache, digest: str, name: str = "good", wish: ExportWish = PLY) -> b
     return data
 
 
-def test_an_export_is_made_once(cache):
+def test_export_is_made_once_and_cached(cache):
     first = content(cache, "a")
     assert first.startswith(b"good --format=ply --time=1.5 ")
     assert content(cache, "a") == first and cache.made == 1
 
 
-def test_another_model_time_or_format_is_another_export(cache):
+def test_cache_key_includes_model_time_and_format(cache):
     for digest, wish in (
         ("a", PLY),
         ("b", PLY),
@@ -56,7 +56,7 @@ def test_another_model_time_or_format_is_another_export(cache):
     assert cache.made == 4
 
 
-def test_another_option_of_a_rendering_is_another_rendering(cache):
+def test_cache_key_includes_render_options(cache):
     for options in ({}, {"outputs": ("normals",)}, {}):
         wish = RenderWish(PICTURES["png"], RenderOptions(**options), "orbit", 0.5)
         said = content(cache, "a", wish=wish)
@@ -65,7 +65,7 @@ def test_another_option_of_a_rendering_is_another_rendering(cache):
     assert wanted == {"view": "orbit", "time_s": 0.5, "options": {}} and cache.made == 2
 
 
-def test_the_oldest_leave_and_one_that_is_being_read_is_read_to_its_end(cache):
+def test_cache_evicts_oldest_export_and_open_file_stays_readable(cache):
     reading = cache.get("a", lambda: Path("/nowhere/good"), PLY)
     content(cache, "b")
     content(cache, "c")
@@ -76,7 +76,7 @@ def test_the_oldest_leave_and_one_that_is_being_read_is_read_to_its_end(cache):
     assert cache.made == 4
 
 
-def test_one_that_was_used_stays(cache):
+def test_cache_keeps_recently_used_export(cache):
     content(cache, "a")
     content(cache, "b")
     for path in cache._folder.glob("*.data"):
@@ -87,7 +87,7 @@ def test_one_that_was_used_stays(cache):
     assert cache.made == 3
 
 
-def test_what_is_too_large_to_keep_is_refused(tmp_path):
+def test_export_larger_than_cache_raises(tmp_path):
     small = ExportCache(tmp_path / "x", most_bytes=10, programs=ExportPrograms(STUB))
     with pytest.raises(ExportFailed, match="10 bytes"):
         content(small, "a")
@@ -97,20 +97,20 @@ def test_what_is_too_large_to_keep_is_refused(tmp_path):
     ("folder", "error", "said"),
     [("refused", ExportRefused, "^the model has no Gaussians$"), ("fails", ExportFailed, "code 1: it broke")],
 )
-def test_what_cannot_be_made_is_said_and_not_kept(cache, folder, error, said):
+def test_failed_export_raises_with_reason_and_is_not_cached(cache, folder, error, said):
     with pytest.raises(error, match=said):
         content(cache, "a", folder)
     assert list(cache._folder.iterdir()) == []
     content(cache, "a")
 
 
-def test_one_that_takes_too_long_is_ended(tmp_path):
+def test_export_over_time_limit_raises(tmp_path):
     slow = ExportCache(tmp_path / "x", programs=ExportPrograms(STUB, most_s=0.5))
     with pytest.raises(ExportFailed, match=r"longer than 0\.5 s"):
         content(slow, "a", "slow")
 
 
-def test_those_that_wait_are_bounded_and_end_with_the_service(tmp_path):
+def test_waiting_exports_are_limited_and_end_on_close(tmp_path):
     cache = ExportCache(tmp_path / "x", most_waiting=1, programs=ExportPrograms(STUB))
     ended: list[Exception] = []
 
@@ -133,7 +133,7 @@ def test_those_that_wait_are_bounded_and_end_with_the_service(tmp_path):
     assert len(ended) == 1
 
 
-def test_who_asks_for_the_same_waits_for_the_first_one(cache):
+def test_concurrent_requests_share_one_export(cache):
     found: list[bytes] = []
     threads = [threading.Thread(target=lambda: found.append(content(cache, "a"))) for _ in range(4)]
     for thread in threads:
@@ -143,14 +143,14 @@ def test_who_asks_for_the_same_waits_for_the_first_one(cache):
     assert len(found) == 4 and cache.made == 1
 
 
-def test_what_was_left_half_made_goes_at_start(tmp_path):
+def test_new_cache_removes_unfinished_exports(tmp_path):
     (tmp_path / "x" / "new-1").mkdir(parents=True)
     ExportCache(tmp_path / "x")
     assert list((tmp_path / "x").iterdir()) == []
 
 
 @pytest.mark.slow
-def test_the_export_program_writes_a_file_or_refuses(tmp_path):
+def test_export_program_writes_ply_or_refuses_time_out_of_window(tmp_path):
     save_bundle(uniform((0.9, 0.1, 0.1)), tmp_path / "model")
     cache = ExportCache(tmp_path / "exports")
     with cache.get("a", lambda: tmp_path / "model", PLY).file as ply:
@@ -161,7 +161,7 @@ def test_the_export_program_writes_a_file_or_refuses(tmp_path):
 
 @pytest.mark.parametrize("module", ["services.exports.files", "services.exports.snapshots"])
 @pytest.mark.slow
-def test_this_process_loads_no_torch(module):
+def test_export_modules_do_not_import_torch(module):
     program = f"import sys, {module}; assert not {{'torch', 'cv2'}} & set(sys.modules)"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

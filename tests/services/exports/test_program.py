@@ -28,7 +28,7 @@ def ran(monkeypatch):
     return calls
 
 
-def test_a_packed_model_and_other_formats_have_their_own_writers(ran, tmp_path):
+def test_export_program_packs_isplat_and_exports_other_formats(ran, tmp_path):
     folder, file = tmp_path / "model", tmp_path / "file"
     assert files.main([str(folder), str(file), "--format", "isplat"]) == 0
     assert ran.pop("pack") == (folder, file) and "export" not in ran
@@ -39,12 +39,12 @@ def test_a_packed_model_and_other_formats_have_their_own_writers(ran, tmp_path):
     assert (wish.format, wish.time_s, wish.times) == (ALL["ply"], 1.5, None)
 
 
-def test_it_gives_way_to_streams_and_writes_no_core_file(ran, tmp_path):
+def test_export_program_lowers_priority_and_disables_core_files(ran, tmp_path):
     files.main([str(tmp_path), "file", "--format", "isplat"])
     assert "private" in ran and ran["limit"] == (resource.RLIMIT_CORE, (0, 0)) and ran["nice"][0] > 0
 
 
-def test_a_refusal_is_a_sentence_without_the_folder(ran, tmp_path, monkeypatch, capsys):
+def test_export_refusal_omits_server_folder(ran, tmp_path, monkeypatch, capsys):
     def refuse(*wanted):
         raise InvalidSetting(f"{tmp_path}/model.safetensors is damaged")
 
@@ -53,7 +53,7 @@ def test_a_refusal_is_a_sentence_without_the_folder(ran, tmp_path, monkeypatch, 
     assert capsys.readouterr().err == "model.safetensors is damaged\n"
 
 
-def test_a_model_is_loaded_and_exported(monkeypatch, tmp_path):
+def test_export_loads_bundle_and_calls_export_model(monkeypatch, tmp_path):
     from gsplat_core.io import bundle
     from gsplat_core.io.exports import export
 
@@ -65,7 +65,7 @@ def test_a_model_is_loaded_and_exported(monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["png", "mp4"])
-def test_a_rendering_has_the_requested_outputs(ran, tmp_path, name):
+def test_export_program_renders_requested_outputs(ran, tmp_path, name):
     save_bundle(uniform((0.2, 0.5, 0.8)), tmp_path / "model")
     file, outputs = tmp_path / f"file.{name}", ["image", "normals"]
     wanted = {"view": "recorded", "time_s": None, "options": {"outputs": outputs, "fps": 1.0}}

@@ -25,7 +25,7 @@ def taken(store: SnapshotStore, stream: str = "a", number: int = 0) -> Snapshot:
     return made
 
 
-def test_a_snapshot_is_what_was_said_of_it(tmp_path):
+def test_snapshot_is_stored_with_its_description(tmp_path):
     store = SnapshotStore(tmp_path)
     made = taken(store)
     assert store.get("a", made.id) == made and store.all("a") == [made]
@@ -36,7 +36,7 @@ def test_a_snapshot_is_what_was_said_of_it(tmp_path):
     assert SnapshotStore(tmp_path).get("a", made.id) == made
 
 
-def test_the_newest_stay(tmp_path):
+def test_store_keeps_newest_snapshots_of_each_stream(tmp_path):
     store = SnapshotStore(tmp_path, most=3)
     made = [taken(store, number=number) for number in range(5)]
     other = taken(store, "b")
@@ -45,7 +45,7 @@ def test_the_newest_stay(tmp_path):
     assert len({each.digest for each in made}) == 5
 
 
-def test_what_is_not_there_is_said(tmp_path):
+def test_snapshot_store_raises_for_unknown_or_invalid_id(tmp_path):
     store = SnapshotStore(tmp_path)
     made = taken(store)
     store.delete("a", made.id)
@@ -56,7 +56,7 @@ def test_what_is_not_there_is_said(tmp_path):
                 ask("a", number)
 
 
-def test_what_fails_leaves_nothing(tmp_path):
+def test_failed_snapshot_leaves_no_files(tmp_path):
     store = SnapshotStore(tmp_path)
     with pytest.raises(RuntimeError), store.new() as new:
         (new / "model").mkdir()
@@ -68,7 +68,7 @@ def test_what_fails_leaves_nothing(tmp_path):
 
 
 @pytest.mark.parametrize("damaged", ["", '{"id": ', "[]", "null", '{"id": "1"}', "\xff"])
-def test_a_damaged_record_hides_only_its_own_snapshot(tmp_path, damaged):
+def test_damaged_snapshot_record_hides_only_its_snapshot(tmp_path, damaged):
     store = SnapshotStore(tmp_path)
     lost, kept = taken(store), taken(store, number=1)
     (store.folder_of("a", lost.id) / "snapshot.json").write_bytes(damaged.encode("latin-1"))
@@ -80,7 +80,7 @@ def test_a_damaged_record_hides_only_its_own_snapshot(tmp_path, damaged):
     assert not (tmp_path / "a" / lost.id).exists()
 
 
-def test_a_snapshot_is_kept_when_another_request_deletes_the_oldest_first(tmp_path, monkeypatch):
+def test_keep_succeeds_if_oldest_snapshot_is_deleted_concurrently(tmp_path, monkeypatch):
     store = SnapshotStore(tmp_path, most=1)
     oldest = taken(store)
     listed = store.all
@@ -95,7 +95,7 @@ def test_a_snapshot_is_kept_when_another_request_deletes_the_oldest_first(tmp_pa
     assert listed("a") == [newest]
 
 
-def test_a_refused_snapshot_does_not_show_a_path_of_the_server(tmp_path):
+def test_snapshot_refusal_omits_server_path(tmp_path):
     async def refuse(*_: object, folder: str, **__: object) -> None:
         raise CommandRefused(f"cannot write the model to {folder}: No space left on device; free space")
 

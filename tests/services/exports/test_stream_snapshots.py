@@ -42,7 +42,7 @@ def taking(tmp_path, monkeypatch):
     return SimpleNamespace(snapshots=StreamSnapshots(streams, registry, store), calls=calls, refusal=refusal)
 
 
-def test_a_snapshot_is_kept_or_becomes_a_version_of_a_model(taking, tmp_path):
+def test_take_stores_snapshot_or_uploads_model_version(taking, tmp_path):
     folder = tmp_path / "model"
     taken = (folder, "a", "nurse", "said")
     assert asyncio.run(taking.snapshots.take("a", None, "nurse")) == (taken, None)
@@ -57,7 +57,7 @@ def test_a_snapshot_is_kept_or_becomes_a_version_of_a_model(taking, tmp_path):
     assert taking.calls[-1] == ("a", "7")
 
 
-def test_an_engine_that_refuses_is_a_conflict(taking):
+def test_take_raises_conflict_if_engine_refuses(taking):
     taking.refusal.append("nothing was learned yet")
     with pytest.raises(Conflict, match="nothing was learned yet"):
         asyncio.run(taking.snapshots.take("a", None, "nurse"))
@@ -79,7 +79,7 @@ def exports():
     return made
 
 
-def test_exports_of_versions_and_snapshots_within_their_time(exports):
+def test_exports_reject_time_outside_time_window(exports):
     wish = lambda time_s: ExportWish(ALL["ply"], time_s, None)
     assert exports.of_version("liver", 2, wish(1.5)) == ("d", ("liver", 2), 1.5)
     assert exports.of_snapshot("a", "7", wish(3.5)) == ("s", ("a", "7"), 3.5)
@@ -90,7 +90,7 @@ def test_exports_of_versions_and_snapshots_within_their_time(exports):
 
 
 @pytest.mark.parametrize("state", list(State))
-def test_only_checked_versions_are_exported(exports, state):
+def test_of_version_raises_conflict_unless_version_passed_check(exports, state):
     exports.version.state = state
     if state in (State.READY, State.ACTIVE, State.RETIRED):
         assert exports.of_version("liver", 2, ExportWish(ALL["ply"], 1.5, None))
@@ -99,7 +99,7 @@ def test_only_checked_versions_are_exported(exports, state):
             exports.of_version("liver", 2, ExportWish(ALL["ply"], 1.5, None))
 
 
-def test_running_exports_end_with_the_service(exports):
+def test_running_closes_export_cache_at_exit(exports):
     async def run():
         async with exports.running():
             assert not exports.closed

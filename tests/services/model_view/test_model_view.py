@@ -60,7 +60,7 @@ def model_of(field: bool, window_s: tuple[float, float] = (1.0, 3.0)) -> Model:
     return replace(random_model(field=field), time_window_s=window_s)
 
 
-def test_rotations_are_those_of_the_quaternions(rng: np.random.Generator) -> None:
+def test_rotation_matrices_match_rodrigues(rng: np.random.Generator) -> None:
     axes, angles = rng.normal(size=(20, 3)), rng.uniform(-3, 3, 20)
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
     quats = np.concatenate([np.cos(angles / 2)[:, None], np.sin(angles / 2)[:, None] * axes], 1)
@@ -68,7 +68,7 @@ def test_rotations_are_those_of_the_quaternions(rng: np.random.Generator) -> Non
     np.testing.assert_allclose(rotation_matrices(quats.astype(np.float32)), expected, atol=1e-5)
 
 
-def test_the_median_of_what_is_before_the_camera_is_at_the_distance() -> None:
+def test_scene_to_view_scales_median_depth_to_distance() -> None:
     model = model_of(field=False)
     pose = np.array([[0.0, -1, 0, 3], [1, 0, 0, -2], [0, 0, 1, 60], [0, 0, 0, 1]])
     rotation, offset, scale = scene_to_view(replace(model, camera=model.camera.with_pose(pose)))
@@ -81,7 +81,7 @@ def test_the_median_of_what_is_before_the_camera_is_at_the_distance() -> None:
 
 
 @pytest.mark.parametrize(("field", "window_s", "moves"), [(True, (1.0, 3.0), True), (True, (2.0, 2.0), False), (False, (1.0, 3.0), False)])  # fmt: skip
-def test_only_a_model_that_moves_has_a_time(field: bool, window_s: tuple[float, float], moves: bool) -> None:
+def test_time_slider_is_enabled_only_for_moving_model(field: bool, window_s: tuple[float, float], moves: bool) -> None:
     with ModelView(model_of(field, window_s), "127.0.0.1", 5) as view:
         server, slider = view._server, view._time
         assert view.address == ("127.0.0.1", 18081) and server.options["port"] == 5
@@ -95,7 +95,7 @@ def test_only_a_model_that_moves_has_a_time(field: bool, window_s: tuple[float, 
     assert server.stopped
 
 
-def test_a_browser_begins_at_the_endoscope_with_its_angle_of_view() -> None:
+def test_browser_starts_at_endoscope_camera() -> None:
     view = ModelView(model_of(field=False), "127.0.0.1", 0)
     client = SimpleNamespace(camera=SimpleNamespace())
     view._server.on_connect(client)
@@ -104,7 +104,7 @@ def test_a_browser_begins_at_the_endoscope_with_its_angle_of_view() -> None:
     assert np.tan(client.camera.fov / 2) * camera.K[1, 1] == pytest.approx(camera.height_px / 2)
 
 
-def test_splats_are_in_the_axes_and_scale_of_the_view() -> None:
+def test_splats_are_transformed_to_view_axes_and_scale() -> None:
     model = model_of(field=True)
     view = ModelView(model, "127.0.0.1", 0)
     now, (rotation, offset, scale) = model.at(1.5), view._place
@@ -120,7 +120,7 @@ def test_splats_are_in_the_axes_and_scale_of_the_view() -> None:
     assert splats["rgbs"].min() >= 0 and splats["rgbs"].max() <= 1
 
 
-def test_the_time_is_played_within_the_window_and_drawn_when_it_changes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_run_plays_time_window_in_loop_and_draws_changes(monkeypatch: pytest.MonkeyPatch) -> None:
     view = ModelView(model_of(field=True), "127.0.0.1", 0)
     clock, drawn, rounds = iter([10.0, 10.0, 10.5, 11.25, 12.0, 12.0, 20.0]), [], []
     monkeypatch.setattr(model_view.time, "monotonic", lambda: next(clock))

@@ -73,7 +73,7 @@ def picture(view, **changed):
     return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1], headers
 
 
-def test_the_page_and_pictures_of_the_requested_size_are_served():
+def test_picture_view_serves_page_and_pictures_of_requested_size():
     with served() as view:
         status, headers, page = get(view, "/")
         assert status == 200 and b"not a medical device" in page and "text/html" in headers["Content-Type"]
@@ -86,7 +86,7 @@ def test_the_page_and_pictures_of_the_requested_size_are_served():
         assert picture(view, width=100, height=30)[0].shape == (30, 100, 3)
 
 
-def test_samples_add_up_while_the_camera_stands_still(counter):
+def test_samples_accumulate_while_camera_is_still(counter):
     with served("counter", samples=3) as view:
         drawn = [picture(view, **changed)[1]["X-Samples"] for changed in ({}, {}, {"azimuth": 5}, {"azimuth": 5}, {})]
         assert drawn == ["3", "6", "3", "6", "3"]
@@ -94,7 +94,7 @@ def test_samples_add_up_while_the_camera_stands_still(counter):
         assert picture(view)[1]["X-Complete"] == "1"
 
 
-def test_a_turn_and_its_return_show_the_same_camera():
+def test_viewpoint_camera_orbits_around_pivot():
     model = uniform((0.5, 0.5, 0.5))
     start = model.camera
     still = Viewpoint(0, 0, 1, 0, 0, 0, start.width_px, start.height_px)
@@ -118,24 +118,24 @@ def test_a_turn_and_its_return_show_the_same_camera():
         (f"/picture?{urlencode({**STILL, 'azimuth': 'x'})}", 400),
     ],
 )
-def test_a_wrong_request_is_refused(path, status):
+def test_picture_view_refuses_malformed_requests(path, status):
     with served() as view:
         assert get(view, path)[0] == status
 
 
-def test_pages_of_other_sites_cannot_read_the_pictures():
+def test_picture_view_refuses_unknown_host_header():
     with served() as view:
         assert get(view, "/", host="attacker.example:80")[0] == 403
         assert get(view, "/", host="localhost:1")[0] == 200
 
 
-def test_a_renderer_that_cannot_show_the_model_refuses_it_at_the_start():
+def test_pictures_raise_for_renderer_incompatible_with_model():
     model = replace(uniform((0.5, 0.5, 0.5)), trained_by=TrainedBy("weighted_sum"))
     with pytest.raises(InvalidSetting, match="choose renderer 'weighted_sum'"):
         Pictures(model, "alpha", RendererOptions(), "cpu")
 
 
-def test_a_taken_port_is_named():
+def test_picture_view_raises_for_taken_port():
     with served() as view, pytest.raises(InvalidSetting, match="choose another --port"):
         model = uniform((0.5, 0.5, 0.5))
         PictureView(Pictures(model, "alpha", RendererOptions(), "cpu"), model.time_window_s, *view.address)
@@ -149,6 +149,6 @@ def test_a_taken_port_is_named():
         (["--renderer", "alpha", "--samples", "4"], "no option samples"),
     ],
 )
-def test_a_wrong_option_is_one_sentence(tmp_path, capsys, words, reason):
+def test_view_prints_error_for_invalid_renderer_options(tmp_path, capsys, words, reason):
     assert run(["view", str(tmp_path / "scene.ply"), *words]) == BAD_INPUT
     assert reason in capsys.readouterr().err

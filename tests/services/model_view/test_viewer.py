@@ -34,7 +34,7 @@ def view():
         yield made
 
 
-def test_a_browser_gets_the_page_and_the_splats(view):
+def test_viser_server_sends_page_and_splats(view):
     address = f"127.0.0.1:{view.address[1]}"
     page = urllib.request.urlopen(f"http://{address}/", timeout=300).read()
     assert b"<html" in page
@@ -52,7 +52,7 @@ def test_a_browser_gets_the_page_and_the_splats(view):
     assert second - first == 32
 
 
-def test_no_browser_can_have_the_model_published(view, monkeypatch, caplog):
+def test_viser_share_url_request_is_refused(view, monkeypatch, caplog):
     monkeypatch.setattr("viser._viser.ViserTunnel", None)  # what would open the way out
     message = viser._messages.ShareUrlRequest()
     (asked,) = view._server._websock_server._incoming_handlers[type(message)]
@@ -64,7 +64,7 @@ def test_no_browser_can_have_the_model_published(view, monkeypatch, caplog):
     assert view._server._share_tunnel is None and "public address" in caplog.text
 
 
-def test_what_is_shown_is_the_model_in_the_cameras_axes_at_the_distance(view):
+def test_splats_match_model_in_camera_axes_at_distance(view):
     model = random_model(field=True)
     pose = np.array([[0.0, -1, 0, 3], [1, 0, 0, -2], [0, 0, 1, 60], [0, 0, 0, 1]])
     model = Model(1, model.gaussians, model.field, model.camera.with_pose(pose), model.time_window_s)
@@ -81,7 +81,7 @@ def test_what_is_shown_is_the_model_in_the_cameras_axes_at_the_distance(view):
     np.testing.assert_allclose(splats["opacities"][:, 0], now.logit_opacities.sigmoid(), atol=1e-6)
 
 
-def test_the_slider_moves_the_model(view):
+def test_time_slider_redraws_moving_model(view):
     model = random_model(field=True)
     with ModelView(model, "127.0.0.1", 18090) as moving:
         assert not moving._time.disabled and moving._drawn_s == 3.0
@@ -92,20 +92,20 @@ def test_the_slider_moves_the_model(view):
     assert view._time.disabled and view._play.disabled  # a model without a field stands still
 
 
-def test_rotations_are_those_of_unit_quaternions():
+def test_rotation_matrices_of_known_quaternions():
     half = np.sqrt(0.5)
     turn = rotation_matrices(np.array([[half, 0, 0, half], [1, 0, 0, 0]], np.float32))
     np.testing.assert_allclose(turn[0] @ [1, 0, 0], [0, 1, 0], atol=1e-6)
     np.testing.assert_allclose(turn[1], np.eye(3), atol=1e-6)
 
 
-def test_a_scene_behind_the_camera_has_a_scale_all_the_same():
+def test_scene_to_view_scale_is_1_for_scene_behind_camera():
     model = uniform((0.5, 0.5, 0.5))
     behind = replace(model.gaussians, means=model.gaussians.means * torch.tensor([1.0, 1.0, -1.0]))
     assert scene_to_view(Model(1, behind, None, model.camera, (0.0, 1.0)))[2] == 1.0
 
 
-def test_packed_models_are_unpacked(tmp_path):
+def test_bundle_in_unpacks_isplat_file(tmp_path):
     save_bundle(uniform((0.9, 0.1, 0.1)), tmp_path / "model")
     pack(tmp_path / "model", tmp_path / "x.isplat")
     with bundle_in(tmp_path / "model") as folder:

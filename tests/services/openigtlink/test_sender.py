@@ -70,7 +70,7 @@ def connected(server):
         client.stop()
 
 
-def test_an_asymmetric_picture_arrives_as_it_is(runtime):
+def test_client_receives_image_pose_and_state_unchanged(runtime):
     image = asymmetric()
     header = {"state": "stale", "age_ms": 41.3, "world_to_camera": POSE.tolist()}
     with sending(runtime, header, image, spacing_mm=0.25) as server, connected(server) as client:
@@ -89,7 +89,7 @@ def test_an_asymmetric_picture_arrives_as_it_is(runtime):
         assert client.wait_for_message("theatre_State", SOON_S).string == "stale 41 ms"
 
 
-def test_without_clients_nothing_is_read_and_with_one_again_it_is(runtime):
+def test_client_can_reconnect_after_all_clients_left(runtime):
     with sending(runtime, {"state": "live", "age_ms": 1.0}, asymmetric()) as server:
         assert server.clients == 0
         for _ in range(2):
@@ -98,7 +98,7 @@ def test_without_clients_nothing_is_read_and_with_one_again_it_is(runtime):
             until(lambda: server.clients == 0)
 
 
-def test_a_client_that_takes_nothing_does_not_slow_another_one(runtime):
+def test_stalled_client_does_not_slow_other_client(runtime):
     large = np.zeros((500, 800, 3), np.uint8)
     with (
         sending(runtime, {"state": "live", "age_ms": 1.0}, large) as server,
@@ -111,7 +111,7 @@ def test_a_client_that_takes_nothing_does_not_slow_another_one(runtime):
         assert server.clients == 2
 
 
-def test_a_stream_that_says_nothing_is_said(runtime):
+def test_client_receives_no_picture_state_of_silent_stream(runtime):
     folder = runtime.stream("silent")
     server, stop = MessageServer("127.0.0.1", 0), threading.Event()
     messages = StreamMessages("silent")
@@ -124,7 +124,7 @@ def test_a_stream_that_says_nothing_is_said(runtime):
     server.close()
 
 
-def test_silence_is_said_once_in_a_second_of_it(runtime, monkeypatch):
+def test_no_picture_state_is_sent_once_per_second(runtime, monkeypatch):
     """Each look at the stream takes a tenth of a second of the test's clock."""
     looks = itertools.count()
     monkeypatch.setattr("services.openigtlink.POLL_MS", 1)
@@ -144,7 +144,7 @@ def until(what) -> None:
         time.sleep(0.02)
 
 
-def test_what_cannot_be_is_refused(runtime):
+def test_invalid_name_spacing_stream_and_taken_port_raise(runtime):
     for name in ("", "a" * 14, "größe", "a\n"):
         with pytest.raises(InvalidSetting, match="name"):
             StreamMessages(name)
@@ -157,7 +157,7 @@ def test_what_cannot_be_is_refused(runtime):
         MessageServer("127.0.0.1", taken.getsockname()[1])
 
 
-def test_a_closed_server_has_ended_its_thread(monkeypatch):
+def test_message_server_close_waits_for_accept_thread(monkeypatch):
     ended = []
 
     def accept(server):
@@ -172,7 +172,7 @@ def test_a_closed_server_has_ended_its_thread(monkeypatch):
     assert ended == [server]
 
 
-def test_a_client_that_takes_nothing_is_left_after_a_time(monkeypatch):
+def test_client_socket_has_stall_timeout_and_is_closed(monkeypatch):
     """Sending to it must not block a thread without end."""
     calls = []
 

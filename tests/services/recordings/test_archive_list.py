@@ -45,7 +45,7 @@ def with_end(**changed: int) -> io.BytesIO:
     return io.BytesIO(bytes(content))
 
 
-def test_the_end_states_the_number_of_entries() -> None:
+def test_check_end_returns_number_of_entries() -> None:
     assert check_end(packed(("a.png", b"x"), ("b.png", b"y"))) == 2
     assert check_end(packed()) == 0, "the shortest archive is nothing but its end"
 
@@ -68,12 +68,12 @@ def test_the_end_states_the_number_of_entries() -> None:
         (with_end(list_at=1), "not where its end says"),
     ],
 )  # fmt: skip
-def test_an_end_that_is_not_that_of_one_small_archive_is_refused(file: io.BytesIO, why: str) -> None:
+def test_check_end_refuses_damaged_multipart_or_zip64_archive(file: io.BytesIO, why: str) -> None:
     with pytest.raises(ArchiveInvalid, match=why):
         check_end(file)
 
 
-def test_a_zip64_locator_before_the_end_is_refused() -> None:
+def test_check_end_refuses_zip64_locator() -> None:
     content = packed().getvalue()
     with pytest.raises(ArchiveInvalid, match="zip64"):
         check_end(io.BytesIO(b"PK\x06\x07" + bytes(16) + content))
@@ -93,7 +93,7 @@ def test_a_zip64_locator_before_the_end_is_refused() -> None:
         ([("n" * 100) + "/0.png"], ["0.png"]),
     ],
 )
-def test_files_are_unpacked_without_a_common_folder_and_hidden_files(names: list[str], paths: list[str]) -> None:
+def test_entries_omit_common_folder_and_hidden_files(names: list[str], paths: list[str]) -> None:
     assert listed(packed(*((name, b"" if name.endswith("/") else b"x") for name in names))) == paths
 
 
@@ -117,12 +117,12 @@ def test_files_are_unpacked_without_a_common_folder_and_hidden_files(names: list
         ([], "holds no files"),
     ],
 )
-def test_a_name_that_breaks_a_rule_is_refused(names: list[str], why: str) -> None:
+def test_entries_of_refuses_unsafe_names(names: list[str], why: str) -> None:
     with pytest.raises(ArchiveInvalid, match=why):
         listed(packed(*((name, b"x") for name in names)))
 
 
-def test_limits_hold_on_both_sides_of_their_border() -> None:
+def test_entries_of_enforces_limits_exactly() -> None:
     assert len(listed(packed(*((f"{each}.png", b"x") for each in range(3))))) == 3
     with pytest.raises(ArchiveInvalid, match="has 4 files; at most 3"):
         listed(packed(*((f"{each}.png", b"x") for each in range(4))))
@@ -134,7 +134,7 @@ def test_limits_hold_on_both_sides_of_their_border() -> None:
 
 
 @pytest.mark.parametrize(("mib", "refused"), [(1, False), (2, True)])
-def test_the_packing_ratio_is_bounded_for_files_over_one_mebibyte(
+def test_compression_ratio_is_limited_for_files_over_1_mib(
     mib: int, refused: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     wide = 4 << 20
@@ -158,7 +158,7 @@ def test_the_packing_ratio_is_bounded_for_files_over_one_mebibyte(
         (stat.S_IFIFO, True),
     ],
 )
-def test_links_and_devices_are_refused(mode: int, refused: bool) -> None:
+def test_entries_of_refuses_links_and_devices(mode: int, refused: bool) -> None:
     info = zipfile.ZipInfo("a.png")
     info.external_attr = mode << 16
     if refused:
@@ -169,7 +169,7 @@ def test_links_and_devices_are_refused(mode: int, refused: bool) -> None:
 
 
 @pytest.mark.parametrize(("bits", "refused"), [(0x1, True), (0x40, True), (0x2000, True), (0x800, False), (0, False)])
-def test_encrypted_files_are_refused(bits: int, refused: bool) -> None:
+def test_check_entry_refuses_encrypted_files(bits: int, refused: bool) -> None:
     info = zipfile.ZipInfo("a.png")
     info.flag_bits = bits
     if refused:
@@ -179,7 +179,7 @@ def test_encrypted_files_are_refused(bits: int, refused: bool) -> None:
         check._check_entry(info, 0)
 
 
-def test_other_methods_of_packing_are_refused() -> None:
+def test_entries_of_refuses_other_compression_methods() -> None:
     with pytest.raises(ArchiveInvalid, match="packed by method 12"):
         listed(packed(("a.png", b"x"), method=zipfile.ZIP_BZIP2))
 
@@ -188,7 +188,7 @@ def test_other_methods_of_packing_are_refused() -> None:
     ("offset", "size", "why"),
     [(0, 1, None), (0, 5, "goes on into the list"), (1, 1, "not where its list says"), (30, 1, "not where its list")],
 )
-def test_a_file_lies_where_the_list_says(offset: int, size: int, why: str | None) -> None:
+def test_check_places_refuses_wrong_header_offset_or_size(offset: int, size: int, why: str | None) -> None:
     file = packed(("a.png", b"x"))
     with zipfile.ZipFile(file) as archive:
         info, start = archive.infolist()[0], archive.start_dir
@@ -200,7 +200,7 @@ def test_a_file_lies_where_the_list_says(offset: int, size: int, why: str | None
             check._check_places([info], file, start)
 
 
-def test_two_files_in_the_same_place_are_refused() -> None:
+def test_check_places_refuses_overlapping_files() -> None:
     file = packed(("a.png", b"x"), ("b.png", b"y"))
     with zipfile.ZipFile(file) as archive:
         infos, start = archive.infolist(), archive.start_dir
@@ -210,7 +210,7 @@ def test_two_files_in_the_same_place_are_refused() -> None:
         check._check_places(infos, file, start)
 
 
-def test_a_leading_folder_is_removed_from_paths_alone() -> None:
+def test_common_folder_is_removed_from_path_but_not_from_info() -> None:
     file = packed(("rec/images/0.png", b"x"))
     with zipfile.ZipFile(file) as archive:
         (entry,) = entries_of(archive, file, 1, MOST_BYTES)

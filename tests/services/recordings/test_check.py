@@ -32,7 +32,7 @@ def checked(tmp_path, monkeypatch, capsys):
     return run
 
 
-def test_a_recording_is_unpacked_in_place_of_leftovers_and_described(checked, packed):
+def test_check_unpacks_archive_over_leftovers_and_describes_recording(checked, packed):
     (checked.folder / "case").mkdir()
     (checked.folder / "case" / "left by an interrupted check").touch()
     verdict = checked(packed().read_bytes())
@@ -41,13 +41,13 @@ def test_a_recording_is_unpacked_in_place_of_leftovers_and_described(checked, pa
     assert "left by an interrupted check" not in {path.name for path in (checked.folder / "case").iterdir()}
 
 
-def test_a_bad_archive_is_rejected(checked):
+def test_check_rejects_bad_archive(checked):
     assert checked(b"PK no archive") == {"stage": "rejected", "reason": "the archive is cut off: it has 13 bytes"}
     verdict = checked(b"", most_bytes=1)
     assert verdict["stage"] == "rejected"
 
 
-def test_a_video_keeps_its_suffix_and_the_upload_stays(checked):
+def test_check_links_video_with_its_suffix(checked):
     (checked.folder / "clip.mp4").write_text("left by an interrupted check")
     verdict = checked(b"no video at all", kind=".mp4", name="clip")
     assert verdict["stage"] == "rejected" and str(checked.folder) not in verdict["reason"]
@@ -56,14 +56,14 @@ def test_a_video_keeps_its_suffix_and_the_upload_stays(checked):
 
 
 @pytest.mark.parametrize(("count", "said"), [(2, "p0; p1"), (3, "p0; p1; p2"), (5, "p0; p1; p2; and 2 more")])
-def test_the_first_problems_are_named_and_the_rest_counted(monkeypatch, tmp_path, count, said):
+def test_verdict_names_first_three_problems_and_counts_rest(monkeypatch, tmp_path, count, said):
     problems = [f"{tmp_path}/p{k}" for k in range(count)]
     monkeypatch.setattr(check, "validate_recording", lambda path: SimpleNamespace(ok=False, problems=problems))
     assert check._verdict(tmp_path / "x", tmp_path) == {"stage": "rejected", "reason": said}
 
 
 @pytest.mark.parametrize("error", [ArchiveInvalid("no"), MemoryError()])
-def test_what_cannot_be_read_is_a_verdict_and_not_a_crash(checked, monkeypatch, error):
+def test_check_rejects_unreadable_upload_without_crash(checked, monkeypatch, error):
     def fail(*_):
         raise error
 
@@ -76,7 +76,7 @@ def test_what_cannot_be_read_is_a_verdict_and_not_a_crash(checked, monkeypatch, 
     )
 
 
-def test_the_check_is_limited_as_the_settings_say(monkeypatch):
+def test_check_sets_resource_limits(monkeypatch):
     set_to, niced = {}, []
     monkeypatch.setattr(check.os, "nice", niced.append)
     monkeypatch.setattr(check.resource, "setrlimit", lambda kind, limits: set_to.update({kind: limits}))

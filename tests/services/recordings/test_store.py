@@ -31,7 +31,7 @@ def path_of(store, name):
         return store.path_of(connection, name)
 
 
-def test_the_migrations_make_the_table_that_the_program_uses(new_store, database_url):
+def test_recording_migrations_create_table_of_metadata(new_store, database_url):
     store = new_store(database_url=database_url)
     options = {"version_table": "alembic_version_recordings"}
     with store._database.reading() as connection:
@@ -39,7 +39,7 @@ def test_the_migrations_make_the_table_that_the_program_uses(new_store, database
 
 
 @pytest.mark.parametrize("top", ["", "case/", "a folder/"])
-def test_an_archive_becomes_the_recording_that_was_packed(new_store, add, packed, recording, top):
+def test_checked_archive_becomes_ready_recording(new_store, add, packed, recording, top):
     store = new_store()
     record, is_new = add(store, "case-1", packed(top))
     assert is_new and record.state is State.UPLOADED and record.kind == "archive"
@@ -54,7 +54,7 @@ def test_an_archive_becomes_the_recording_that_was_packed(new_store, add, packed
     assert sorted(entry.name for entry in path.parent.iterdir()) == ["case-1"]
 
 
-def test_a_video_is_kept_as_it_is(new_store, add, video_file):
+def test_checked_video_is_stored_unchanged(new_store, add, video_file):
     store = new_store()
     content = video_file.read_bytes()
     add(store, "clip", video_file)
@@ -79,7 +79,7 @@ def video_file(tmp_path):
     return tmp_path / "v.mp4"
 
 
-def test_what_cannot_be_read_is_rejected_with_its_reason_and_not_kept(new_store, add, packed, tmp_path):
+def test_unreadable_recording_is_rejected_with_reason_and_not_kept(new_store, add, packed, tmp_path):
     store = new_store()
     with zipfile.ZipFile(tmp_path / "x.zip", "w") as archive:
         archive.writestr("images/000000.png", b"no picture")
@@ -94,14 +94,14 @@ def test_what_cannot_be_read_is_rejected_with_its_reason_and_not_kept(new_store,
 
 
 @pytest.mark.parametrize("content", [b"", b"\x80\x04pickle", b"#EXTM3U\nfile:///etc/passwd", b"PK"])
-def test_what_is_neither_video_nor_archive_is_refused_at_once(new_store, add, tmp_path, content):
+def test_add_rejects_file_that_is_neither_video_nor_archive(new_store, add, tmp_path, content):
     (tmp_path / "x").write_bytes(content)
     with pytest.raises(Rejected, match="neither a video"):
         add(new_store(), "x", tmp_path / "x")
     assert list((tmp_path / "store").iterdir()) == []
 
 
-def test_the_same_file_again_changes_nothing_and_another_one_is_refused(new_store, add, packed, tmp_path):
+def test_add_accepts_same_file_again_and_refuses_other_file(new_store, add, packed, tmp_path):
     store = new_store(check_program=QUICK)
     first, _ = add(store, "case", packed())
     again, is_new = add(store, "case", packed())
@@ -110,7 +110,7 @@ def test_the_same_file_again_changes_nothing_and_another_one_is_refused(new_stor
         add(store, "case", packed("other/"))
 
 
-def test_a_recording_in_use_is_neither_deleted_nor_expired(new_store, add, packed):
+def test_recording_in_use_is_not_deleted_or_expired(new_store, add, packed):
     used = {"b"}
     store = new_store(check_program=QUICK, in_use=lambda connection, name: name in used)
     for name in "abc":
@@ -123,7 +123,7 @@ def test_a_recording_in_use_is_neither_deleted_nor_expired(new_store, add, packe
     assert [(each.name, "take more than 1 bytes" in each.why) for each in store.expire(None, 1)] == [("b", True)]
 
 
-def test_the_oldest_go_first_and_no_more_than_must(new_store, add, packed):
+def test_expire_removes_oldest_recordings_until_within_limits(new_store, add, packed):
     store = new_store(check_program=QUICK)
     for age, name in enumerate("cba"):
         add(store, name, packed(name=name))
@@ -137,13 +137,13 @@ def test_the_oldest_go_first_and_no_more_than_must(new_store, add, packed):
     assert [record.name for record in store.all()] == ["c"]
 
 
-def test_a_recording_that_waits_for_its_check_is_not_expired(new_store, add, packed):
+def test_unchecked_recording_is_not_expired(new_store, add, packed):
     store = new_store()
     add(store, "case", packed())
     assert store.expire(0.0, 1) == []
 
 
-def test_what_a_dead_process_left_is_removed_and_what_waits_is_named(new_store, add, packed, tmp_path):
+def test_recover_removes_leftovers_and_returns_unchecked_recordings(new_store, add, packed, tmp_path):
     store = new_store(check_program=QUICK)
     add(store, "ready", packed(name="1"))
     store.check("ready")
@@ -154,7 +154,7 @@ def test_what_a_dead_process_left_is_removed_and_what_waits_is_named(new_store, 
     assert sorted(path.name.split("-")[0] for path in (tmp_path / "store").iterdir()) == ["ready", "waits"]
 
 
-def test_a_check_that_fails_by_itself_leaves_the_recording_waiting(new_store, add, packed):
+def test_recording_stays_uploaded_if_check_program_fails(new_store, add, packed):
     store = new_store(check_program=(sys.executable, "-c", "raise SystemExit(3)"))
     add(store, "case", packed())
     with pytest.raises(CheckFailed, match="code 3"):
@@ -164,7 +164,7 @@ def test_a_check_that_fails_by_itself_leaves_the_recording_waiting(new_store, ad
 
 
 @pytest.mark.slow
-def test_a_check_that_takes_too_much_rejects_the_recording(new_store, add, packed):
+def test_check_over_cpu_limit_rejects_recording(new_store, add, packed):
     store = new_store(check_program=(sys.executable, "-c", BURNS))
     add(store, "case", packed())
     record = store.check("case")

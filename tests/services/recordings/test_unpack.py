@@ -13,7 +13,7 @@ from services.recordings import check as unpacking
 from services.recordings.check import ArchiveInvalid
 
 
-def test_files_are_private_and_whole_also_beyond_one_piece(tmp_path, monkeypatch):
+def test_unpack_writes_complete_private_files(tmp_path, monkeypatch):
     monkeypatch.setattr(unpacking, "PIECE_BYTES", 3)
     with zipfile.ZipFile(tmp_path / "upload", "w") as archive:
         archive.writestr("session.json", "{}")
@@ -30,7 +30,7 @@ def test_files_are_private_and_whole_also_beyond_one_piece(tmp_path, monkeypatch
 
 
 @pytest.mark.parametrize(("stated", "said"), [(9, "longer than its list says"), (11, "is cut off")])
-def test_a_file_of_another_length_than_its_list_says_is_refused(tmp_path, stated, said):
+def test_unpack_refuses_file_with_other_length_than_listed(tmp_path, stated, said):
     archive = SimpleNamespace(open=lambda info: io.BytesIO(b"0123456789"))
     entry = SimpleNamespace(path="file", info=SimpleNamespace(file_size=stated))
     with pytest.raises(ArchiveInvalid, match=f"file 8 of the archive .*{said}"):
