@@ -75,60 +75,60 @@ class Attack:
 
 
 @pytest.mark.slow
-def test_the_good_upload_is_taken(registry, payload, tmp_path):
+def test_valid_upload_is_accepted_and_ready(registry, payload, tmp_path):
     (tmp_path / "upload").write_bytes(payload)
     assert registry.upload("liver", tmp_path / "upload", None, "friend").version == 1
     assert registry.check("liver", 1).state == "ready"
 
 
 @pytest.mark.slow
-def test_a_pickle_as_tensors_is_rejected_by_the_check(rejected, bundle, tmp_path):
+def test_check_rejects_pickle_as_tensors_without_executing(rejected, bundle, tmp_path):
     bundle.replace_tensors(pickle.dumps([Attack(tmp_path / "executed"), bytes(1000)]))
     assert rejected()
     assert not (tmp_path / "executed").exists()
 
 
-def test_weights_that_are_not_finite_are_rejected(check_here, rejected, bundle):
+def test_check_rejects_non_finite_weights(check_here, rejected, bundle):
     tensors = dict(load_bundle(bundle.folder).tensors())
     tensors["field.weights"] = torch.full_like(tensors["field.weights"], float("nan"))
     bundle.replace_tensors(save(tensors))
     assert "field.weights holds 390 of 390 values that are NaN" in rejected()
 
 
-def test_overlapping_tensors_are_rejected(check_here, rejected, bundle):
+def test_check_rejects_overlapping_tensors(check_here, rejected, bundle):
     header = json.loads(bundle.header_and_data()[0])
     header["gaussians.means"]["data_offsets"] = header["gaussians.log_scales"]["data_offsets"]
     bundle.replace_header(json.dumps(header).encode())
     assert "not a safetensors file" in rejected()
 
 
-def test_a_giant_header_is_rejected(check_here, rejected, bundle):
+def test_check_rejects_giant_tensor_header(check_here, rejected, bundle):
     bundle.replace_tensors(struct.pack("<Q", 2**40) + bundle.tensors.read_bytes()[8:])
     assert "states a header of 1099511627776 bytes" in rejected()
 
 
-def test_tensors_that_the_manifest_does_not_name_are_rejected(check_here, rejected, bundle):
+def test_check_rejects_tensors_missing_in_manifest(check_here, rejected, bundle):
     bundle.replace_tensors(save(dict(load_bundle(bundle.folder).tensors()) | {"__reduce__": torch.zeros(0)}))
     assert "unknown __reduce__" in rejected()
 
 
-def test_a_nested_manifest_is_rejected(check_here, rejected, bundle):
+def test_check_rejects_deeply_nested_manifest(check_here, rejected, bundle):
     bundle.manifest.write_bytes(b"[" * 100_000 + b"]" * 100_000)
     assert "not valid JSON" in rejected()
 
 
-def test_a_picture_beyond_the_budget_is_rejected_unrendered(check_here, rejected, bundle):
+def test_check_rejects_camera_over_pixel_limit(check_here, rejected, bundle):
     bundle.edit(lambda manifest: manifest["camera"].update(width_px=16384, height_px=4096))
     assert "16384x4096" in rejected()
 
 
-def test_more_gaussians_than_the_file_has_are_rejected(check_here, rejected, bundle):
+def test_check_rejects_gaussian_count_beyond_file_size(check_here, rejected, bundle):
     bundle.edit(lambda manifest: manifest["gaussians"].update(count=1_900_000))
     assert "describes" in rejected()
 
 
 @pytest.mark.slow
-def test_a_model_that_shows_nothing_is_rejected(check_here, rejected, bundle):
+def test_check_rejects_model_with_empty_picture(check_here, rejected, bundle):
     """Every value is finite, and so is the picture: the Gaussians are moved out of it."""
     tensors = dict(load_bundle(bundle.folder).tensors())
     tensors["field.weights"] = torch.full_like(tensors["field.weights"], 3e38)

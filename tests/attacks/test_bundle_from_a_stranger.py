@@ -20,7 +20,7 @@ def tensors_of(bundle):
     return dict(load_bundle(bundle.folder).tensors())
 
 
-def test_a_changed_byte_is_noticed(bundle):
+def test_load_bundle_detects_changed_byte(bundle):
     path = bundle.tensors
     payload = bytearray(path.read_bytes())
     payload[-5] ^= 1
@@ -30,7 +30,7 @@ def test_a_changed_byte_is_noticed(bundle):
 
 
 @pytest.mark.parametrize("keep", [0, 4, 8, 100, -1])
-def test_a_truncated_file_is_noticed(bundle, keep):
+def test_load_bundle_detects_truncated_tensors(bundle, keep):
     path = bundle.tensors
     path.write_bytes(path.read_bytes()[:keep])
     with pytest.raises(BundleCorrupt, match=r"bytes"):
@@ -38,26 +38,26 @@ def test_a_truncated_file_is_noticed(bundle, keep):
 
 
 @pytest.mark.parametrize("version", [0, 2, 99])
-def test_another_format_version_names_both(bundle, version):
+def test_load_bundle_names_unknown_and_supported_format_version(bundle, version):
     bundle.edit(lambda manifest: manifest.update(format_version=version))
     with pytest.raises(UnknownFormatVersion, match=rf"{version}.*reads 1"):
         load_bundle(bundle.folder)
 
 
 @pytest.mark.parametrize("missing", ["manifest.json", "model.safetensors"])
-def test_a_missing_file_is_named(bundle, missing):
+def test_load_bundle_names_missing_file(bundle, missing):
     (bundle.folder / missing).unlink()
     with pytest.raises(BundleError, match=missing):
         load_bundle(bundle.folder)
 
 
-def test_a_folder_that_is_not_there_is_named(tmp_path):
+def test_load_bundle_names_missing_folder(tmp_path):
     with pytest.raises(BundleError, match="nowhere"):
         load_bundle(tmp_path / "nowhere")
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
-def test_values_that_are_not_finite_are_counted_and_named(bundle, value):
+def test_load_bundle_counts_non_finite_values_by_tensor(bundle, value):
     tensors = tensors_of(bundle)
     tensors["field.weights"] = tensors["field.weights"].clone()
     tensors["field.weights"][1, 2, :3] = value
@@ -66,14 +66,14 @@ def test_values_that_are_not_finite_are_counted_and_named(bundle, value):
         load_bundle(bundle.folder)
 
 
-def test_tensors_that_the_manifest_does_not_know_are_refused(bundle):
+def test_load_bundle_refuses_unknown_tensors(bundle):
     tensors = tensors_of(bundle)
     bundle.replace_tensors(save(tensors | {"field.extra": torch.zeros(0)}))
     with pytest.raises(BundleCorrupt, match=r"unknown field\.extra"):
         load_bundle(bundle.folder)
 
 
-def test_a_missing_tensor_is_named(bundle):
+def test_load_bundle_names_missing_tensor(bundle):
     tensors = tensors_of(bundle)
     renamed = {("x" if name == "gaussians.quats" else name): tensor for name, tensor in tensors.items()}
     bundle.replace_tensors(save(renamed))
@@ -82,7 +82,7 @@ def test_a_missing_tensor_is_named(bundle):
 
 
 @pytest.mark.parametrize("change", [lambda t: t.T.contiguous(), lambda t: t.view(torch.int32)])
-def test_other_shapes_and_types_are_refused(bundle, change):
+def test_load_bundle_refuses_wrong_shape_or_dtype(bundle, change):
     tensors = tensors_of(bundle)
     tensors["gaussians.means"] = change(tensors["gaussians.means"])
     bundle.replace_tensors(save(tensors))
@@ -91,14 +91,14 @@ def test_other_shapes_and_types_are_refused(bundle, change):
 
 
 @pytest.mark.parametrize("length", [26_000_000, 2**40, 2**64 - 1])
-def test_a_header_larger_than_allowed_is_refused(bundle, length):
+def test_load_bundle_refuses_oversized_tensor_header(bundle, length):
     payload = bundle.tensors.read_bytes()
     bundle.replace_tensors(struct.pack("<Q", length) + payload[8:])
     with pytest.raises(BundleCorrupt, match="header"):
         load_bundle(bundle.folder)
 
 
-def test_offsets_outside_the_file_are_refused(bundle):
+def test_load_bundle_refuses_offsets_outside_file(bundle):
     text, _ = bundle.header_and_data()
     header = json.loads(text)
     header["gaussians.means"]["data_offsets"] = [2**33, 2**33 + 60]
@@ -107,7 +107,7 @@ def test_offsets_outside_the_file_are_refused(bundle):
         load_bundle(bundle.folder)
 
 
-def test_counts_beyond_the_file_take_no_memory(bundle):
+def test_load_bundle_refuses_gaussian_count_beyond_file_size(bundle):
     """Fifty million Gaussians of 6 bumps would be 20 GB; the file's size tells that they are not there."""
     bundle.edit(lambda manifest: manifest["gaussians"].update(count=50_000_000))
     with pytest.raises(BundleCorrupt, match="describes"):
@@ -143,7 +143,7 @@ def test_counts_beyond_the_file_take_no_memory(bundle):
         ("tensors", {"bytes": 10, "sha256": "zz"}),
     ],
 )
-def test_manifest_values_out_of_range_are_refused(bundle, key, value):
+def test_load_bundle_refuses_manifest_values_out_of_range(bundle, key, value):
     bundle.edit(lambda manifest: manifest.update({key: value}))
     with pytest.raises(BundleCorrupt):
         load_bundle(bundle.folder)
@@ -153,13 +153,13 @@ def test_manifest_values_out_of_range_are_refused(bundle, key, value):
     "text",
     [b"", b"\xff\xfe", b"[1, 2]", b"{" * 100_000, b'{"format_version": NaN}', b"1" * 5000, b" " * (1 << 20) + b"{}"],
 )
-def test_a_manifest_that_is_none_is_refused(bundle, text):
+def test_load_bundle_refuses_malformed_manifest(bundle, text):
     bundle.manifest.write_bytes(text)
     with pytest.raises(BundleCorrupt, match=r"manifest\.json"):
         load_bundle(bundle.folder)
 
 
-def test_a_pickle_in_place_of_the_tensors_is_not_opened(bundle, tmp_path):
+def test_load_bundle_does_not_unpickle_tensors(bundle, tmp_path):
     import pickle
 
     marker = tmp_path / "executed"
@@ -175,7 +175,7 @@ def test_a_pickle_in_place_of_the_tensors_is_not_opened(bundle, tmp_path):
     assert not marker.exists()
 
 
-def test_a_box_inside_out_is_refused(tmp_path):
+def test_load_bundle_refuses_inverted_hexplane_box(tmp_path):
     gaussians = Gaussians(torch.rand(2, 3), torch.rand(2, 4), torch.rand(2, 3), torch.rand(2), torch.rand(2, 1, 3))
     field = new_field("hexplane", gaussians, (0.0, 1.0), channels=2, resolution=(3, 3, 3, 3)).detached_copy()
     field.box = field.box.flip(0)

@@ -90,13 +90,13 @@ class Attack:
 
 
 @pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
-def test_a_pickle_is_not_opened(refused, tmp_path, protocol):
+def test_pickle_upload_is_refused_without_executing(refused, tmp_path, protocol):
     marker = tmp_path / "executed"
     assert "intrasplat pack" in refused(pickle.dumps([Attack(marker), bytes(5000)], protocol))
     assert not marker.exists()
 
 
-def test_a_checkpoint_of_torch_is_not_opened(refused, tmp_path):
+def test_torch_checkpoint_upload_is_refused_without_executing(refused, tmp_path):
     file = io.BytesIO()
     torch.save({"means": torch.zeros(5, 3), "attack": Attack(tmp_path / "executed")}, file)
     assert "zip archive" in refused(file.getvalue())
@@ -116,14 +116,14 @@ def test_a_checkpoint_of_torch_is_not_opened(refused, tmp_path):
         "",
     ],
 )
-def test_paths_in_the_archive_are_refused(refused, name):
+def test_upload_with_paths_in_member_names_is_refused(refused, name):
     assert "must hold manifest.json and then model.safetensors" in refused(
         archive((name, b"{}", {}), (TENSORS, b"x", {}))
     )
     assert "must hold" in refused(archive((MANIFEST, b"{}", {}), (name.replace("manifest.json", TENSORS), b"x", {})))
 
 
-def test_a_path_in_the_prefix_of_a_name_is_refused(refused, payload):
+def test_upload_with_tar_name_prefix_is_refused(refused, payload):
     assert "must hold" in refused(with_header(payload, 0, 345, b"../../root"))
 
 
@@ -131,17 +131,17 @@ def test_a_path_in_the_prefix_of_a_name_is_refused(refused, payload):
     "kind",
     [tarfile.SYMTYPE, tarfile.LNKTYPE, tarfile.CHRTYPE, tarfile.FIFOTYPE, tarfile.DIRTYPE, tarfile.GNUTYPE_SPARSE],
 )
-def test_links_devices_folders_and_sparse_files_are_refused(refused, payload, kind):
+def test_upload_with_links_devices_folders_or_sparse_files_is_refused(refused, payload, kind):
     for start in (0, second_header(payload)):
         assert "as plain files" in refused(with_header(payload, start, 156, kind))
 
 
-def test_a_link_out_of_the_archive_is_refused(refused):
+def test_upload_with_link_as_manifest_is_refused(refused):
     link = {"type": tarfile.SYMTYPE, "linkname": "/etc/passwd"}
     assert "as plain files" in refused(archive((MANIFEST, b"", link), (TENSORS, b"x", {})))
 
 
-def test_further_repeated_and_swapped_files_are_refused(refused):
+def test_upload_with_extra_repeated_or_swapped_files_is_refused(refused):
     manifest, tensors = (MANIFEST, b"{}", {}), (TENSORS, b"x", {})
     assert "does not end after" in refused(archive(manifest, tensors, ("evil.py", b"x", {})))
     assert "does not end after" in refused(archive(manifest, tensors, tensors))
@@ -150,7 +150,7 @@ def test_further_repeated_and_swapped_files_are_refused(refused):
     assert refused(archive(manifest)) and refused(archive())
 
 
-def test_pax_and_long_name_headers_are_refused(refused):
+def test_upload_with_pax_or_long_name_headers_is_refused(refused):
     """Such headers would give a file another name or size than its plain header."""
     renamed = {"pax_headers": {"path": "../../evil", "size": "9"}}
     assert "as plain files" in refused(
@@ -171,24 +171,24 @@ def test_pax_and_long_name_headers_are_refused(refused):
         b"1 2\0",
     ],
 )
-def test_sizes_that_are_not_there_or_no_numbers_are_refused(refused, payload, size):
+def test_upload_with_invalid_tar_sizes_is_refused(refused, payload, size):
     for start in (0, second_header(payload)):
         assert refused(with_header(payload, start, 124, size.ljust(12, b"\0")))
 
 
-def test_a_manifest_without_a_bound_is_refused(refused):
+def test_upload_with_oversized_manifest_is_refused(refused):
     sentence = refused(archive((MANIFEST, bytes((1 << 20) + 1), {}), (TENSORS, b"x", {})))
     assert sentence == "manifest.json has 1048577 bytes; at most 1048576 are allowed, so it is not a manifest"
 
 
-def test_a_wrong_checksum_and_another_format_are_refused(refused, payload):
+def test_upload_with_wrong_tar_checksum_or_other_format_is_refused(refused, payload):
     assert "no tar header" in refused(payload[:200] + b"x" + payload[201:])
     assert "no tar header" in refused(b"x" * 5000)
     assert "no tar header" in refused(bytes(5000))
     assert "ends where the header of manifest.json should be" in refused(b"")
 
 
-def test_bytes_hidden_between_and_behind_the_files_are_refused(refused, payload):
+def test_upload_with_bytes_between_or_after_files_is_refused(refused, payload):
     end = BLOCK + int(payload[124:135], 8)
     assert "hidden behind manifest.json" in refused(payload[:end] + b"#!" + payload[end + 2 :])
     assert "does not end after" in refused(payload[:-1] + b"x")
@@ -196,12 +196,12 @@ def test_bytes_hidden_between_and_behind_the_files_are_refused(refused, payload)
     assert "does not end after" in refused(payload + bytes(30 * BLOCK))
 
 
-def test_a_truncated_upload_is_refused(refused, payload):
+def test_truncated_upload_is_refused(refused, payload):
     for size in (1, 511, 512, 700, len(payload) // 2, len(payload) - 1):
         assert refused(payload[:size])
 
 
-def test_bombs_are_not_unpacked(refused, payload):
+def test_compressed_bomb_upload_is_refused(refused, payload):
     bomb = io.BytesIO()
     with zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as made:
         made.writestr(TENSORS, bytes(50 << 20))
@@ -210,16 +210,16 @@ def test_bombs_are_not_unpacked(refused, payload):
     assert "compressed with gzip" in refused(gzip.compress(bytes(50 << 20)) + gzip.flush())
 
 
-def test_an_upload_over_the_limit_is_refused_as_it_comes(refused):
+def test_upload_over_size_limit_is_refused(refused):
     assert "more than 4194304 bytes" in refused(bytes((4 << 20) + 1))
 
 
-def test_a_pointer_of_git_lfs_is_named(refused):
+def test_upload_of_git_lfs_pointer_is_refused_by_name(refused):
     pointer = f"version https://git-lfs.github.com/spec/v1\noid sha256:{64 * '0'}\nsize 12345\n"
     assert "Git LFS pointer" in refused(pointer.encode())
 
 
-def test_a_pipe_or_folder_in_place_of_the_upload_is_not_waited_for(registry, tmp_path):
+def test_upload_from_pipe_or_folder_raises_without_waiting(registry, tmp_path):
     os.mkfifo(tmp_path / "pipe")
     for path in (tmp_path / "pipe", tmp_path):
         with pytest.raises(StoreUnavailable, match="not a plain file"):

@@ -93,7 +93,7 @@ def _is_one_sentence(capsys) -> bool:
 @pytest.mark.parametrize("body", BODIES, ids=lambda body: repr(body[:20]))
 @pytest.mark.parametrize("status", [200, 302, 404])
 @pytest.mark.parametrize("command", COMMANDS[:1], ids=" ".join)
-def test_an_answer_that_is_none_is_one_sentence(server, capsys, command, status, body):
+def test_ctl_prints_one_error_for_malformed_response(server, capsys, command, status, body):
     server.answer = status, sized(body, Content_Type="application/json", Location="http://127.0.0.1:1/"), body
     code = ctl(server, *command)
     assert code == OK if (status < 300 and body == b"[]") else code == BAD_INPUT
@@ -102,7 +102,7 @@ def test_an_answer_that_is_none_is_one_sentence(server, capsys, command, status,
 
 @pytest.mark.parametrize("body", [b"<html></html>", b"[1]", b"null", b"{}"], ids=repr)
 @pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
-def test_every_command_reads_answers_like_that(server, capsys, command, body):
+def test_every_ctl_command_prints_one_error_for_malformed_response(server, capsys, command, body):
     server.answer = 200, sized(body), body
     assert ctl(server, *command) == BAD_INPUT
     assert _is_one_sentence(capsys)
@@ -125,13 +125,13 @@ def test_every_command_reads_answers_like_that(server, capsys, command, body):
     ],
     ids=lambda value: repr(value)[:40],
 )
-def test_broken_http_is_one_sentence(server, capsys, headers, body):
+def test_ctl_prints_one_error_for_broken_http(server, capsys, headers, body):
     server.answer = 200, headers, body
     assert ctl(server, "streams") == BAD_INPUT
     assert _is_one_sentence(capsys)
 
 
-def test_an_answer_without_end_is_given_up(server, capsys, monkeypatch):
+def test_ctl_stops_reading_oversized_response(server, capsys, monkeypatch):
     monkeypatch.setattr(requests, "MOST_ANSWER_BYTES", 1000)
     server.answer = 200, {}, bytes(100_000)
     assert ctl(server, "streams") == BAD_INPUT
@@ -146,7 +146,7 @@ def test_an_answer_without_end_is_given_up(server, capsys, monkeypatch):
         "http://" + "a" * 300, "http://xn--zzzzzzzzzzzz-.example",
     ],
 )  # fmt: skip
-def test_an_address_that_is_none_is_one_sentence(capsys, url):
+def test_ctl_prints_one_error_for_invalid_url(capsys, url):
     assert run(["ctl", "streams", "--url", url]) == BAD_INPUT
     assert _is_one_sentence(capsys)
 
@@ -157,7 +157,7 @@ def test_an_address_that_is_none_is_one_sentence(capsys, url):
     ids=lambda value: repr(value)[:20],
 )  # fmt: skip
 @pytest.mark.parametrize("how", ["file", "variable"])
-def test_a_key_that_is_none_is_one_sentence(tmp_path, capsys, monkeypatch, content, how):
+def test_ctl_prints_one_error_for_invalid_key(tmp_path, capsys, monkeypatch, content, how):
     more = []
     if how == "file":
         (tmp_path / "key").write_bytes(content)
@@ -174,7 +174,7 @@ def test_a_key_that_is_none_is_one_sentence(tmp_path, capsys, monkeypatch, conte
 @pytest.mark.parametrize(
     "kind", ["missing", "junk", "empty", "pipe", "device", "folder", "half a certificate", "binary"]
 )
-def test_a_certificate_that_is_none_is_one_sentence(tmp_path, capsys, kind, option):
+def test_ctl_prints_one_error_for_unusable_ca_or_key_file(tmp_path, capsys, kind, option):
     path = tmp_path / "ca.pem"
     if kind == "pipe":
         os.mkfifo(path)
@@ -193,7 +193,7 @@ def test_a_certificate_that_is_none_is_one_sentence(tmp_path, capsys, kind, opti
 
 @pytest.mark.parametrize("name", ["a\x00b", "a\nb", "\ud800", "a" * 100_000])
 @pytest.mark.parametrize("command", [["start"], ["models"], ["cancel"], ["remove-recording"], ["snapshots"]])
-def test_names_that_cannot_be_sent_are_one_sentence(server, capsys, command, name):
+def test_ctl_prints_one_error_for_unsendable_names(server, capsys, command, name):
     server.answer = 404, sized(b"{}"), b"{}"
     assert ctl(server, *command, name) == BAD_INPUT
     assert _is_one_sentence(capsys)
@@ -203,14 +203,14 @@ def test_names_that_cannot_be_sent_are_one_sentence(server, capsys, command, nam
     "option",
     ["a=" + "[" * 50_000, "a=2001-01-01", "a=.nan", "a={b: 1}", "a=\x00", "a", "=1", "a=!!python/name:os.system"],
 )
-def test_options_that_cannot_be_sent_are_one_sentence(server, capsys, option):
+def test_ctl_prints_one_error_for_unsendable_options(server, capsys, option):
     server.answer = 404, sized(b"{}"), b"{}"
     assert ctl(server, "replay", "r", "--option", option) == BAD_INPUT
     assert _is_one_sentence(capsys)
 
 
 @pytest.mark.parametrize("path", ["/dev/zero", "/dev/stdin", "/nowhere", "fifo", "folder with a link"])
-def test_an_upload_of_what_is_no_file_is_one_sentence(server, capsys, tmp_path, path):
+def test_ctl_prints_one_error_for_upload_of_non_regular_file(server, capsys, tmp_path, path):
     server.answer = 404, sized(b"{}"), b"{}"
     if path == "fifo":
         os.mkfifo(tmp_path / "fifo")
@@ -231,7 +231,7 @@ DOWNLOADS = {
 
 @pytest.mark.parametrize("command", DOWNLOADS)
 @pytest.mark.parametrize("overwrite", [[], ["--overwrite"]])
-def test_a_download_never_replaces_a_file_of_somebody_else(server, capsys, tmp_path, command, overwrite):
+def test_ctl_download_does_not_overwrite_foreign_file(server, capsys, tmp_path, command, overwrite):
     server.answer = 200, sized(b"new"), b"new"
     (tmp_path / "mine.html").write_text("mine")
     assert ctl(server, *DOWNLOADS[command](str(tmp_path / "mine.html")), *overwrite) == BAD_INPUT
@@ -239,7 +239,7 @@ def test_a_download_never_replaces_a_file_of_somebody_else(server, capsys, tmp_p
     assert _is_one_sentence(capsys)
 
 
-def test_a_download_replaces_an_earlier_one_on_request_alone(server, tmp_path):
+def test_ctl_download_overwrites_own_file_only_on_request(server, tmp_path):
     page, file = b"<!doctype html><title>IntraSplat</title>", tmp_path / "report.html"
     server.answer = 200, sized(page), page
     assert ctl(server, *DOWNLOADS["result"](str(file))) == OK
@@ -257,7 +257,7 @@ SILENT = {
 
 @pytest.mark.parametrize("status", [200, 204])
 @pytest.mark.parametrize("command", SILENT)
-def test_an_answer_of_another_server_is_no_success(server, capsys, tmp_path, command, status):
+def test_ctl_fails_for_response_without_request_id(server, capsys, tmp_path, command, status):
     """Such as the sign-in page of a proxy. These commands read nothing in the answer that would tell."""
     body = b"<html>sign in</html>" if status == 200 else b""
     server.answer = status, {"Content-Length": str(len(body))}, body
@@ -277,7 +277,7 @@ def test_an_answer_of_another_server_is_no_success(server, capsys, tmp_path, com
     ids=str,
 )
 @pytest.mark.parametrize("command", DOWNLOADS)
-def test_a_download_that_is_not_whole_leaves_nothing(server, capsys, tmp_path, command, headers):
+def test_ctl_incomplete_download_leaves_no_file(server, capsys, tmp_path, command, headers):
     server.answer = 200, headers, b"new"
     assert ctl(server, *DOWNLOADS[command](str(tmp_path / "x.html"))) == BAD_INPUT
     assert list(tmp_path.iterdir()) == []

@@ -64,7 +64,7 @@ KINDS = {
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", READERS)
-def test_what_is_no_plain_file_is_refused_at_once(tmp_path, name, kind):
+def test_readers_refuse_non_regular_files(tmp_path, name, kind):
     KINDS[kind](tmp_path / name)
     with pytest.raises((UserError, OSError)) as refused:
         READERS[name](tmp_path / name)
@@ -73,21 +73,21 @@ def test_what_is_no_plain_file_is_refused_at_once(tmp_path, name, kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_opening_says_what_it_is(tmp_path, kind):
+def test_open_regular_error_names_kind_of_file(tmp_path, kind):
     KINDS[kind](tmp_path / "x")
     with pytest.raises(OSError) as refused:
         open_regular(tmp_path / "x")
     assert kind == "link to itself" or kind.split()[-1] in str(refused.value.strerror)
 
 
-def test_more_than_may_be_read_is_refused(tmp_path):
+def test_read_regular_refuses_file_over_size_limit(tmp_path):
     (tmp_path / "x").write_bytes(bytes(11))
     assert read_regular(tmp_path / "x", 11) == bytes(11)
     with pytest.raises(OSError, match="larger than 10 bytes"):
         read_regular(tmp_path / "x", 10)
 
 
-def test_a_name_with_a_zero_byte_is_an_error_of_the_system():
+def test_open_regular_raises_oserror_for_name_with_zero_byte():
     with pytest.raises(OSError, match="cannot be used"):
         open_regular("a\0b")
 
@@ -105,7 +105,7 @@ KEY = {"id": "a" * 8, "name": "n", "role": "viewer", "sha256": "0" * 64, "create
         *(json.dumps({"keys": [{k: v for k, v in KEY.items() if k != name}]}).encode() for name in KEY),
     ],
 )  # fmt: skip
-def test_a_damaged_file_of_keys_is_one_sentence(tmp_path, content):
+def test_key_store_raises_keys_unreadable_for_damaged_file(tmp_path, content):
     (tmp_path / "keys.json").write_bytes(content)
     with pytest.raises(KeysUnreadable, match=r"keys\.json .*(damaged|cannot be read)"):
         KeyStore(tmp_path / "keys.json").all()
@@ -127,7 +127,7 @@ ENTRY = {
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("where", ["audit.jsonl", "audit.head", "audit.anchor"])
-def test_a_damaged_audit_log_is_a_finding(tmp_path, line, where):
+def test_verify_reports_damaged_audit_files_as_not_intact(tmp_path, line, where):
     (tmp_path / "audit.jsonl").write_bytes(b"")
     (tmp_path / where).write_bytes(line + b"\n")
     verdict = verify(tmp_path / "audit.jsonl")

@@ -84,7 +84,7 @@ def place(tmp_path):
     ],
     ids=" ".join,
 )
-def test_a_command_never_replaces_what_it_did_not_write(place, monkeypatch, capsys, arguments, overwrite):
+def test_commands_do_not_overwrite_foreign_files(place, monkeypatch, capsys, arguments, overwrite):
     monkeypatch.chdir(place)
     before = held(place)
     assert run([*arguments, *overwrite]) == BAD_INPUT
@@ -94,7 +94,7 @@ def test_a_command_never_replaces_what_it_did_not_write(place, monkeypatch, caps
 
 
 @pytest.mark.parametrize("name", ["out.ply", "out.splat", "out.glb", "out.zip", "out.isplat"])
-def test_an_earlier_output_is_replaced_on_request(place, monkeypatch, capsys, name):
+def test_pack_and_export_overwrite_own_output_on_request(place, monkeypatch, capsys, name):
     monkeypatch.chdir(place)
     command = ["pack" if name.endswith(".isplat") else "export", "model", name]
     more = ["--times", "2"] if name == "out.zip" else []
@@ -105,7 +105,7 @@ def test_an_earlier_output_is_replaced_on_request(place, monkeypatch, capsys, na
 
 
 @pytest.mark.parametrize("format_name", ["mesh-ply", "points-ply", "mesh-glb"])
-def test_a_surface_is_recognised(place, monkeypatch, format_name):
+def test_exported_mesh_is_recognised_as_own_file(place, monkeypatch, format_name):
     monkeypatch.chdir(place)
     name = f"out.{format_name[-3:]}"
     code = run(["export", "model", name, "--format", format_name])
@@ -113,7 +113,7 @@ def test_a_surface_is_recognised(place, monkeypatch, format_name):
     assert is_own_file(place / name)
 
 
-def test_poses_are_recognised_and_read_like_any_array(tmp_path):
+def test_written_poses_are_recognised_as_own_file_and_loadable(tmp_path):
     write_poses(tmp_path / "poses.npy", np.tile(np.eye(4), (3, 1, 1)))
     assert is_own_file(tmp_path / "poses.npy")
     assert np.load(tmp_path / "poses.npy").shape == (3, 4, 4)
@@ -121,7 +121,7 @@ def test_poses_are_recognised_and_read_like_any_array(tmp_path):
     assert not is_own_file(tmp_path / "truth.npy")
 
 
-def test_poses_of_this_program_beside_a_recording_are_replaced(tmp_path):
+def test_poses_in_recording_are_overwritten_only_if_own_file(tmp_path):
     (tmp_path / "images").mkdir()
     (tmp_path / "images" / "0.png").touch()
     out = tmp_path / "poses.npy"
@@ -134,7 +134,7 @@ def test_poses_of_this_program_beside_a_recording_are_replaced(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["a\0b.ply", "x" * 5000, f"{'x' * 300}.ply"])
-def test_names_that_no_file_can_have_are_refused(tmp_path, name):
+def test_check_file_path_refuses_impossible_names(tmp_path, name):
     with pytest.raises(OutputError):
         check_file_path(Path(f"{tmp_path}/{name}"), [tmp_path / "in"])
 
@@ -170,7 +170,7 @@ FOREIGN = {
 
 
 @pytest.mark.parametrize("what", FOREIGN)
-def test_a_second_run_refuses_a_folder_whose_results_were_changed(tmp_path, what):
+def test_second_run_refuses_output_folder_with_changed_results(tmp_path, what):
     out = tmp_path / "out"
     _first_run(out)
     FOREIGN[what](out)
@@ -181,7 +181,7 @@ def test_a_second_run_refuses_a_folder_whose_results_were_changed(tmp_path, what
 
 
 @pytest.mark.parametrize("what", [what for what in FOREIGN if what != "another page"])
-def test_files_that_appear_during_the_second_run_are_kept(tmp_path, what):
+def test_foreign_files_added_during_second_run_are_kept(tmp_path, what):
     out = tmp_path / "out"
     _first_run(out)
     _second_run(out, lambda: FOREIGN[what](out))
@@ -194,7 +194,7 @@ def test_files_that_appear_during_the_second_run_are_kept(tmp_path, what):
 
 
 @pytest.mark.parametrize("name", [".run-notes", ".old-photos", ".complete-work", "notes.txt", "recordings"])
-def test_other_files_in_the_folder_stay(tmp_path, name):
+def test_second_run_keeps_other_files_in_output_folder(tmp_path, name):
     out = tmp_path / "out"
     _first_run(out)
     (out / name).mkdir()
@@ -203,7 +203,7 @@ def test_other_files_in_the_folder_stay(tmp_path, name):
     assert (out / name / "x").read_text() == "mine"
 
 
-def test_a_folder_of_an_earlier_version_is_replaced_where_its_files_are_known(tmp_path):
+def test_output_folder_of_older_version_is_replaced_if_files_are_known(tmp_path):
     out = tmp_path / "out"
     _first_run(out)
     marker = out / ".intrasplat.json"

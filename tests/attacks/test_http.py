@@ -41,14 +41,14 @@ def asked_from(client: TestClient, headers, caplog) -> str:
     return caplog.records[-1].facts["address"]
 
 
-def test_a_stranger_cannot_say_where_it_comes_from(served, caplog):
+def test_forwarded_headers_of_untrusted_client_are_ignored(served, caplog):
     client = served()
     for headers in ({"X-Forwarded-For": "1.2.3.4"}, {"Forwarded": "for=1.2.3.4"}, {"X-Real-IP": "1.2.3.4"}):
         assert asked_from(client, headers, caplog) == "10.0.0.9"
     assert "strict-transport-security" not in client.get("/livez", headers={"X-Forwarded-Proto": "https"}).headers
 
 
-def test_behind_a_proxy_the_last_stranger_counts(served, caplog):
+def test_last_untrusted_address_behind_trusted_proxies_is_logged(served, caplog):
     client = served(server={"trusted_proxies": ["10.0.0.9", "10.1.0.0/16"]})
     for value, address in (
         ("1.2.3.4", "1.2.3.4"),
@@ -61,7 +61,7 @@ def test_behind_a_proxy_the_last_stranger_counts(served, caplog):
     assert client.get("/livez", headers={"X-Forwarded-Proto": "https"}).headers["strict-transport-security"]
 
 
-def test_a_proxy_s_other_headers_name_no_host_and_no_scheme_of_their_own(served, caplog):
+def test_proxy_headers_do_not_change_host_or_scheme(served, caplog):
     client = served(server={"trusted_proxies": ["10.0.0.9"], "allowed_hosts": ["room-1.example"]})
     for forged in ({"X-Forwarded-Host": "localhost"}, {"Forwarded": "host=localhost"}, {"X-Host": "localhost"}):
         assert client.get("/livez", headers={"Host": "evil.example", **forged}).status_code == 421
@@ -74,7 +74,7 @@ def test_a_proxy_s_other_headers_name_no_host_and_no_scheme_of_their_own(served,
         assert client.get("/livez", headers={"X-Forwarded-For": value}).status_code == 200, value
 
 
-def test_a_rate_is_not_escaped_by_forged_addresses(served):
+def test_forged_forwarded_addresses_do_not_evade_rate_limit(served):
     client = served(limits={"address_requests_per_s": 0.05, "burst_s": 40})
     answers = [client.get("/livez", headers={"X-Forwarded-For": f"1.2.3.{n}"}).status_code for n in range(5)]
     assert answers[-1] == 429
@@ -89,7 +89,7 @@ def test_a_rate_is_not_escaped_by_forged_addresses(served):
         {"X-Original-URL": "/livez"}, {"X-HTTP-Method-Override": "GET"}, {"Authorization": "Bearer \xff"},
     ],
 )  # fmt: skip
-def test_no_other_way_in(served, headers):
+def test_malformed_or_misplaced_keys_return_401(served, headers):
     client = served()
     given = {name: value.replace("KEY", client.app.state.key).encode("latin1") for name, value in headers.items()}
     answer = client.get("/v1/version", headers=given)
@@ -97,7 +97,7 @@ def test_no_other_way_in(served, headers):
     assert client.get(f"/v1/version?ticket={client.app.state.key}&key={client.app.state.key}").status_code == 401
 
 
-def test_two_keys_are_none(served):
+def test_two_authorization_headers_return_401(served):
     client = served()
     right = f"Bearer {client.app.state.key}"
     assert client.get("/v1/version", headers={"Authorization": right}).status_code == 200
@@ -113,7 +113,7 @@ def test_two_keys_are_none(served):
         "/v1/version;x", "/metrics/", "/readyz/x", "/v1/models/liver/versions/1e3", "/v1/models/liver/versions/-1",
     ],
 )  # fmt: skip
-def test_odd_paths_give_a_problem_and_no_file(served, path):
+def test_odd_paths_return_problem_document(served, path):
     client = served()
     answer = client.get(path, headers={"Authorization": f"Bearer {client.app.state.key}"})
     assert answer.status_code in (404, 422, 503), answer.text
@@ -121,7 +121,7 @@ def test_odd_paths_give_a_problem_and_no_file(served, path):
 
 
 @pytest.mark.parametrize("method", ["TRACE", "CONNECT", "OPTIONS", "PROPFIND", "X" * 1000])
-def test_odd_methods_are_405_and_no_label(served, method):
+def test_odd_methods_return_405_and_are_not_metric_labels(served, method):
     client = served()
     answer = client.request(method, "/v1/version", headers={"Origin": "https://evil.example"})
     assert answer.status_code == 405 and answer.headers["content-type"] == PROBLEM_JSON
@@ -139,7 +139,7 @@ def test_odd_methods_are_405_and_no_label(served, method):
     ],
     ids=lambda body: repr(body[:20]),
 )  # fmt: skip
-def test_bodies_that_are_none_are_refused(served, body):
+def test_malformed_json_bodies_return_400_or_422(served, body):
     client = served()
     headers = {"Authorization": f"Bearer {client.app.state.key}", "Content-Type": "application/json"}
     for path in ("/v1/keys", "/v1/tickets", "/v1/streams", "/v1/models/a/activate"):
@@ -147,7 +147,7 @@ def test_bodies_that_are_none_are_refused(served, body):
         assert answer.status_code in (400, 422) and answer.headers["content-type"] == PROBLEM_JSON, answer.text
 
 
-def test_paths_are_no_labels(served):
+def test_request_paths_are_not_metric_labels(served):
     client = served()
     for number in range(20):
         client.get(f"/v1/models/patient-{number}/versions")
@@ -156,7 +156,7 @@ def test_paths_are_no_labels(served):
     assert "patient" not in metrics and 'route="unmatched"' in metrics
 
 
-def test_a_line_of_the_log_cannot_be_forged():
+def test_json_formatter_escapes_newlines_and_hides_passwords():
     message = 'x\n{"level": "info", "message": "forged"}\r\n\x1b[31m rtsp://u:pa55@h/'
     record = logging.LogRecord("x", logging.INFO, "", 0, "%s", (message,), None)
     record.__dict__[FACTS] = {"address": "a\nb"}

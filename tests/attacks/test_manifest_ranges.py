@@ -58,14 +58,14 @@ def refused(bundle, name: str) -> str:
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("value", NO_INTEGERS, ids=lambda value: f"{value!r:.12}")
-def test_integers(bundle, path, value):
+def test_manifest_integers_out_of_range_are_refused(bundle, path, value):
     bundle.set(path, value)
     refused(bundle, path.split(".")[-1])
 
 
 @pytest.mark.parametrize("path", ["field.origin_s", "field.spacing_s"])
 @pytest.mark.parametrize("value", NO_NUMBERS, ids=lambda value: f"{value!r:.12}")
-def test_numbers(bundle, path, value):
+def test_manifest_numbers_of_other_type_or_range_are_refused(bundle, path, value):
     bundle.set(path, value)
     refused(bundle, path.split(".")[-1])
 
@@ -76,12 +76,12 @@ def test_numbers(bundle, path, value):
     [[0, 1e9], [-1e9, 0], [0, 400_000], [1, 0], [0], [0, 1, 2], [0, "1"], [0, 10**400], [0, True], None, 5, {"0": 1}, [[0], [1]]],
     ids=lambda value: f"{value!r:.16}",
 )  # fmt: skip
-def test_time_windows(bundle, path, window):
+def test_manifest_with_invalid_time_window_is_refused(bundle, path, window):
     bundle.set(path, window)
     refused(bundle, "time_window_s")
 
 
-def test_a_day_is_the_longest_that_a_model_has_seen(bundle):
+def test_manifest_time_window_is_limited_to_one_day(bundle):
     bundle.set("time_window_s", [1e9, 1e9 + 86_400])
     assert load_bundle(bundle.folder).time_window_s == (1e9, 1e9 + 86_400)
     bundle.set("time_window_s", [1e9, 1e9 + 86_401])
@@ -91,12 +91,12 @@ def test_a_day_is_the_longest_that_a_model_has_seen(bundle):
 @pytest.mark.parametrize(
     ("width", "height"), [(16_385, 1), (1, 16_385), (65_536, 65_536), (0, 8), (8, 0), (16_384, 16_384), (8192, 8193)]
 )
-def test_images_that_are_too_large(bundle, width, height):
+def test_manifest_with_invalid_image_size_is_refused(bundle, width, height):
     bundle.edit(lambda values: values["camera"].update(width_px=width, height_px=height))
     refused(bundle, "camera")
 
 
-def test_the_largest_image_is_accepted(bundle):
+def test_manifest_with_largest_image_size_is_accepted(bundle):
     bundle.edit(lambda values: values["camera"].update(width_px=16_384, height_px=4096))
     assert load_bundle(bundle.folder).camera.width_px == 16_384
 
@@ -120,7 +120,7 @@ def test_the_largest_image_is_accepted(bundle):
     ],
     ids=lambda value: f"{value!r:.24}",
 )
-def test_intrinsics(bundle, K):
+def test_manifest_with_invalid_intrinsics_is_refused(bundle, K):
     bundle.set("camera.K", K)
     refused(bundle, "K")
 
@@ -144,12 +144,12 @@ def test_intrinsics(bundle, K):
     ],
     ids=lambda value: f"{value!r:.24}",
 )
-def test_poses(bundle, matrix):
+def test_manifest_with_invalid_pose_is_refused(bundle, matrix):
     bundle.set("camera.world_to_camera", matrix)
     refused(bundle, "camera: ")
 
 
-def test_a_rotation_that_was_rounded_is_accepted(bundle):
+def test_manifest_with_rounded_rotation_is_accepted(bundle):
     angle = 0.3
     rotation = [[math.cos(angle), -math.sin(angle), 0], [math.sin(angle), math.cos(angle), 0], [0, 0, 1]]
     rounded = np.round(rotation, 4)
@@ -158,7 +158,7 @@ def test_a_rotation_that_was_rounded_is_accepted(bundle):
 
 
 @pytest.mark.parametrize("value", [None, "", "fisheye2", 3, ["pinhole"], "pinhole" * 10_000])
-def test_camera_models(bundle, value):
+def test_manifest_with_unknown_camera_model_is_refused(bundle, value):
     bundle.set("camera.model", value)
     refused(bundle, "model")
 
@@ -167,12 +167,12 @@ def test_camera_models(bundle, value):
     ("path", "value"),
     [("units.length", "m"), ("units.length", None), ("units.time", "ms"), ("units", []), ("units", None)],
 )
-def test_other_units_are_not_taken_for_ours(bundle, path, value):
+def test_manifest_with_other_units_is_refused(bundle, path, value):
     bundle.set(path, value)
     refused(bundle, path.split(".")[-1])
 
 
-def test_a_number_of_parameters_that_is_not_the_tensors_is_refused(bundle):
+def test_manifest_with_wrong_parameter_count_is_refused(bundle):
     bundle.edit(lambda values: values.update(parameters=values["parameters"] + 1))
     refused(bundle, "parameters")
 
@@ -195,7 +195,7 @@ def test_a_number_of_parameters_that_is_not_the_tensors_is_refused(bundle):
         ("levels", [65]),
     ],
 )
-def test_sizes_of_a_hexplane(hexplane_bundle, name, value):
+def test_manifest_with_invalid_hexplane_sizes_is_refused(hexplane_bundle, name, value):
     hexplane_bundle.set(f"field.{name}", value)
     refused(hexplane_bundle, name)
 
@@ -208,25 +208,25 @@ def test_sizes_of_a_hexplane(hexplane_bundle, name, value):
         {"channels": 3},
     ],
 )
-def test_sizes_that_the_file_does_not_hold_take_no_memory(hexplane_bundle, sizes):
+def test_hexplane_sizes_beyond_file_size_are_refused(hexplane_bundle, sizes):
     """The largest that the ranges allow is some 10^17 bytes."""
     hexplane_bundle.edit(lambda values: (values["field"].update(sizes), values.pop("parameters")))
     refused(hexplane_bundle, "describes")
 
 
 @pytest.mark.parametrize("kind", [None, "", "auto", "__import__('os').system('true')", 7, ["basis"], "x" * 100_000])
-def test_kinds_of_field(bundle, kind):
+def test_manifest_with_unknown_field_kind_is_refused(bundle, kind):
     bundle.set("field.kind", kind)
     assert "known are basis, hexplane" in refused(bundle, "field")
 
 
 @pytest.mark.parametrize("value", [[], "basis", 5, True])
-def test_a_field_that_is_no_object(bundle, value):
+def test_manifest_field_that_is_no_object_is_refused(bundle, value):
     bundle.set("field", value)
     refused(bundle, "field must be a JSON object")
 
 
-def test_a_name_that_occurs_twice_is_refused(bundle):
+def test_manifest_with_duplicate_key_is_refused(bundle):
     text = bundle.manifest.read_text()
     bundle.manifest.write_text(text.replace('"version": 1', '"version": 1, "version": 2'))
     refused(bundle, "'version' occurs twice")
@@ -234,7 +234,7 @@ def test_a_name_that_occurs_twice_is_refused(bundle):
 
 @pytest.mark.parametrize("depth", [17, 900, 200_000])
 @pytest.mark.parametrize(("start", "end"), [("[", "]"), ('{"a":', "}")])
-def test_deep_nesting_is_refused(bundle, depth, start, end):
+def test_deeply_nested_manifest_is_refused(bundle, depth, start, end):
     nested = start * depth + "1" + end * depth
     bundle.manifest.write_text('{"format_version": 1, "more": ' + nested + "}")
     with pytest.raises(BundleCorrupt, match=r"manifest\.json"):
@@ -242,19 +242,19 @@ def test_deep_nesting_is_refused(bundle, depth, start, end):
 
 
 @pytest.mark.parametrize("text", ["1e400", "-1e400", "NaN", "Infinity", "1" + "0" * 5000, "0x10", "1_000", "٣"])
-def test_numbers_that_json_does_not_have(bundle, text):
+def test_manifest_with_invalid_json_numbers_is_refused(bundle, text):
     values = bundle.manifest.read_text()
     bundle.manifest.write_text(values.replace('"spacing_s": ', f'"spacing_s": {text}, "was": '))
     with pytest.raises(BundleCorrupt, match=r"manifest\.json"):
         load_bundle(bundle.folder)
 
 
-def test_names_that_are_not_known_are_ignored(bundle):
+def test_unknown_manifest_keys_are_ignored(bundle):
     bundle.edit(lambda values: values.update(comment="\ud800", more=[1, {"a": None}]))
     assert load_bundle(bundle.folder).gaussians.count == 5
 
 
-def test_what_could_not_be_read_again_is_not_written(tmp_path):
+def test_save_bundle_refuses_values_out_of_range(tmp_path):
     gaussians = Gaussians(*(torch.zeros(2, *shape) for shape in ((3,), (4,), (3,), (), (1, 3))))
     camera = Camera.from_focal(50.0, 8, 8)
     save_bundle(Model(1, gaussians, None, camera, (0.0, 1.0)), tmp_path)
@@ -270,7 +270,7 @@ def test_what_could_not_be_read_again_is_not_written(tmp_path):
     assert load_bundle(tmp_path).version == 1
 
 
-def test_the_documentation_states_the_ranges():
+def test_bundle_documentation_states_manifest_ranges():
     text = (Path(__file__).parents[2] / "docs" / "design" / "bundle.md").read_text(encoding="utf-8")
     ranges = (VERSION, COUNT, SH_DEGREE, SIDE_PX, FOCAL_PX, INTRINSICS_PX, POSE)
     for low, high in [(each.low, each.high) for each in ranges]:

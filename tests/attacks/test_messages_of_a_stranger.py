@@ -74,7 +74,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_what_is_no_frame_is_refused_before_anything_is_allocated(name):
+def test_decode_message_refuses_malformed_data_without_allocating(name):
     tracemalloc.start()
     with pytest.raises(InvalidMessage):
         decode_message(memoryview(BAD[name]))
@@ -84,7 +84,7 @@ def test_what_is_no_frame_is_refused_before_anything_is_allocated(name):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_messages_with_bytes_changed_are_frames_or_refused(seed):
+def test_decode_message_of_fuzzed_bytes_yields_valid_frame_or_raises(seed):
     rng = random.Random(seed)
     for _ in range(300):
         data = bytearray(GOOD)
@@ -97,7 +97,7 @@ def test_messages_with_bytes_changed_are_frames_or_refused(seed):
         assert frame.image.nbytes == len(data) - 32 and 0 <= frame.seq < 2**62 and abs(frame.pts_ns) < 2**62
 
 
-def test_a_sender_of_nonsense_takes_nothing_down(tmp_path, monkeypatch):
+def test_zeromq_source_skips_malformed_messages(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with zmq.Context() as context, context.socket(zmq.PUB) as socket:
         socket.setsockopt(zmq.LINGER, 0)
@@ -126,7 +126,7 @@ def test_a_sender_of_nonsense_takes_nothing_down(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_message_larger_than_any_frame_is_never_received(monkeypatch):
+def test_zeromq_source_drops_oversized_message_and_reconnects(monkeypatch):
     monkeypatch.setattr("operators.sources.zeromq.MAX_MESSAGE_BYTES", 10_000)
     with zmq.Context() as context, context.socket(zmq.PUB) as socket:
         socket.setsockopt(zmq.LINGER, 0)
@@ -156,7 +156,7 @@ def test_a_message_larger_than_any_frame_is_never_received(monkeypatch):
             thread.join()
 
 
-def test_nothing_of_ours_unpickles():
+def test_frame_transport_modules_do_not_import_pickle():
     for module in (frame_codec, process, zeromq):
         assert "pickle" not in vars(module)
 
@@ -183,7 +183,7 @@ GOOD_PIECES = [bytes(piece) for piece in encode(Frame(1, 2, np.full((4, 6, 3), 5
         (64, [32, 72, 2]),
     ],
 )
-def test_a_process_that_says_nonsense_of_its_memory_is_refused(offset, sizes):
+def test_frame_reader_refuses_invalid_offset_and_sizes(offset, sizes):
     fd = new_memory()
     writer, reader = FrameWriter(fd), FrameReader(fd)
     writer.grow(GOOD_PIECES)
@@ -195,7 +195,7 @@ def test_a_process_that_says_nonsense_of_its_memory_is_refused(offset, sizes):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_pieces_with_bytes_changed_are_frames_or_refused(seed):
+def test_decode_of_fuzzed_pieces_yields_valid_frame_or_raises(seed):
     rng = random.Random(seed)
     for _ in range(300):
         pieces = [bytearray(piece) for piece in GOOD_PIECES]
@@ -210,12 +210,12 @@ def test_pieces_with_bytes_changed_are_frames_or_refused(seed):
 
 
 @pytest.mark.parametrize("data", [b"", b"[]", b"{", b'{"kind": 3}', struct.pack("<I", 7), b"\xff\xfe", b'{"kind"'])
-def test_what_is_no_message_of_a_process_is_refused(data):
+def test_parsed_refuses_malformed_process_message(data):
     with pytest.raises(InvalidMessage):
         parsed(data)
 
 
-def test_what_describes_no_source_is_refused():
+def test_source_description_from_json_refuses_incomplete_content():
     for content in (
         None,
         {},

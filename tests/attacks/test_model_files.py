@@ -82,7 +82,7 @@ PLACED = [pipe, listening_socket, Path.mkdir, dangling_link, link_to_itself, lin
 
 @pytest.mark.parametrize("place", PLACED, ids=lambda place: place.__name__)
 @pytest.mark.parametrize("name", FILES)
-def test_what_is_no_plain_file_in_the_folder_is_refused_at_once(bundle, name: str, place: Callable[[Path], object]):
+def test_load_bundle_refuses_non_regular_files_without_waiting(bundle, name: str, place: Callable[[Path], object]):
     (bundle.folder / name).unlink()
     place(bundle.folder / name)
     with seconds(10), pytest.raises(BundleError, match=name.split(".")[0]) as refused:
@@ -91,21 +91,21 @@ def test_what_is_no_plain_file_in_the_folder_is_refused_at_once(bundle, name: st
 
 
 @pytest.mark.parametrize("place", PLACED[:-1], ids=lambda place: place.__name__)
-def test_the_same_in_place_of_a_ply(tmp_path, place):
+def test_load_ply_refuses_non_regular_files_without_waiting(tmp_path, place):
     place(tmp_path / "a.ply")
     with seconds(10), pytest.raises(BundleError, match=r"a\.ply"):
         load_ply(tmp_path / "a.ply")
 
 
 @pytest.mark.parametrize("next_manifest", [pipe, Path.mkdir, link_out])
-def test_a_manifest_of_an_interrupted_save_has_to_be_a_plain_file_too(bundle, next_manifest):
+def test_load_bundle_refuses_non_regular_next_manifest(bundle, next_manifest):
     bundle.set("tensors.bytes", 1)
     next_manifest(bundle.folder / "manifest.next.json")
     with seconds(10), pytest.raises(BundleError):
         load_bundle(bundle.folder)
 
 
-def test_a_link_within_the_folder_and_a_link_to_the_folder_are_followed(bundle, tmp_path):
+def test_load_bundle_follows_links_within_and_to_folder(bundle, tmp_path):
     bundle.tensors.rename(bundle.folder / "tensors.bin")
     bundle.tensors.symlink_to("tensors.bin")
     (tmp_path / "latest").symlink_to(bundle.folder)
@@ -113,18 +113,18 @@ def test_a_link_within_the_folder_and_a_link_to_the_folder_are_followed(bundle, 
 
 
 @pytest.mark.parametrize("name", ["a\0b", "x" * 5000, "plain/model"])
-def test_a_folder_with_an_impossible_name(tmp_path, name):
+def test_load_bundle_raises_for_impossible_folder_name(tmp_path, name):
     (tmp_path / "plain").write_bytes(b"")
     with pytest.raises(BundleError):
         load_bundle(tmp_path / name)
 
 
-def test_a_file_in_place_of_the_folder(bundle):
+def test_load_bundle_raises_for_file_in_place_of_folder(bundle):
     with pytest.raises(BundleError):
         load_bundle(bundle.tensors)
 
 
-def test_a_model_that_does_not_fit_into_memory_is_refused_with_what_it_needs(bundle, tmp_path, monkeypatch):
+def test_model_larger_than_memory_is_refused_with_required_size(bundle, tmp_path, monkeypatch):
     monkeypatch.setattr(model_files, "available_bytes", lambda: 100)
     with pytest.raises(BundleError, match=r"needs \d+\.\d GiB of memory to load, and 0\.0 GiB are available"):
         load_bundle(bundle.folder)
@@ -135,7 +135,7 @@ def test_a_model_that_does_not_fit_into_memory_is_refused_with_what_it_needs(bun
 
 
 @pytest.mark.parametrize("count", [20_000_000, 50_000_000])
-def test_a_file_that_is_mostly_a_hole_is_not_read(bundle, monkeypatch, count):
+def test_load_bundle_refuses_sparse_tensor_file_larger_than_memory(bundle, monkeypatch, count):
     """Sizes that agree cost an attacker nothing on a file system with holes."""
     monkeypatch.setattr(model_files, "available_bytes", lambda: 2**30)
     size = 4 * count * (14 + 6 * 15)
@@ -175,7 +175,7 @@ def loaded_or_refused(load: Callable[[], Any]) -> None:
 @pytest.mark.slow
 @FUZZ
 @given(data=st.data())
-def test_any_value_in_any_place_of_a_manifest(bundle, data):
+def test_manifest_with_fuzzed_values_loads_or_raises_bundle_error(bundle, data):
     values = bundle.values()
     before = bundle.manifest.read_bytes()
     for place in data.draw(st.lists(st.sampled_from(list(places(values))), min_size=1, max_size=3)):
@@ -195,7 +195,7 @@ def test_any_value_in_any_place_of_a_manifest(bundle, data):
 
 @FUZZ
 @given(changes=st.lists(st.tuples(st.integers(0, 2000), st.integers(0, 255)), min_size=1, max_size=6))
-def test_any_bytes_of_a_manifest(bundle, changes):
+def test_manifest_with_fuzzed_bytes_loads_or_raises_bundle_error(bundle, changes):
     before = bundle.manifest.read_bytes()
     text = bytearray(before)
     for at, value in changes:
@@ -210,7 +210,7 @@ def test_any_bytes_of_a_manifest(bundle, changes):
 @pytest.mark.slow
 @FUZZ
 @given(data=st.data())
-def test_any_change_of_the_tensors_header(bundle, data):
+def test_fuzzed_tensor_header_loads_or_raises_bundle_error(bundle, data):
     files = bundle.manifest.read_bytes(), bundle.tensors.read_bytes()
     header = bytearray(bundle.header_and_data()[0])
     if data.draw(st.booleans()):
@@ -242,7 +242,7 @@ def ply(tmp_path) -> bytes:
 
 @FUZZ
 @given(data=st.data())
-def test_any_change_of_a_ply(ply, tmp_path, data):
+def test_fuzzed_ply_loads_or_raises_bundle_error(ply, tmp_path, data):
     lines = ply.split(b"\n")
     at = data.draw(st.integers(0, ply[: ply.index(b"end_header")].count(b"\n")))
     words = [
@@ -267,7 +267,7 @@ def test_any_change_of_a_ply(ply, tmp_path, data):
 
 
 @pytest.mark.parametrize("value", [1e300, -1e39, float("inf")])
-def test_a_double_beyond_a_float_is_infinite_and_refused(tmp_path, value):
+def test_load_ply_refuses_double_beyond_float_range(tmp_path, value):
     names = [
         "x",
         "y",

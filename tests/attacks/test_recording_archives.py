@@ -62,53 +62,53 @@ def refused(tmp_path):
         "..\\evil", "images\\..\\evil", "\\\\host\\share", "../.hidden", "__MACOSX/../../evil",
     ],
 )  # fmt: skip
-def test_no_name_leads_out(refused, name):
+def test_archive_with_path_traversal_is_refused(refused, name):
     assert "leads out of the recording" in refused(archive((name, b"x")))
 
 
 @pytest.mark.parametrize(
     "name", ["imag\u00e9s/1.png", "a\nb", "a\x1b[31m", "-rf", "a" * 101, "a;b", "\u202egnp.exe", "$(id)"]
 )
-def test_odd_names_are_refused_and_not_repeated(refused, name):
+def test_archive_with_odd_names_is_refused_without_repeating_name(refused, name):
     said = refused(archive((name, b"x")))
     assert "other signs than letters" in said and name not in said
 
 
-def test_a_zero_byte_in_a_name_hides_nothing(refused):
+def test_archive_with_zero_byte_in_name_is_refused(refused):
     content = archive(("aaaa/evil.png", b"x")).replace(b"aaaa/evil", b"aaaa\0evil")
     assert "leads out" in refused(content) or "damaged" in refused(content)
 
 
 @pytest.mark.parametrize("kind", [stat.S_IFLNK, stat.S_IFCHR, stat.S_IFIFO, stat.S_IFSOCK, stat.S_IFBLK])
 @pytest.mark.parametrize("system", [0, 3])
-def test_links_and_devices_are_refused(refused, kind, system):
+def test_archive_with_link_or_device_is_refused(refused, kind, system):
     entry = marked("images", external_attr=(kind | 0o777) << 16, create_system=system)
     assert "link or a device" in refused(archive((entry, b"/etc")))
 
 
-def test_a_link_made_by_unzip_is_never_followed(refused):
+def test_archive_writing_through_link_is_refused(refused):
     link = marked("images", external_attr=(stat.S_IFLNK | 0o777) << 16)
     assert "link or a device" in refused(archive((link, b"/tmp"), ("images/evil", b"x")))
 
 
-def test_a_bomb_is_refused_before_it_is_unpacked(refused, tmp_path):
+def test_archive_over_compression_ratio_is_refused_before_unpacking(refused, tmp_path):
     said = refused(archive(("depth.npy", bytes(2 << 20)), method=zipfile.ZIP_DEFLATED))
     assert "over 100 times as many" in said and not (tmp_path / "inside" / "recording").exists()
 
 
-def test_many_small_bombs_are_one(refused):
+def test_archive_over_total_size_is_refused(refused):
     files = [(f"{n}.npy", bytes(1 << 20)) for n in range(4)]
     assert "holds 4194304 bytes; at most 3145728" in refused(archive(*files, method=zipfile.ZIP_DEFLATED))
 
 
-def test_so_many_files_and_no_more(refused, tmp_path):
+def test_archive_over_entry_limit_is_refused(refused, tmp_path):
     assert "has 6 files; at most 5" in refused(archive(*[(f"{n}.png", b"x") for n in range(6)]))
     (tmp_path / "five").write_bytes(archive(*[(f"{n}.png", b"x") for n in range(5)]))
     unpack(tmp_path / "five", tmp_path / "recording", SMALL)
     assert len(list((tmp_path / "recording").iterdir())) == 5
 
 
-def test_a_file_that_is_longer_than_its_list_says(refused):
+def test_archive_file_longer_than_listed_is_refused(refused):
     packed = zlib.compressobj(9, zlib.DEFLATED, -15)
     data = packed.compress(bytes(1 << 20)) + packed.flush()
     content = bytearray(archive(("a.npy", bytes(1 << 20)), method=zipfile.ZIP_DEFLATED))
@@ -118,27 +118,27 @@ def test_a_file_that_is_longer_than_its_list_says(refused):
     assert "damaged" in refused(bytes(content))
 
 
-def test_files_in_the_same_place_are_refused(refused):
+def test_archive_with_overlapping_files_is_refused(refused):
     content = bytearray(archive(("a.png", b"x" * 100), ("b.png", b"y" * 100)))
     second = content.rindex(b"PK\x01\x02")
     struct.pack_into("<I", content, second + 42, 0)  # b's list entry points at a
     assert "in the same place" in refused(bytes(content))
 
 
-def test_a_file_may_not_reach_into_the_list(refused):
+def test_archive_file_reaching_into_directory_is_refused(refused):
     content = bytearray(archive(("a.png", b"x" * 100)))
     for signature, offset in ((b"PK\x03\x04", 18), (b"PK\x01\x02", 20)):
         struct.pack_into("<II", content, content.index(signature) + offset, 120, 120)
     assert "into the list" in refused(bytes(content))
 
 
-def test_a_giant_list_is_not_read(refused):
+def test_archive_with_giant_directory_is_refused(refused):
     end = struct.pack("<4s4H2LH", b"PK\x05\x06", 0, 0, 1, 1, MOST_LIST_BYTES + 1, 4, 0)
     assert "list of files has" in refused(b"PK\x03\x04" + bytes(MOST_LIST_BYTES + 1) + end)
 
 
 @pytest.mark.parametrize("stated", [0, 1, 3, 60000])
-def test_the_number_of_files_must_be_the_stated_one(refused, stated):
+def test_archive_with_wrong_entry_count_is_refused(refused, stated):
     content = bytearray(archive(("a.png", b"x"), ("b.png", b"y")))
     struct.pack_into("<HH", content, len(content) - 14, stated, stated)
     assert "says that there are" in refused(bytes(content))
@@ -156,11 +156,11 @@ def test_the_number_of_files_must_be_the_stated_one(refused, stated):
         lambda content: content.replace(b"PK\x01\x02", b"PK\x01\x03"),
     ],
 )
-def test_cut_and_extended_archives_are_refused(refused, change):
+def test_truncated_or_extended_archive_is_refused(refused, change):
     assert refused(change(archive(("a.png", b"x" * 50))))
 
 
-def test_the_larger_format_is_refused(refused):
+def test_zip64_archive_is_refused(refused):
     content = archive(("a.png", b"x"))
     locator = struct.pack("<4sLQL", b"PK\x06\x07", 0, 0, 1)
     assert "zip64" in refused(content[:-22] + locator + content[-22:])
@@ -170,41 +170,41 @@ def test_the_larger_format_is_refused(refused):
 
 
 @pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
-def test_other_ways_of_packing_are_refused(refused, method):
+def test_archive_with_other_compression_method_is_refused(refused, method):
     assert f"by method {method}" in refused(archive(("a.png", b"x" * 100), method=method))
 
 
-def test_encrypted_files_are_refused(refused):
+def test_encrypted_archive_is_refused(refused):
     content = bytearray(archive(("a.png", b"x" * 100)))
     for signature, offset in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
         struct.pack_into("<H", content, content.index(signature) + offset, 1)
     assert "encrypted" in refused(bytes(content))
 
 
-def test_a_wrong_checksum_is_damage(refused):
+def test_archive_with_wrong_checksum_is_refused(refused):
     content = archive(("a.png", b"x" * 100))
     assert "damaged" in refused(content.replace(b"x" * 100, b"x" * 99 + b"y"))
 
 
 @pytest.mark.filterwarnings("ignore:Duplicate name")
 @pytest.mark.parametrize("names", [("a.png", "a.png"), ("a.png", "A.PNG"), ("images", "images/a.png")])
-def test_no_file_takes_anothers_place(refused, names):
+def test_archive_with_colliding_names_is_refused(refused, names):
     assert "same name" in refused(archive(*[(name, b"x") for name in names])) or "name of a folder" in refused(
         archive(*[(name, b"x") for name in names])
     )
 
 
-def test_a_local_name_that_differs_from_the_listed_one_is_damage(refused):
+def test_archive_with_differing_local_name_is_refused(refused):
     content = archive(("aa/bb/evil", b"x"))
     assert "damaged" in refused(content.replace(b"aa/bb/evil", b"../../evil", 1))
 
 
 @pytest.mark.parametrize("entries", [(), (("folder/", b""),), ((".hidden", b"x"),), (("__MACOSX/._a", b"x"),)])
-def test_an_archive_without_files_is_refused(refused, entries):
+def test_archive_without_files_is_refused(refused, entries):
     assert "holds no files" in refused(archive(*entries))
 
 
-def test_what_file_managers_add_is_left_out(tmp_path: Path):
+def test_unpack_omits_files_of_file_managers(tmp_path: Path):
     entries = [("case/images/0.png", b"x"), ("__MACOSX/case/images/._0.png", b"y"), ("case/.DS_Store", b"z")]
     (tmp_path / "upload").write_bytes(archive(*entries))
     unpack(tmp_path / "upload", tmp_path / "recording", SMALL)

@@ -59,34 +59,34 @@ def _cameras(root: Path, name: object) -> None:
         ["images/0.png"],
     ],
 )
-def test_file_names_in_cameras_json_stay_inside(tmp_path: Path, name: object) -> None:
+def test_cameras_json_with_file_name_outside_recording_is_refused(tmp_path: Path, name: object) -> None:
     secret = _image(tmp_path / "secret.png")
     _cameras(tmp_path / "rec", str(secret) if name == "{absolute}" else name)
     _refused(tmp_path / "rec", "cameras.json", "file of frame 0")
 
 
-def test_a_link_that_leads_out_is_refused(tmp_path: Path) -> None:
+def test_image_link_leading_out_of_recording_is_refused(tmp_path: Path) -> None:
     secret = _image(tmp_path / "secret.png")
     _cameras(tmp_path / "rec", "innocent.png")
     (tmp_path / "rec" / "innocent.png").symlink_to(secret)
     _refused(tmp_path / "rec", "innocent.png", "leads out")
 
 
-def test_a_folder_link_that_leads_out_is_refused(tmp_path: Path) -> None:
+def test_folder_link_leading_out_of_recording_is_refused(tmp_path: Path) -> None:
     _image(tmp_path / "elsewhere" / "0.png")
     _cameras(tmp_path / "rec", "images/0.png")
     (tmp_path / "rec" / "images").symlink_to(tmp_path / "elsewhere")
     _refused(tmp_path / "rec", "leads out")
 
 
-def test_a_link_inside_is_followed(tmp_path: Path) -> None:
+def test_link_inside_recording_is_followed(tmp_path: Path) -> None:
     _cameras(tmp_path / "rec", "images/0.png")
     _image(tmp_path / "rec" / "raw" / "0.png")
     (tmp_path / "rec" / "images").symlink_to("raw")
     assert len(list(open_recording(tmp_path / "rec"))) == 1
 
 
-def test_link_loops(tmp_path: Path) -> None:
+def test_recording_with_link_loop_is_refused(tmp_path: Path) -> None:
     _cameras(tmp_path / "rec", "loop.png")
     (tmp_path / "rec" / "loop.png").symlink_to("loop.png")
     _refused(tmp_path / "rec", "loop.png", "frame 0")
@@ -99,7 +99,7 @@ def test_link_loops(tmp_path: Path) -> None:
     _refused(images, "0.png", error=RecordingError)
 
 
-def test_a_pipe_in_place_of_a_file_does_not_hang(tmp_path: Path) -> None:
+def test_recording_with_pipe_as_file_is_refused_without_hang(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "0.png")
     _refused(tmp_path, "0.png", "not a plain file")
     os.mkfifo(tmp_path / "video.mp4")
@@ -121,7 +121,7 @@ class _Bomb:
 
 @pytest.mark.parametrize("how", ["object array", "bare pickle"])
 @pytest.mark.parametrize("name", ["poses_bounds.npy", "depth/0.npy"])
-def test_pickled_arrays_are_not_loaded(tmp_path: Path, how: str, name: str) -> None:
+def test_recording_with_pickled_array_is_refused_without_executing(tmp_path: Path, how: str, name: str) -> None:
     root, target = tmp_path / "rec", tmp_path / "executed"
     _image(root / "images" / "0.png")
     path = root / name
@@ -145,12 +145,12 @@ def _png(width: int, height: int) -> bytes:
 
 
 @pytest.mark.parametrize("size", [(100_000, 100_000), (2**31 - 1, 1), (0, 5), (MAX_PIXELS + 1, 1)])
-def test_huge_images_are_refused_by_their_header(tmp_path: Path, size: tuple[int, int]) -> None:
+def test_image_over_pixel_limit_is_refused_by_header(tmp_path: Path, size: tuple[int, int]) -> None:
     (tmp_path / "0.png").write_bytes(_png(*size))
     _refused(tmp_path, "0.png", f"{size[0]}x{size[1]} pixels")
 
 
-def test_huge_arrays_are_refused_by_their_header(tmp_path: Path) -> None:
+def test_huge_npy_array_is_refused_by_header(tmp_path: Path) -> None:
     _image(tmp_path / "images" / "0.png")
     for name, shape in (("poses_bounds.npy", (10**9, 17)), ("depth/0.npy", (10**6, 10**6))):
         path = tmp_path / name
@@ -175,7 +175,7 @@ def test_huge_arrays_are_refused_by_their_header(tmp_path: Path) -> None:
     ],
 )
 @pytest.mark.parametrize("suffix", [".mp4", ".avi", ".mkv"])
-def test_playlists_never_reach_the_decoder(
+def test_playlist_as_video_is_refused_before_decoder(
     tmp_path: Path, text: str, suffix: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def reached(*_: object) -> None:
@@ -190,13 +190,13 @@ def test_playlists_never_reach_the_decoder(
     "text",
     ["[" * 200_000, '{"frames": ' * 50_000, "[1, 2]", '"x"', "\ud800".encode("utf-8", "surrogatepass"), b"\xff\xfe"],
 )
-def test_strange_json(tmp_path: Path, text: str | bytes) -> None:
+def test_malformed_cameras_json_is_refused(tmp_path: Path, text: str | bytes) -> None:
     path = tmp_path / "cameras.json"
     path.write_bytes(text.encode() if isinstance(text, str) else text)
     _refused(tmp_path, "cameras.json")
 
 
-def test_numbers_that_do_not_fit(tmp_path: Path) -> None:
+def test_cameras_json_with_non_finite_or_huge_numbers_is_refused(tmp_path: Path) -> None:
     _image(tmp_path / "0.png")
     for value in ("1e999", "1" + "0" * 400, "-1e308", "true", "NaN"):
         camera = f'{{"width": 32, "height": 32, "fx": {value}, "fy": 30, "cx": 16, "cy": 16, "frames": [1]}}'

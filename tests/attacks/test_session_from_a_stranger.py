@@ -95,13 +95,13 @@ def change_lines(folder: Path, change: Callable[[dict[str, Any]], None], event: 
     ],
     ids=str,
 )
-def test_a_value_that_no_writer_writes(session, values):
+def test_session_with_invalid_frame_values_yields_no_frames(session, values):
     change_lines(session, lambda line: line.update(values))
     found = outcome_of(session)
     assert isinstance(found, str), "no frame of it is whole"
 
 
-def test_numbers_that_repeat_or_go_back_are_left_out(session):
+def test_session_omits_repeated_or_decreasing_frame_numbers(session):
     data = (session / LOG).read_bytes().splitlines(keepends=True)
     (session / LOG).write_bytes(b"".join([*data[:-1], *data[1:]]))
     found = outcome_of(session)
@@ -109,14 +109,14 @@ def test_numbers_that_repeat_or_go_back_are_left_out(session):
 
 
 @pytest.mark.parametrize("value", ["NaN", "Infinity", "-Infinity"])
-def test_numbers_that_are_none(session, value):
+def test_session_with_non_finite_number_is_refused(session, value):
     text = (session / LOG).read_text()
     assert '"fx":20.0,' in text
     (session / LOG).write_text(text.replace('"fx":20.0,', f'"fx":{value},'))
     assert isinstance(outcome_of(session), str)
 
 
-def test_a_line_without_an_end_takes_no_memory(session):
+def test_session_log_with_endless_line_is_refused(session):
     with (session / LOG).open("ab") as file:
         file.truncate(200)
         file.seek(200)
@@ -127,7 +127,7 @@ def test_a_line_without_an_end_takes_no_memory(session):
 @pytest.mark.parametrize(
     "text", [b"", b"[]", b"null", b"{}", b"[" * 100_000, b"\xff\xfe", b'{"format":"other"}', b"{" * 3_000_000]
 )
-def test_a_session_file_that_is_none(session, text):
+def test_malformed_session_json_is_refused(session, text):
     (session / "session.json").write_bytes(text)
     assert isinstance(outcome_of(session), str)
 
@@ -145,7 +145,7 @@ def test_a_session_file_that_is_none(session, text):
     ],
     ids=str,
 )
-def test_a_camera_that_cannot_be(session, camera):
+def test_session_with_invalid_camera_is_refused(session, camera):
     values = json.loads((session / "session.json").read_text())
     values["camera"].update(camera)
     (session / "session.json").write_text(json.dumps(values))
@@ -153,7 +153,7 @@ def test_a_camera_that_cannot_be(session, camera):
 
 
 @pytest.mark.parametrize("name", [LOG, IMAGE, "session.json", "segments/000000", "segments"])
-def test_links_are_not_followed(session, tmp_path, name):
+def test_session_with_links_is_refused(session, tmp_path, name):
     target = tmp_path / "elsewhere"
     (session / name).rename(target)
     (session / name).symlink_to(target)
@@ -162,7 +162,7 @@ def test_links_are_not_followed(session, tmp_path, name):
 
 
 @pytest.mark.parametrize("name", [LOG, IMAGE])
-def test_a_pipe_is_not_waited_for(session, name):
+def test_session_with_pipe_as_file_is_refused_without_hang(session, name):
     (session / name).unlink()
     os.mkfifo(session / name)
     assert isinstance(outcome_of(session), str)
@@ -192,14 +192,14 @@ def other_video(path: Path, codec: str, pixels: str, width: int = 24, height: in
         ("libx264", "yuv420p", (24, 16)),
     ],
 )
-def test_another_video_under_the_name_of_a_track(session, codec, pixels, size):
+def test_session_track_with_other_video_is_refused_or_damaged(session, codec, pixels, size):
     other_video(session / IMAGE, codec, pixels, *size)
     found = outcome_of(session)
     assert isinstance(found, str) or all(frame.status is FrameStatus.DAMAGED for frame in found)
 
 
 @pytest.mark.slow
-def test_bits_that_flip_anywhere_raise_nothing(session, whole, rng):
+def test_session_with_flipped_bits_yields_true_or_damaged_frames(session, whole, rng):
     """An image that is not reported as damaged equals the recorded one byte for byte."""
     names = [str(path.relative_to(whole)) for path in whole.rglob("*") if path.is_file()]
     for k in range(120):
@@ -217,7 +217,7 @@ def test_bits_that_flip_anywhere_raise_nothing(session, whole, rng):
 
 
 @pytest.mark.parametrize("track", ["image", "prepared_loss_mask"])
-def test_what_is_damaged_is_not_given_to_training_as_whole(session, track):
+def test_prepared_frame_of_damaged_track_is_marked_damaged(session, track):
     path = session / f"segments/000000/{track}_24x16.mkv"
     data = bytearray(path.read_bytes())
     with path.open("rb") as file:
@@ -239,7 +239,7 @@ def test_what_is_damaged_is_not_given_to_training_as_whole(session, track):
     ],
     ids=str,
 )
-def test_a_schedule_that_asks_for_what_cannot_be(session, values):
+def test_session_schedule_omits_invalid_observe_lines(session, values):
     change_lines(session, lambda line: line.update(values), "observe")
     outcome_of(session)
     assert not [line for line in SessionReader(session).schedule() if line.event == "observe"]
@@ -257,7 +257,7 @@ def test_a_schedule_that_asks_for_what_cannot_be(session, values):
     ],
     ids=str,
 )
-def test_a_reconstructor_that_cannot_be_made_is_refused(session, tmp_path, made):
+def test_session_with_invalid_reconstructor_is_refused_or_noted(session, tmp_path, made):
     camera = json.loads((session / "session.json").read_text())["camera"]
     line = {
         "event": "reconstructor",
@@ -279,7 +279,7 @@ def test_a_reconstructor_that_cannot_be_made_is_refused(session, tmp_path, made)
         assert followed is None or notes or made == {"config": {"no such setting": 1}}
 
 
-def test_the_fixture_is_read_as_it_was_written(session):
+def test_unmodified_session_is_read_unchanged(session):
     found = outcome_of(session)
     assert all(same_frame(frame, new_frame(frame.seq)) for frame in found)
     assert len(found) == FRAMES

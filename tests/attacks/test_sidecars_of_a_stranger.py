@@ -75,7 +75,7 @@ WRONG: dict[str, Callable[[Path], object]] = {
 
 @pytest.mark.parametrize("name", (*FOLDERS, *FILES))
 @pytest.mark.parametrize("kind", sorted(WRONG))
-def test_what_is_there_and_cannot_be_used_is_an_error(root: Path, name: str, kind: str) -> None:
+def test_unusable_sidecar_is_refused(root: Path, name: str, kind: str) -> None:
     _remove(root / name)
     assert validate_recording(root).ok  # absent is no error
     WRONG[kind](root / name)
@@ -83,14 +83,14 @@ def test_what_is_there_and_cannot_be_used_is_an_error(root: Path, name: str, kin
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_a_folder_in_place_of_a_file(root: Path, name: str) -> None:
+def test_folder_in_place_of_sidecar_file_is_refused(root: Path, name: str) -> None:
     _remove(root / name)
     (root / name).mkdir()
     _refused(root, name)
 
 
 @pytest.mark.parametrize("name", FOLDERS)
-def test_an_empty_folder(root: Path, name: str) -> None:
+def test_empty_sidecar_folder_is_refused(root: Path, name: str) -> None:
     _remove(root / name)
     (root / name).mkdir()
     _refused(root, name, f"for {COUNT} frames")
@@ -98,7 +98,9 @@ def test_an_empty_folder(root: Path, name: str) -> None:
 
 @pytest.mark.parametrize("name", [*(f"{folder}/1.png" for folder in (*FOLDERS, "images")), *FILES])
 @pytest.mark.parametrize("kind", ["dangling", "pipe", "out", "chain"])
-def test_links_and_pipes_among_the_files(root: Path, name: str, kind: str, tmp_path: Path) -> None:
+def test_dangling_outward_and_chained_links_and_pipes_are_refused(
+    root: Path, name: str, kind: str, tmp_path: Path
+) -> None:
     path, outside = root / name, tmp_path / f"outside{Path(name).suffix}"
     path.rename(outside)
     if kind == "dangling":
@@ -114,20 +116,20 @@ def test_links_and_pipes_among_the_files(root: Path, name: str, kind: str, tmp_p
 
 
 @pytest.mark.parametrize("name", (*FOLDERS, "images"))
-def test_a_folder_that_lies_outside(root: Path, name: str, tmp_path: Path) -> None:
+def test_sidecar_folder_linked_outside_is_refused(root: Path, name: str, tmp_path: Path) -> None:
     (root / name).rename(tmp_path / "outside")
     (root / name).symlink_to(tmp_path / "outside")
     _refused(root, name, "leads out")
 
 
-def test_a_link_to_a_video_outside(tmp_path: Path) -> None:
+def test_video_linked_outside_recording_is_refused(tmp_path: Path) -> None:
     (tmp_path / "rec").mkdir()
     (tmp_path / "secret.mp4").write_bytes(b"....ftyp")
     (tmp_path / "rec" / "video.mp4").symlink_to("../secret.mp4")
     _refused(tmp_path / "rec", "video.mp4", "leads out")
 
 
-def test_links_inside_are_followed(root: Path) -> None:
+def test_sidecar_folder_linked_inside_recording_is_followed(root: Path) -> None:
     (root / "masks").rename(root / "real")
     (root / "masks").symlink_to("real")
     assert validate_recording(root).ok
@@ -176,20 +178,20 @@ ARRAYS = {
 
 
 @pytest.mark.parametrize("kind", sorted(ARRAYS))
-def test_hostile_poses(root: Path, kind: str) -> None:
+def test_malformed_poses_bounds_npy_is_refused(root: Path, kind: str) -> None:
     (root / "poses_bounds.npy").write_bytes(ARRAYS[kind])
     _refused(root, "poses_bounds.npy")
 
 
 @pytest.mark.parametrize("kind", sorted(ARRAYS))
-def test_hostile_depth(root: Path, kind: str) -> None:
+def test_malformed_depth_npy_is_refused(root: Path, kind: str) -> None:
     for index in range(COUNT):
         (root / "depth" / f"{index}.png").unlink()
         (root / "depth" / f"{index}.npy").write_bytes(ARRAYS[kind])
     _refused(root, "0.npy")
 
 
-def test_depth_in_fortran_order_is_read_as_it_is_meant(root: Path) -> None:
+def test_depth_in_fortran_order_is_read_correctly(root: Path) -> None:
     depth = np.arange(SIZE * SIZE, dtype=np.float64).reshape(SIZE, SIZE)
     for index in range(COUNT):
         (root / "depth" / f"{index}.png").unlink()
@@ -213,7 +215,7 @@ def test_depth_in_fortran_order_is_read_as_it_is_meant(root: Path) -> None:
         "null",
     ],
 )
-def test_hostile_descriptions(root: Path, text: str) -> None:
+def test_malformed_recording_json_is_refused(root: Path, text: str) -> None:
     (root / "recording.json").write_text(text)
     _refused(root, "recording.json")
 
@@ -221,7 +223,7 @@ def test_hostile_descriptions(root: Path, text: str) -> None:
 @pytest.mark.parametrize(
     "change", [{"camera_to_world": [[1e308] * 4] * 3 + [[0, 0, 0, 1]]}, {"file": "\ud800.png"}, {"file": "a" * 5000}]
 )
-def test_hostile_cameras(root: Path, change: dict) -> None:
+def test_cameras_json_with_invalid_pose_or_name_is_refused(root: Path, change: dict) -> None:
     entry = {"file": "images/0.png", "camera_to_world": np.eye(4).tolist()} | change
     camera = {"width": SIZE, "height": SIZE, "fx": 30, "fy": 30, "cx": 16, "cy": 16}
     (root / "cameras.json").write_text(json.dumps({**camera, "frames": [entry]}))
@@ -229,12 +231,12 @@ def test_hostile_cameras(root: Path, change: dict) -> None:
 
 
 @pytest.mark.parametrize("scale", [60 * 1e6, 1e300, 1e-9, 0.1, 400.0, float("inf"), float("nan"), -1.0, 0.0])
-def test_a_scale_that_leads_to_no_picture(root: Path, scale: float) -> None:
+def test_open_recording_rejects_scale_without_valid_image_size(root: Path, scale: float) -> None:
     with pytest.raises(InvalidSetting, match="scale"):
         open_recording(root, scale=scale)
 
 
-def test_a_scale_that_is_too_large_says_the_size(root: Path) -> None:
+def test_open_recording_states_size_for_too_large_scale(root: Path) -> None:
     with pytest.raises(InvalidSetting, match=r"9600x9600 px from 32x32.*at most 67108864 pixels"):
         open_recording(root, scale=300)
     assert open_recording(root, scale=2).width_px == 64
@@ -242,7 +244,7 @@ def test_a_scale_that_is_too_large_says_the_size(root: Path) -> None:
 
 @pytest.mark.skipif(sys.platform == "darwin", reason="this file system takes no names that are not UTF-8")
 @pytest.mark.parametrize("name", [b"caf\xe9", "größe 日本".encode(), b"a\nb", b"concat:x"])
-def test_any_folder_name(root: Path, name: bytes) -> None:
+def test_recording_folder_may_have_non_utf8_or_odd_name(root: Path, name: bytes) -> None:
     from tests.gsplat_core.io.recordings.videos import encode
 
     folder = Path(os.fsdecode(os.fsencode(root.parent) + b"/" + name))

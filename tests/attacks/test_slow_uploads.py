@@ -33,7 +33,7 @@ def head(key: str, framing: str) -> bytes:
 
 
 @pytest.mark.parametrize("framing", [f"Content-Length: {SIZE}", "Transfer-Encoding: chunked"])
-def test_an_upload_that_stops_is_answered_and_cut_off(served, framing):
+def test_stalled_upload_gets_408_and_is_closed(served, framing):
     port, key, folder = served
     begun = b"a\r\n" + bytes(10) + b"\r\n" if "chunked" in framing else bytes(10)
     answer = raw(port, head(key, framing) + begun)
@@ -41,7 +41,7 @@ def test_an_upload_that_stops_is_answered_and_cut_off(served, framing):
     assert list(folder.iterdir()) == []
 
 
-def test_those_who_stop_give_their_places_back(served):
+def test_stalled_uploads_free_their_slots(served):
     port, key, folder = served
     stopped = [socket.create_connection(("127.0.0.1", port), timeout=300) for _ in range(2)]
     for each in stopped:
@@ -59,7 +59,7 @@ def test_those_who_stop_give_their_places_back(served):
     assert list(folder.iterdir()) == []
 
 
-def test_who_leaves_in_the_middle_leaves_nothing(served):
+def test_disconnected_upload_leaves_no_file(served):
     port, key, folder = served
     with socket.create_connection(("127.0.0.1", port), timeout=300) as client:
         client.sendall(head(key, f"Content-Length: {SIZE}") + bytes(50_000))

@@ -32,7 +32,7 @@ def rules(tmp_path):
         "rtsp://[::ffff:10.1.2.3]/s", "stereo:rtsp://10.1.2.3/l|rtsp://10.1.2.3/r", "stereo:v4l2:/dev/video0|synthetic:",
     ],
 )  # fmt: skip
-def test_what_the_settings_list_is_let_through(rules, address):
+def test_check_source_accepts_addresses_listed_in_settings(rules, address):
     check_source(address, rules)
 
 
@@ -59,7 +59,7 @@ def test_what_the_settings_list_is_let_through(rules, address):
         "rtsp://10.1.2.3/" + 1000 * "a",
     ],
 )  # fmt: skip
-def test_everything_else_is_refused(rules, address):
+def test_check_source_refuses_unlisted_addresses(rules, address):
     with pytest.raises(Unprocessable):
         check_source(address, rules)
 
@@ -72,7 +72,7 @@ def test_everything_else_is_refused(rules, address):
         ("recordings/sub%2f..", False), ("recordings/sub#/../../../secret", False),
     ],
 )  # fmt: skip
-def test_recordings_lie_in_the_folders_that_are_listed(rules, tmp_path, place, allowed):
+def test_check_source_accepts_recordings_in_listed_folders_only(rules, tmp_path, place, allowed):
     address = f"recording:{tmp_path}/{place}"
     if allowed:
         check_source(address, rules)
@@ -81,7 +81,7 @@ def test_recordings_lie_in_the_folders_that_are_listed(rules, tmp_path, place, a
             check_source(address, rules)
 
 
-def test_by_default_nothing_but_the_synthetic_endoscope_can_be_named():
+def test_default_source_rules_accept_synthetic_source_only():
     check_source("synthetic:", SourceRules())
     for address in ("rtsp://10.0.0.1/s", "v4l2:/dev/video0", "recording:/srv/x", "http:" + "//10.0.0.1/"):
         with pytest.raises(Unprocessable):

@@ -77,12 +77,12 @@ def refused(address):
         "lavfi://testsrc",
     ],
 )
-def test_only_schemes_that_are_known_reach_ffmpeg(address, secret):
+def test_unknown_url_schemes_do_not_reach_ffmpeg(address, secret):
     assert "unknown source" in (text := refused(address.format(secret))) or "there is no such file" in text
 
 
 @pytest.mark.parametrize("scheme", ["tcp", "http", "udp", "rtsp"])
-def test_a_scheme_within_the_place_opens_no_file(scheme, secret):
+def test_nested_file_scheme_in_url_opens_no_file(scheme, secret):
     refused(f"{scheme}://file:{secret}")
 
 
@@ -98,13 +98,13 @@ def test_a_scheme_within_the_place_opens_no_file(scheme, secret):
     ],
 )
 @pytest.mark.slow
-def test_a_playlist_opens_no_file(answering, secret, body, kind):
+def test_playlist_from_server_opens_no_local_file(answering, secret, body, kind):
     answering.update(body=body.format(secret).encode(), type=kind)
     refused(answering["url"])
 
 
 @pytest.mark.parametrize("location", ["file://{0}", "{0}", "concat:{0}", "ftp://127.0.0.1/x"])
-def test_a_redirection_leads_to_no_file(answering, secret, location):
+def test_http_redirect_opens_no_local_file(answering, secret, location):
     answering["location"] = location.format(secret)
     refused(answering["url"])
 
@@ -121,12 +121,12 @@ def test_a_redirection_leads_to_no_file(answering, secret, location):
     ],
 )
 @pytest.mark.slow
-def test_what_is_no_video_is_a_sentence(answering, body):
+def test_response_that_is_no_video_raises_user_error(answering, body):
     answering["body"] = body
     assert "cannot be opened" in refused(answering["url"])
 
 
-def test_the_same_video_is_read_when_a_server_sends_it(answering, secret):
+def test_video_sent_by_http_server_is_read(answering, secret):
     answering["body"] = secret.read_bytes()
     source = open_source(answering["url"], HERE)
     assert (source.description.width_px, source.description.height_px) == (64, 48)

@@ -33,7 +33,7 @@ def is_one_sentence(capsys) -> bool:
 @pytest.mark.parametrize(
     "command", [["compare", "model", "mesh.ply"], ["measure", "model", "--from", "8,6"], ["export", "model", "x.ply"]]
 )
-def test_a_time_that_a_model_has_not_seen_is_refused(tmp_path, monkeypatch, capsys, command, time):
+def test_commands_refuse_time_outside_model_window(tmp_path, monkeypatch, capsys, command, time):
     monkeypatch.chdir(tmp_path)
     save_model(tmp_path / "model")
     # The model has no unit, so that a comparison needs pairs.
@@ -57,14 +57,14 @@ def test_a_time_that_a_model_has_not_seen_is_refused(tmp_path, monkeypatch, caps
     ],
     ids=" ".join,
 )
-def test_a_long_value_does_not_hide_the_sentence(tmp_path, monkeypatch, capsys, arguments):
+def test_error_for_long_value_is_one_short_line(tmp_path, monkeypatch, capsys, arguments):
     monkeypatch.chdir(tmp_path)
     assert run([each.replace("VALUE", "x" * 5000) for each in arguments]) == BAD_INPUT
     assert is_one_sentence(capsys)
 
 
 @pytest.mark.parametrize("option", ["--fps=1e-320", "--fps=0.0001", "--scale=1e-320", "--scale=0.01"])
-def test_a_picture_or_a_rate_that_no_video_has_is_refused(tmp_path, monkeypatch, capsys, option):
+def test_render_refuses_fps_or_scale_impossible_for_video(tmp_path, monkeypatch, capsys, option):
     monkeypatch.chdir(tmp_path)
     save_model(tmp_path / "model")
     assert run(["render", "model", "--out", "x.mp4", option]) == BAD_INPUT
@@ -72,7 +72,7 @@ def test_a_picture_or_a_rate_that_no_video_has_is_refused(tmp_path, monkeypatch,
 
 
 @pytest.mark.parametrize("head", [" ", "AUTO", "x" * 5000, "0" * 63, "é", "\udcff", "0" * 64 + "\n"])
-def test_a_digest_that_is_none_is_refused(tmp_path, capsys, head):
+def test_audit_verify_refuses_malformed_head_digest(tmp_path, capsys, head):
     log = AuditLog(tmp_path / "audit.jsonl")
     log.append("model.activate", actor="console", subject="x")
     log.close()
@@ -80,13 +80,13 @@ def test_a_digest_that_is_none_is_refused(tmp_path, capsys, head):
     assert is_one_sentence(capsys)
 
 
-def test_a_log_that_was_changed_is_said_on_standard_error_too(tmp_path, capsys):
+def test_audit_verify_prints_error_for_changed_log(tmp_path, capsys):
     (tmp_path / "audit.jsonl").write_bytes(b"{}\n")
     assert run(["audit", "verify", str(tmp_path / "audit.jsonl")]) == BAD_INPUT
     assert is_one_sentence(capsys)
 
 
-def test_a_file_that_would_make_the_reader_wait_is_an_error(tmp_path, monkeypatch):
+def test_read_regular_raises_for_file_that_blocks(tmp_path, monkeypatch):
     """Files of /proc such as kmsg are plain files by their mode, and wait for contents. A pipe that passes for one stands for them."""
     os.mkfifo(tmp_path / "p")
     writer = os.open(tmp_path / "p", os.O_RDWR)
@@ -118,7 +118,7 @@ def place(path, kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_report_that_is_none_is_refused(tmp_path, kind):
+def test_load_evaluated_refuses_unusable_report_json(tmp_path, kind):
     save_model(tmp_path / "model")
     place(tmp_path / "report.json", kind)
     for path in (tmp_path, tmp_path / "model"):
@@ -127,7 +127,7 @@ def test_a_report_that_is_none_is_refused(tmp_path, kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_points_that_are_none_are_refused(tmp_path, kind):
+def test_sparse_points_refuse_unusable_file(tmp_path, kind):
     place(tmp_path / "sfm_points.npz", kind)
     with pytest.raises(InvalidInput, match=r"sfm_points\.npz cannot be read"):
         SparsePoints.read(tmp_path / "sfm_points.npz")
@@ -136,7 +136,7 @@ def test_points_that_are_none_are_refused(tmp_path, kind):
 @pytest.mark.parametrize(
     "points", [np.full((3, 3), np.nan), np.array([["a"] * 3] * 3), np.array([[None] * 3] * 3), np.ones((3, 3), complex)]
 )
-def test_points_that_are_no_numbers_are_refused(tmp_path, points):
+def test_sparse_points_refuse_non_finite_or_non_numeric_points(tmp_path, points):
     file = io.BytesIO()
     np.savez(file, points=points, obs_point=np.arange(3), obs_frame=np.arange(3))
     (tmp_path / "p.npz").write_bytes(file.getvalue())
@@ -145,7 +145,7 @@ def test_points_that_are_no_numbers_are_refused(tmp_path, points):
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS, errno.EDQUOT])
-def test_a_key_on_a_full_disk_changes_nothing_and_says_so(tmp_path, monkeypatch, capsys, number):
+def test_keys_add_on_full_disk_prints_error_and_keeps_keys(tmp_path, monkeypatch, capsys, number):
     def full(_):
         raise OSError(number, os.strerror(number))
 
@@ -160,7 +160,7 @@ def test_a_key_on_a_full_disk_changes_nothing_and_says_so(tmp_path, monkeypatch,
 
 
 @pytest.mark.parametrize("name", ["a", "new"])
-def test_a_result_of_a_batch_is_no_output_folder_of_another_run(tmp_path, name):
+def test_check_folder_path_refuses_folder_of_batch(tmp_path, name):
     (tmp_path / "batch.sqlite").touch()
     with pytest.raises(OutputError, match="of the batch in"):
         check_folder_path(tmp_path / name)

@@ -41,7 +41,7 @@ def test_every_profile_has_services(services):
 
 
 @pytest.mark.parametrize("name", ["cpu", "gpu", "prometheus", "grafana"])
-def test_services_are_closed(services, name):
+def test_compose_services_are_hardened(services, name):
     service = services[name]
     assert service["read_only"] is True
     assert service["cap_drop"] == ["ALL"]
@@ -51,19 +51,19 @@ def test_services_are_closed(services, name):
 
 
 @pytest.mark.parametrize("name", ["cpu", "gpu"])
-def test_the_sockets_are_in_memory_and_closed_to_others(services, name):
+def test_compose_runtime_folder_is_private_tmpfs(services, name):
     (runtime,) = [entry for entry in services[name]["tmpfs"] if entry.startswith("/run/intrasplat:")]
     assert {"mode=0700", "uid=10001", "gid=10001"} <= set(runtime.split(":")[1].split(","))
     assert services[name]["shm_size"] == "1gb"
 
 
-def test_only_one_profile_asks_for_a_gpu(services):
+def test_compose_reserves_gpu_in_gpu_profile_only(services):
     (device,) = services["gpu"]["deploy"]["resources"]["reservations"]["devices"]
     assert (device["driver"], device["capabilities"]) == ("nvidia", ["gpu"])
     assert "deploy" not in services["cpu"]
 
 
-def test_files_that_are_mounted_are_there():
+def test_files_mounted_by_compose_exist():
     document = yaml.safe_load((DEPLOY / "compose.yaml").read_text())
     mounted = [config["file"] for config in document["configs"].values()]
     mounted += [
@@ -76,14 +76,14 @@ def test_files_that_are_mounted_are_there():
     assert [name for name in mounted if not (DEPLOY / name).exists()] == []
 
 
-def test_docker_compose_takes_it(composed):
+def test_docker_compose_accepts_compose_file(composed):
     services = composed("compose.yaml")["services"]
     assert set(services) == {"cpu", "gpu", "prometheus", "grafana"}
     assert services["cpu"]["ports"][0]["host_ip"] == "127.0.0.1"
     assert services["gpu"]["build"]["target"] == "cuda"
 
 
-def test_tls_replaces_the_port_and_the_plain_text(composed, tool, tmp_path):
+def test_compose_tls_file_replaces_port_and_disables_plaintext(composed, tool, tmp_path):
     document = composed("compose.yaml", "compose.tls.yaml")
     for name in ("cpu", "gpu"):
         service = document["services"][name]
@@ -100,7 +100,7 @@ def test_tls_replaces_the_port_and_the_plain_text(composed, tool, tmp_path):
     assert checked.returncode == 0, checked.stderr
 
 
-def test_secrets_are_made_once_and_the_service_takes_the_key(tmp_path):
+def test_new_secrets_are_created_once_and_key_is_accepted(tmp_path):
     from services.auth.keys import KeyStore, Role, first_admin_key
 
     script = shutil.copy(DEPLOY / "new_secrets.sh", tmp_path)

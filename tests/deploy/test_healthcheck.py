@@ -44,20 +44,20 @@ def check(url: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_a_server_that_answers_is_well():
+def test_healthcheck_succeeds_for_status_200():
     with server(200) as url:
         assert check(url).returncode == 0
 
 
 @pytest.mark.parametrize("status", [204, 404, 500, 503])
-def test_any_other_answer_is_not(status):
+def test_healthcheck_fails_for_other_status(status):
     with server(status) as url:
         done = check(url)
     assert (done.returncode, done.stderr) == (1, "")
     assert str(status) in done.stdout
 
 
-def test_nobody_there_is_not_well():
+def test_healthcheck_fails_if_connection_is_refused():
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
     done = check(f"http://127.0.0.1:{port}/livez")
@@ -66,7 +66,7 @@ def test_nobody_there_is_not_well():
 
 
 @pytest.mark.slow
-def test_a_server_that_says_nothing_is_not_well():
+def test_healthcheck_fails_if_server_times_out():
     with socket.create_server(("127.0.0.1", 0)) as silent:
         done = check(f"http://127.0.0.1:{silent.getsockname()[1]}/livez")
     assert (done.returncode, done.stderr) == (1, "")
@@ -74,6 +74,6 @@ def test_a_server_that_says_nothing_is_not_well():
 
 
 @pytest.mark.parametrize("url", ["", "nonsense", "http://"])
-def test_an_address_that_is_none_is_said(url):
+def test_healthcheck_fails_for_invalid_url(url):
     done = check(url)
     assert (done.returncode, done.stderr) == (1, "")

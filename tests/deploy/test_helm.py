@@ -45,13 +45,13 @@ def container(resources: dict[str, dict]) -> dict:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("values", [FULL, WITHOUT_A_GPU], ids=["full", "without a GPU"])
-def test_kubernetes_takes_what_is_rendered(render, kubernetes_takes, values):
+def test_rendered_chart_matches_kubernetes_schemas(render, kubernetes_takes, values):
     for resource in render(values).values():
         if resource["kind"] not in OF_AN_OPERATOR:
             kubernetes_takes(resource)
 
 
-def test_pods_are_restricted(render):
+def test_chart_pods_are_restricted(render):
     resources = render(FULL)
     pod = resources["Deployment room-1-intrasplat"]["spec"]["template"]["spec"]
     assert pod["securityContext"]["runAsNonRoot"] is True
@@ -63,7 +63,7 @@ def test_pods_are_restricted(render):
     assert not any("hostPath" in volume for volume in pod["volumes"])
 
 
-def test_one_pod_with_the_gpu(render):
+def test_chart_deploys_single_pod_with_gpu_limit(render):
     resources = render(FULL)
     deployment = resources["Deployment room-1-intrasplat"]["spec"]
     assert (deployment["replicas"], deployment["strategy"]) == (1, {"type": "Recreate"})
@@ -71,7 +71,7 @@ def test_one_pod_with_the_gpu(render):
     assert "nvidia.com/gpu" not in container(render(WITHOUT_A_GPU))["resources"]["limits"]
 
 
-def test_probes_ask_the_probe_listener(render):
+def test_chart_probes_use_probe_port(render):
     for values in (FULL, WITHOUT_A_GPU):
         probed = container(render(values))
         asked = {name: probed[f"{name}Probe"]["httpGet"] for name in ("startup", "liveness", "readiness")}
@@ -82,7 +82,7 @@ def test_probes_ask_the_probe_listener(render):
         assert variables["INTRASPLAT_SERVER__PROBE_PORT"] == str(ports["probe"]) != variables["INTRASPLAT_SERVER__PORT"]
 
 
-def test_a_room_shares_nothing_with_another(render):
+def test_releases_share_no_resources(render):
     one, two = render(FULL, "room-1"), render(FULL, "room-2")
     assert not set(one) & set(two)
     selectors = [
@@ -92,7 +92,7 @@ def test_a_room_shares_nothing_with_another(render):
     assert selectors == ["room-1", "room-2"]
 
 
-def test_rules_and_dashboard_are_those_of_the_compose_file(render):
+def test_chart_rules_and_dashboard_match_deploy_files(render):
     resources = render(FULL)
     rules = yaml.safe_load((ROOT / "deploy" / "prometheus" / "rules.yaml").read_text())
     assert resources["PrometheusRule room-1-intrasplat"]["spec"] == rules
@@ -100,7 +100,7 @@ def test_rules_and_dashboard_are_those_of_the_compose_file(render):
     assert shown == json.loads((ROOT / "deploy" / "grafana" / "dashboards" / "intrasplat.json").read_text())
 
 
-def test_prometheus_is_let_in_with_its_key(render):
+def test_chart_service_monitor_uses_metrics_key(render):
     resources = render(FULL)
     (endpoint,) = resources["ServiceMonitor room-1-intrasplat"]["spec"]["endpoints"]
     assert endpoint["authorization"]["credentials"] == {"name": "room-1-metrics", "key": "metrics.key"}
@@ -121,19 +121,19 @@ def test_prometheus_is_let_in_with_its_key(render):
         (["plaintext=true", "terminationGracePeriodSeconds=5"], "minimum"),
     ],
 )
-def test_what_cannot_work_is_refused(tool, values, why):
+def test_chart_refuses_invalid_values(tool, values, why):
     given = [argument for value in values for argument in ("--set", value)]
     done = tool("helm", "template", "room-1", CHART, *given)
     assert done.returncode != 0
     assert why in done.stderr
 
 
-def test_helm_finds_nothing_to_say(tool):
+def test_helm_lint_passes(tool):
     done = tool("helm", "lint", "--strict", CHART, "--set", "plaintext=true")
     assert done.returncode == 0, done.stdout
 
 
-def test_values_and_their_schema_name_the_same_keys():
+def test_chart_values_and_schema_have_same_keys():
     values = yaml.safe_load((CHART / "values.yaml").read_text())
     schema = json.loads((CHART / "values.schema.json").read_text())
     assert set(schema["properties"]) - {"global"} == set(values)
@@ -142,7 +142,7 @@ def test_values_and_their_schema_name_the_same_keys():
             assert set(each["properties"]) == set(values[name]), name
 
 
-def test_names_that_users_ask_for_are_let_in(render):
+def test_chart_allowed_hosts_include_service_names(render):
     def hosts(*values: str) -> list[str]:
         given = {each["name"]: each["value"] for each in container(render(list(values)))["env"]}
         return json.loads(given.get("INTRASPLAT_SERVER__ALLOWED_HOSTS", "null"))

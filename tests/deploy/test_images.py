@@ -61,7 +61,7 @@ def copied_from_the_repository() -> list[str]:
     ]
 
 
-def test_what_is_copied_is_there_and_reaches_the_build():
+def test_dockerfile_copies_existing_files_not_ignored():
     sources = copied_from_the_repository()
     assert {"services", "requirements-service.lock", "docker/healthcheck.py", "docker/install_packages.py"} <= set(
         sources
@@ -72,12 +72,12 @@ def test_what_is_copied_is_there_and_reaches_the_build():
 
 
 @pytest.mark.parametrize("path", ["deploy/secrets/admin.key", ".git", "tests", "out", "shared", "key.pem", ".venv"])
-def test_nothing_else_reaches_the_build(path):
+def test_dockerignore_excludes_path(path):
     assert not let_through(path)
 
 
 @pytest.mark.parametrize("stage", ["cpu", "cuda"])
-def test_images_have_no_compiler_and_do_not_run_as_root(stage):
+def test_images_have_no_compiler_and_run_as_non_root(stage):
     steps = lineage(stage)
     installed = " ".join(rest for name, rest in steps if name == "RUN")
     assert "tini" in installed
@@ -88,12 +88,12 @@ def test_images_have_no_compiler_and_do_not_run_as_root(stage):
     assert copied == [f"--from=trimmed-{stage} /opt/intrasplat /opt/intrasplat"]
 
 
-def test_the_health_check_asks_the_probe_listener():
+def test_image_healthcheck_uses_probe_port():
     variables = dict(re.findall(r"\b([A-Z_]+)=(\S+)", DOCKERFILE.read_text()))
     assert variables["HEALTHCHECK_URL"] == f"http://127.0.0.1:{variables['INTRASPLAT_SERVER__PROBE_PORT']}/livez"
 
 
-def test_build_tools_are_taken_out_again():
+def test_image_uninstalls_build_tools():
     import tomllib
 
     tools = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]["build"]
@@ -101,13 +101,13 @@ def test_build_tools_are_taken_out_again():
     assert set(re.sub(r"pip uninstall --yes", "", removed).split()) == {re.split(r"[<>=]", tool)[0] for tool in tools}
 
 
-def test_stages_that_are_copied_from_exist():
+def test_dockerfile_stages_copied_from_exist():
     named = re.findall(r"(?:--from=|from=)([\w-]+)", DOCKERFILE.read_text())
     assert set(named) == {f"{each}-{kind}" for each in ("packages", "trimmed", "wheel") for kind in ("cpu", "cuda")}
     assert set(named) <= set(stages())
 
 
-def test_the_cuda_wheel_is_built_as_make_cuda_does():
+def test_image_builds_cuda_wheel_as_make_cuda():
     (built,) = [rest for name, rest in stages()["wheel-cuda"][1] if name == "RUN"]
     makefile = (ROOT / "Makefile").read_text()
     for option in ("--require-hashes --no-deps --target", "requirements-cuda.lock", "INTRASPLAT_CUDA=ON"):
@@ -126,7 +126,7 @@ def installing():
     return module
 
 
-def test_the_cpu_image_leaves_out_what_is_for_cuda_alone(installing):
+def test_without_cuda_removes_only_cuda_packages(installing):
     lock = (ROOT / "requirements-service.lock").read_text()
     every = list(installing.requirements(lock))  # some packages are there once for each Python
     assert len(every) == len(re.findall(r"(?m)^[a-z0-9][^=\s]*==", lock)) > 50
@@ -144,7 +144,7 @@ def test_the_cpu_image_leaves_out_what_is_for_cuda_alone(installing):
         installing.without_cuda("numpy==2.0 \\\n    --hash=sha256:00\n")
 
 
-def test_what_pip_is_asked_for(installing, monkeypatch, tmp_path):
+def test_install_packages_runs_expected_pip_commands(installing, monkeypatch, tmp_path):
     lock = tmp_path / "requirements.lock"
     lock.write_text(
         "numpy==2.0 \\\n    --hash=sha256:00\ntorch==2.15.0 \\\n    --hash=sha256:11\ntriton==3.9.0 \\\n    --hash=sha256:22\n"
@@ -173,7 +173,7 @@ def test_what_pip_is_asked_for(installing, monkeypatch, tmp_path):
     )
 
 
-def test_the_index_of_cpu_torch_is_an_argument_of_the_build():
+def test_torch_index_is_build_argument_of_cpu_image_only():
     steps = stages()["packages-cpu"][1]
     assert [rest.partition("=")[0] for name, rest in steps if name == "ARG"] == ["TORCH_INDEX_URL", "TORCH_SHA256"]
     (run,) = [rest for name, rest in steps if name == "RUN"]
@@ -181,6 +181,6 @@ def test_the_index_of_cpu_torch_is_an_argument_of_the_build():
     assert not any(name == "ARG" for name, _ in stages()["packages-cuda"][1])
 
 
-def test_hadolint_finds_nothing(tool):
+def test_dockerfile_passes_hadolint(tool):
     done = tool("hadolint", DOCKERFILE)
     assert done.returncode == 0 and not done.stdout, done.stdout

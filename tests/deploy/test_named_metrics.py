@@ -88,7 +88,7 @@ def labels_of(expression: str) -> set[str]:
 
 
 @pytest.mark.parametrize(("where", "expression"), ASKED, ids=[where for where, _ in ASKED])
-def test_the_service_has_what_is_asked_for(where, expression):
+def test_metrics_of_rules_and_panels_exist_with_labels(where, expression):
     known = served()
     names = {name for name in NAME.findall(re.sub(r'"[^"]*"', '""', expression)) if name != "instance"}
     assert names, f"{where} names no metric: {expression}"
@@ -97,14 +97,14 @@ def test_the_service_has_what_is_asked_for(where, expression):
     assert labels_of(expression) <= labels, f"{where}: {sorted(labels_of(expression) - labels)} is no label of {names}"
 
 
-def test_states_of_streams_that_are_named_exist():
+def test_stream_states_in_rules_and_panels_exist():
     for where, expression in ASKED:
         for label, value in MATCHER.findall(expression):
             if label == "state":
                 assert set(value.split("|")) <= set(STATES), f"{where}: {value}"
 
 
-def test_reasons_of_refusals_that_are_named_exist():
+def test_refusal_reasons_in_rules_and_panels_exist():
     sources = "".join(path.read_text() for path in (DEPLOY.parent / "services" / "api").rglob("*.py"))
     for where, expression in ASKED:
         for label, value in MATCHER.findall(expression):
@@ -113,22 +113,22 @@ def test_reasons_of_refusals_that_are_named_exist():
 
 
 @pytest.mark.parametrize("name", ["intrasplat_stream_states", "intrasplat_viewers_total"])
-def test_a_metric_that_is_not_there_is_noticed(name):
+def test_unknown_metric_names_are_detected(name):
     assert name in NAME.findall(f"rate({name}[1m])") and name not in served()
 
 
-def test_every_measure_of_the_service_is_in_a_panel():
+def test_every_service_metric_is_in_dashboard_panel():
     shown = {name for _, expression in panels() for name in NAME.findall(expression)}
     families = {re.sub(r"_(total|created|bucket|sum|count)$", "", name) for name in served() if "intrasplat" in name}
     assert {name for name in families if not any(each.startswith(name) for each in shown)} == set()
 
 
-def test_the_docs_have_what_to_do_about_each_alert():
+def test_operations_docs_cover_every_alert():
     text = (DEPLOY.parent / "docs" / "operations.md").read_text()
     assert [name for name, _ in rules() if f"`{name}`" not in text] == []
 
 
-def test_the_docs_name_metrics_that_exist():
+def test_service_docs_name_existing_metrics():
     text = (DEPLOY.parent / "docs" / "service.md").read_text()
     named = set(re.findall(r"`(intrasplat_[a-z_]+)[`{]", text))
     code = "".join(path.read_text() for path in (DEPLOY.parent / "services").rglob("*.py"))

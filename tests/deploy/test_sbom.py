@@ -18,7 +18,7 @@ def pinned(lock: str) -> dict[str, str]:
     return dict(re.findall(r"^([A-Za-z0-9._-]+)==([^\s;\\]+)", text, re.MULTILINE))
 
 
-def test_every_locked_package_is_listed_with_its_digests(tool, tmp_path):
+def test_sbom_lists_locked_packages_with_hashes(tool, tmp_path):
     recipe = (ROOT / "Makefile").read_text().partition("\nsbom:")[2].partition("\n\n")[0]
     command = re.search(r"\$\(BIN\)/cyclonedx-py (.*) -o out/sbom.json", recipe)
     assert command is not None
@@ -34,7 +34,7 @@ def test_every_locked_package_is_listed_with_its_digests(tool, tmp_path):
         assert any(reference.get("hashes") for reference in each["externalReferences"]), name
 
 
-def test_the_service_s_lock_has_the_same_versions_and_its_extras():
+def test_service_lock_has_versions_of_default_lock_and_extras():
     service, default = pinned("requirements-service.lock"), pinned("requirements.lock")
     assert {name: service[name] for name in default} == default
     assert {"psycopg", "s3fs", "pyjwt", "cryptography"} <= set(service) - set(default)

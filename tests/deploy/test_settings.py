@@ -17,19 +17,19 @@ FILES = [
 ]  # fmt: skip
 
 
-def test_the_settings_file_is_taken():
+def test_deploy_settings_file_loads():
     settings = load_settings(ROOT / "deploy" / "settings.yaml")
     assert set(settings.streams) == {"endoscope"}
 
 
-def test_the_chart_s_settings_are_taken(tmp_path):
+def test_chart_settings_load(tmp_path):
     values = yaml.safe_load((ROOT / "deploy" / "helm" / "values.yaml").read_text())
     (tmp_path / "settings.yaml").write_text(yaml.safe_dump(values["settings"]))
     assert set(load_settings(tmp_path / "settings.yaml").streams) == {"endoscope"}
 
 
 @pytest.mark.parametrize("file", FILES)
-def test_variables_are_settings(file):
+def test_environment_variables_of_deploy_files_are_settings(file):
     named = re.findall(rf"{ENVIRONMENT_PREFIX}([A-Z]+)__([A-Z_]+)", (ROOT / file).read_text())
     assert named
     for section, key in named:
@@ -37,7 +37,7 @@ def test_variables_are_settings(file):
         assert key.lower() in field.model_fields, f"{file}: {section}__{key}"
 
 
-def test_what_an_image_starts_with_is_taken(monkeypatch):
+def test_image_environment_and_settings_load(monkeypatch):
     text = (ROOT / "docker" / "Dockerfile").read_text()
     for name, value in re.findall(rf"({ENVIRONMENT_PREFIX}\w+)=(\S+)", text):
         monkeypatch.setenv(name, value)
@@ -51,7 +51,7 @@ def test_what_an_image_starts_with_is_taken(monkeypatch):
 @pytest.mark.parametrize(
     "file", ["deploy/compose.yaml", "deploy/helm/values.yaml", "deploy/systemd/intrasplat.service"]
 )
-def test_there_is_time_to_end(file):
+def test_stop_timeout_exceeds_drain_time(file):
     seconds = re.search(
         r"(?:stop_grace_period: |terminationGracePeriodSeconds: |TimeoutStopSec=)(\d+)", (ROOT / file).read_text()
     )

@@ -19,24 +19,24 @@ def units(tmp_path) -> list[Path]:
     return sorted(tmp_path.iterdir())
 
 
-def test_systemd_takes_the_units(tool, units):
+def test_systemd_analyze_accepts_units(tool, units):
     checked = tool("systemd-analyze", "verify", "--man=no", *units)
     assert (checked.returncode, checked.stderr) == (0, "")
 
 
-def test_a_mistake_would_be_seen(tool, tmp_path):
+def test_systemd_analyze_reports_misspelt_option(tool, tmp_path):
     wrong = tmp_path / "wrong.service"
     wrong.write_text("[Service]\nType=exec\nExecStart=/bin/true\nProtectSistem=strict\n")
     assert "ProtectSistem" in tool("systemd-analyze", "verify", "--man=no", wrong).stderr
 
 
-def test_the_unit_is_closed(tool, units):
+def test_systemd_unit_security_exposure_is_low(tool, units):
     (service,) = [unit for unit in units if unit.name == "intrasplat.service"]
     done = tool("systemd-analyze", "security", "--offline=true", "--threshold=25", service)
     assert done.returncode == 0, done.stdout[-200:]
 
 
-def test_the_unit_waits_for_what_the_service_says():
+def test_systemd_unit_uses_notify_and_watchdog():
     """`sd_notify` (services/api/server.py) and these lines come together."""
     text = (ROOT / "deploy" / "systemd" / "intrasplat.service").read_text()
     assert "\nType=notify\n" in text and "\nNotifyAccess=main\n" in text

@@ -49,7 +49,7 @@ def violations(page: Any, rules: list[str] | None = None, within: str | None = N
     ]
 
 
-def test_signing_in_can_be_read_and_needs_no_mouse(page):
+def test_sign_in_dialog_is_accessible_and_usable_by_keyboard(page):
     page, key = page
     assert violations(page) == []
     assert page.evaluate("document.activeElement.id") == "key"
@@ -59,7 +59,7 @@ def test_signing_in_can_be_read_and_needs_no_mouse(page):
     page.wait_for_selector("#stream-rows tr", state="attached")
 
 
-def test_names_roles_and_contrast_of_every_page(page):
+def test_every_console_tab_passes_axe(page):
     page, _ = page
     tabs = page.eval_on_selector_all("[role=tab]", "all => all.map((tab) => tab.getAttribute('aria-controls'))")
     assert {"live", "models", "streams", "audit"} <= set(tabs)
@@ -70,7 +70,7 @@ def test_names_roles_and_contrast_of_every_page(page):
         assert violations(page) == [], tab
 
 
-def test_what_the_server_refuses_can_be_read(page):
+def test_console_error_message_is_accessible(page):
     page, _ = page
     page.click("#tab-streams")
     page.fill("#stream-name", "spy")
@@ -81,7 +81,7 @@ def test_what_the_server_refuses_can_be_read(page):
     assert violations(page) == []
 
 
-def test_text_stands_out_from_what_is_behind_it(page):
+def test_badges_of_all_states_have_sufficient_contrast(page):
     """Check the colour of every state, also of those that axe-core never sees, and of the badges by the pictures."""
     page, _ = page
     page.click("#tab-live")
@@ -98,7 +98,7 @@ def test_text_stands_out_from_what_is_behind_it(page):
     page.evaluate("document.querySelectorAll('.copied').forEach((each) => each.remove())")
 
 
-def test_everything_is_reached_by_the_keyboard(page):
+def test_console_controls_are_reachable_by_keyboard(page):
     page, _ = page
     for tab, needed in (("models", "model-file"), ("streams", "stream-source"), ("audit", "tab-audit")):
         page.focus(f"#tab-{tab}")

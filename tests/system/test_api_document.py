@@ -16,7 +16,7 @@ pytestmark = pytest.mark.slow
 pytest.importorskip("schemathesis", reason="schemathesis comes with the development packages")
 
 
-def test_no_answer_is_a_server_error_or_undocumented():
+def test_api_responses_conform_to_openapi_document():
     """Every operation with its examples, values at and beyond each limit of its schema, and two at random, the same ones each time."""
     with tempfile.TemporaryDirectory(prefix="isf-") as folder, serving(Path(folder)) as (url, key):
         runs = fuzz(url, key, Path(folder), 2, "--phases", "examples,coverage,fuzzing", "--generation-deterministic")

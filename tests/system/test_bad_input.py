@@ -49,13 +49,13 @@ def copy(tiny, tmp_path):
     return shutil.copytree(tiny, tmp_path / "recording")
 
 
-def test_a_recording_that_is_not_there(tmp_path, kept, refused):
+def test_commands_refuse_missing_recording(tmp_path, kept, refused):
     refused("replay", tmp_path / "nowhere", "--out", kept, match="no such file or folder")
     refused("validate", tmp_path / "nowhere", match="no such file or folder")
     refused("reconstruct", tmp_path / "nowhere", "--out", kept, match="no such file or folder")
 
 
-def test_a_video_cut_in_half(tmp_path, kept, refused):
+def test_replay_refuses_truncated_video(tmp_path, kept, refused):
     with VideoFile(tmp_path / "video.mp4", 64, 48, 30.0) as video:
         for k in range(20):
             video.write(np.random.default_rng(k).integers(0, 255, (48, 64, 3), np.uint8))
@@ -64,7 +64,7 @@ def test_a_video_cut_in_half(tmp_path, kept, refused):
     refused("replay", tmp_path / "video.mp4", "--out", kept, match="video.mp4")
 
 
-def test_a_picture_that_is_broken_in_the_middle_keeps_what_came_before(copy, tmp_path, refused):
+def test_replay_with_broken_image_saves_earlier_frames(copy, tmp_path, refused):
     """The one fault that shows only on the way: the run ends early, and what it had reached is whole."""
     broken = sorted((copy / "images").iterdir())[3]
     broken.write_bytes(broken.read_bytes()[:-200])
@@ -78,18 +78,18 @@ def test_a_picture_that_is_broken_in_the_middle_keeps_what_came_before(copy, tmp
     assert 'role="alert"' in (out / "report.html").read_text()
 
 
-def test_masks_of_the_wrong_size(copy, kept, refused):
+def test_replay_refuses_masks_of_wrong_size(copy, kept, refused):
     for path in (copy / "masks").iterdir():
         cv2.imwrite(str(path), np.zeros((10, 12), np.uint8))
     refused("replay", copy, "--out", kept, match="mask")
 
 
-def test_a_mask_too_few(copy, kept, refused):
+def test_replay_refuses_recording_with_missing_mask(copy, kept, refused):
     sorted((copy / "masks").iterdir())[-1].unlink()
     refused("replay", copy, "--out", kept, match="5 masks for 6 frames")
 
 
-def test_masks_of_the_wrong_polarity(copy, kept, refused):
+def test_replay_refuses_inverted_masks(copy, kept, refused):
     for path in (copy / "masks").iterdir():
         cv2.imwrite(str(path), 255 - cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
     refused("replay", copy, "--out", kept, match="probably inverted")
@@ -113,7 +113,7 @@ def bundle(finished, tmp_path):
 
 
 @pytest.mark.slow
-def test_not_a_number_in_a_model(bundle, tmp_path, refused):
+def test_render_refuses_model_with_nan(bundle, tmp_path, refused):
     rewrite_tensors(
         bundle, lambda data, start: data.__setitem__(slice(start, start + 4), struct.pack("<f", float("nan")))
     )
@@ -121,20 +121,20 @@ def test_not_a_number_in_a_model(bundle, tmp_path, refused):
     assert not (tmp_path / "v.mp4").exists()
 
 
-def test_a_model_with_a_wrong_digest(bundle, tmp_path, refused):
+def test_render_refuses_model_with_wrong_digest(bundle, tmp_path, refused):
     data = bytearray((bundle / "model.safetensors").read_bytes())
     data[-1] ^= 1
     (bundle / "model.safetensors").write_bytes(data)
     refused("render", bundle, "--out", tmp_path / "v.mp4", match="SHA-256")
 
 
-def test_a_model_of_a_later_format(bundle, tmp_path, refused):
+def test_render_refuses_model_of_newer_format(bundle, tmp_path, refused):
     manifest = json.loads((bundle / "manifest.json").read_text())
     (bundle / "manifest.json").write_text(json.dumps(manifest | {"format_version": 99}))
     refused("render", bundle, "--out", tmp_path / "v.mp4", match="format version 99")
 
 
-def test_no_model_at_all(tmp_path, refused):
+def test_render_refuses_empty_model_folder(tmp_path, refused):
     (tmp_path / "model").mkdir()
     refused("render", tmp_path / "model", "--out", tmp_path / "v.mp4", match="missing")
 
@@ -147,12 +147,12 @@ def fill(folder, leave_bytes):
     return ballast
 
 
-def test_a_disk_that_is_full_from_the_start(small_disk, tiny, refused):
+def test_replay_refuses_full_disk(small_disk, tiny, refused):
     fill(small_disk, 1 << 20)
     refused("replay", tiny, "--out", small_disk / "out", *QUICK, match="is full")
 
 
-def test_a_disk_that_fills_up_on_the_way(small_disk, tiny, refused, monkeypatch):
+def test_replay_on_disk_that_fills_up_saves_earlier_frames(small_disk, tiny, refused, monkeypatch):
     """Somebody else takes the room after three frames: video, model and report of these are still written, and whole."""
     from operators.sinks.video import VideoSinkOp
 
@@ -172,7 +172,7 @@ def test_a_disk_that_fills_up_on_the_way(small_disk, tiny, refused, monkeypatch)
     assert (out / "model" / "manifest.json").exists() and (out / "report.html").exists()
 
 
-def test_a_full_disk_does_not_cost_an_earlier_run(small_disk, finished, tiny, refused, fingerprints):
+def test_replay_on_full_disk_keeps_earlier_run(small_disk, finished, tiny, refused, fingerprints):
     out = small_disk / "out"
     shutil.copytree(finished, out)
     before = fingerprints(out)
@@ -182,7 +182,7 @@ def test_a_full_disk_does_not_cost_an_earlier_run(small_disk, finished, tiny, re
     assert fingerprints(out) == before
 
 
-def test_a_recording_of_one_frame_works_and_says_what_it_cannot_show(tiny, tmp_path, intrasplat):
+def test_replay_of_single_frame_succeeds_with_notes(tiny, tmp_path, intrasplat):
     one = tmp_path / "one"
     (one / "images").mkdir(parents=True)
     shutil.copy(sorted((tiny / "images").iterdir())[0], one / "images" / "000000.png")
@@ -196,7 +196,7 @@ def test_a_recording_of_one_frame_works_and_says_what_it_cannot_show(tiny, tmp_p
     assert "the recording has no depth" in " ".join(report.notes)
 
 
-def test_a_folder_of_somebody_else(tiny, tmp_path, refused):
+def test_replay_refuses_foreign_output_folder(tiny, tmp_path, refused):
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "chapter1.tex").write_text("years of work")
     refused("replay", tiny, "--out", tmp_path / "thesis", match="not made by intrasplat")
@@ -204,7 +204,7 @@ def test_a_folder_of_somebody_else(tiny, tmp_path, refused):
     assert [p.name for p in (tmp_path / "thesis").iterdir()] == ["chapter1.tex"]
 
 
-def test_a_gpu_that_is_not_there(tiny, tmp_path, refused, monkeypatch):
+def test_replay_refuses_cuda_without_gpu(tiny, tmp_path, refused, monkeypatch):
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     refused("replay", tiny, "--out", tmp_path / "out", "--device", "cuda", match="use --device cpu")
     assert not (tmp_path / "out").exists()
@@ -222,6 +222,6 @@ def test_a_gpu_that_is_not_there(tiny, tmp_path, refused, monkeypatch):
         (("--device", "tpu"), "device is 'tpu'; choose cpu or cuda"),
     ],
 )
-def test_wrong_options(tiny, tmp_path, refused, options, match):
+def test_replay_refuses_invalid_options(tiny, tmp_path, refused, options, match):
     refused("replay", tiny, "--out", tmp_path / "out", *options, match=match)
     assert not (tmp_path / "out").exists()

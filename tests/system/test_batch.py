@@ -37,7 +37,7 @@ def recordings(tiny, tmp_path):
 
 
 @pytest.mark.slow
-def test_each_result_is_there_once_although_processes_are_killed(batch_kill, tmp_path):
+def test_batch_makes_each_result_once_despite_kills(batch_kill, tmp_path):
     recordings, out = tmp_path / "recordings", tmp_path / "out"
     batch_kill.make_recordings(recordings, 3, frames=3)
     kills = batch_kill.Kills(between_s=(0.1, 0.5), batch_share=0.34, most=3, seed=1)
@@ -48,7 +48,7 @@ def test_each_result_is_there_once_although_processes_are_killed(batch_kill, tmp
 
 
 @pytest.mark.slow
-def test_it_goes_on_where_it_was_ended_and_says_what_failed(start, intrasplat, recordings):
+def test_second_batch_continues_and_names_failures(start, intrasplat, recordings):
     command = ("batch", recordings, "--workers", "1", *QUICK, "--json")
     first = start(*command)
     out, err = first.communicate(timeout=300)
@@ -71,7 +71,7 @@ def test_it_goes_on_where_it_was_ended_and_says_what_failed(start, intrasplat, r
 
 
 @pytest.mark.slow
-def test_a_signal_ends_it_and_leaves_nothing_half_made(start, recordings, tmp_path):
+def test_sigterm_ends_batch_without_partial_results(start, recordings, tmp_path):
     out = tmp_path / "out"
     batch = start("batch", recordings, "--out", out, "--workers", "1", "--steps-per-frame", "3000")
     until = time.monotonic() + 300
@@ -95,7 +95,7 @@ def test_a_signal_ends_it_and_leaves_nothing_half_made(start, recordings, tmp_pa
         (("recordings", "--device", "tpu"), "device is 'tpu'; choose cpu or cuda"),
     ],
 )
-def test_what_makes_no_sense_is_refused_and_nothing_is_written(
+def test_batch_refuses_invalid_arguments_without_writing(
     intrasplat, recordings, tmp_path, monkeypatch, arguments, said
 ):
     monkeypatch.chdir(tmp_path)

@@ -51,7 +51,7 @@ def server(finished: Path) -> Iterator[str]:
         thread.join()
 
 
-def test_the_video_plays_from_the_file(browser: Page, finished: Path) -> None:
+def test_report_video_plays_in_browser(browser: Page, finished: Path) -> None:
     browser.open((finished / "report.html").as_uri())
     browser.evaluate("document.querySelector('video').play()")
     end, states = time.monotonic() + 300, []
@@ -62,7 +62,7 @@ def test_the_video_plays_from_the_file(browser: Page, finished: Path) -> None:
     assert all(error is None for *_, error in states)
 
 
-def test_the_first_frame_has_the_colours_of_the_file(browser: Page, finished: Path, server: str) -> None:
+def test_report_video_first_frame_colours_match_file(browser: Page, finished: Path, server: str) -> None:
     with av.open(str(finished / "reconstruction.mp4")) as container:
         expected = next(container.decode(video=0)).to_ndarray(format="rgb24")
     browser.open(f"{server}/report.html")

@@ -80,7 +80,7 @@ def opened(page: Any, tab: str) -> None:
 
 
 @pytest.mark.parametrize("window", WINDOWS)
-def test_the_live_page_fits_the_window(page, window):
+def test_live_page_fits_window(page, window):
     width, height = WINDOWS[window]
     page.set_viewport_size({"width": width, "height": height})
     opened(page, "live")
@@ -98,7 +98,7 @@ def test_the_live_page_fits_the_window(page, window):
     page.set_viewport_size({"width": 1280, "height": 800})
 
 
-def test_the_live_page_says_why_a_stream_shows_nothing(page, client):
+def test_live_page_shows_reason_of_stream_without_picture(page, client):
     opened(page, "live")
     assert page.is_hidden("#stream-reason")
     reason = "nothing is shown: of 45 frames 45 were withheld (out of body: 45)"
@@ -110,7 +110,7 @@ def test_the_live_page_says_why_a_stream_shows_nothing(page, client):
     page.wait_for_selector("#stream-reason", state="hidden")
 
 
-def test_a_picture_may_tell_what_trivial_predictors_score(page):
+def test_console_quality_text_includes_baseline_scores(page):
     texts = page.evaluate(
         """async () => { const { quality } = await import("/console/streams.js");
         return [quality({ psnr_db: 35.71 }), quality({ psnr_db: 35.71, previous_frame_db: 38 }),
@@ -119,7 +119,7 @@ def test_a_picture_may_tell_what_trivial_predictors_score(page):
     assert texts == ["35.7", "35.7 (previous frame 38.0)", "35.7 (previous frame 38.0, next frame 33.3)", "", ""]
 
 
-def test_nothing_is_deleted_at_one_click(page, client):
+def test_console_delete_requires_confirmation(page, client):
     client.create_stream("spare", "synthetic:?width=64&height=48&frames=4", device="cpu", start=False)
     opened(page, "streams")
     delete = page.get_by_role("button", name="Delete the stream spare")
@@ -144,7 +144,7 @@ def test_nothing_is_deleted_at_one_click(page, client):
     assert [stream.name for stream in client.streams()] == ["theatre-1"]
 
 
-def test_every_delete_of_the_page_asks(page):
+def test_console_modules_confirm_every_delete(page):
     """Every deletion and revocation in the modules passes through the confirmation dialog."""
     folder = Path(__file__).resolve().parents[2] / "services" / "console" / "page"
     asking = {}
@@ -157,7 +157,7 @@ def test_every_delete_of_the_page_asks(page):
     assert all(questions >= deletes for deletes, questions in asking.values()), asking
 
 
-def test_a_recording_that_is_deleted_is_named(page, client, tmp_path):
+def test_console_delete_dialog_names_recording(page, client, tmp_path):
     import zipfile
 
     from gsplat_core.io.recordings import synthesize
@@ -178,7 +178,7 @@ def test_a_recording_that_is_deleted_is_named(page, client, tmp_path):
     assert client.recordings() == []
 
 
-def test_keys_are_made_shown_once_and_revoked(page, client):
+def test_console_creates_shows_once_and_revokes_keys(page, client):
     opened(page, "keys")
     page.fill("#key-name", "wall")
     page.select_option("#key-expires", "7")
@@ -203,7 +203,7 @@ def test_keys_are_made_shown_once_and_revoked(page, client):
     assert "wall" not in [key.name for key in listed(client)]
 
 
-def test_the_audit_log_is_filtered_and_saved(page, client, tmp_path):
+def test_console_filters_and_saves_audit_log(page, client, tmp_path):
     client.revoke_key(client.make_key("for-a-while", "viewer").id)
     opened(page, "audit")
     page.wait_for_selector("#entries >> text=key.revoke")
@@ -233,7 +233,7 @@ def test_the_audit_log_is_filtered_and_saved(page, client, tmp_path):
     until(page, f"document.querySelectorAll('#entries tr').length >= {everything}")
 
 
-def test_health_shows_what_readyz_says(page, client):
+def test_console_health_page_matches_readyz(page, client):
     opened(page, "health")
     page.wait_for_selector("#health-checks tr")
     ready = client.ready()
@@ -253,7 +253,7 @@ def test_health_shows_what_readyz_says(page, client):
     page.unroute("**/readyz?verbose")
 
 
-def test_who_is_signed_in_sees_their_pages_and_can_leave(console):
+def test_console_shows_tabs_of_role_and_signs_out(console):
     page, client = console
     assert "role admin" in page.inner_text("#account")
     other = page.context.browser.new_page()

@@ -40,7 +40,7 @@ def evaluated(intrasplat, *arguments) -> EvaluationReport:
     return EvaluationReport.model_validate_json(done.out)
 
 
-def test_the_held_out_figures_are_those_of_the_run(intrasplat, long, offline):
+def test_evaluate_heldout_scores_match_run_report(intrasplat, long, offline):
     report = evaluated(intrasplat, offline, long, "--protocol", "heldout")
     own = RunReport.read(offline / "report.json")
     assert report.heldout is not None and own.quality.heldout is not None
@@ -53,7 +53,7 @@ def test_the_held_out_figures_are_those_of_the_run(intrasplat, long, offline):
     assert report.evaluated.command == "reconstruct" and report.causal is report.live is report.retention is None
 
 
-def test_a_model_alone_is_evaluated_and_what_is_not_known_about_it_is_said(intrasplat, long, offline, tmp_path):
+def test_evaluate_model_without_run_notes_unknown_facts(intrasplat, long, offline, tmp_path):
     shutil.copytree(offline / "model", tmp_path / "elsewhere")
     report = evaluated(intrasplat, tmp_path / "elsewhere", long)
     assert report.heldout is not None and report.retention is not None and report.live is None
@@ -63,7 +63,7 @@ def test_a_model_alone_is_evaluated_and_what_is_not_known_about_it_is_said(intra
     assert beside.evaluated.command == "reconstruct" and not any("it is not known" in note for note in beside.notes)
 
 
-def test_reports_are_written_and_the_table_is_printed(intrasplat, long, offline, tmp_path):
+def test_evaluate_writes_reports_and_prints_table(intrasplat, long, offline, tmp_path):
     out = tmp_path / "out"
     done = intrasplat(
         "evaluate",
@@ -104,7 +104,7 @@ def test_reports_are_written_and_the_table_is_printed(intrasplat, long, offline,
     assert not (out / "evaluation-causal.jsonl").exists(), "a new evaluation replaces the earlier one whole"
 
 
-def test_the_motion_prior_of_the_prediction_can_be_chosen(intrasplat, long, offline):
+def test_evaluate_motion_prior_option_changes_prediction(intrasplat, long, offline):
     few = ("--protocol", "causal", "--steps-per-frame", 2, "--max-frames", 5)
     flow, plain = (evaluated(intrasplat, offline, long, *few, *more) for more in (("--motion-prior", "flow"), ()))
     assert flow.causal is not None and plain.causal is not None
@@ -112,13 +112,13 @@ def test_the_motion_prior_of_the_prediction_can_be_chosen(intrasplat, long, offl
     assert flow.series["causal"] != plain.series["causal"]
 
 
-def test_a_prediction_depends_on_nothing_that_comes_later(intrasplat, long, offline, tmp_path):
+def test_causal_prediction_does_not_depend_on_later_frames(intrasplat, long, offline, tmp_path):
     whole = evaluated(intrasplat, offline, long, "--protocol", "causal", "--steps-per-frame", 2)
     start = evaluated(intrasplat, offline, long, "--protocol", "causal", "--steps-per-frame", 2, "--max-frames", 6)
     assert start.series["causal"] == whole.series["causal"][:5]
 
 
-def test_a_run_that_trained_on_every_frame_has_no_held_out_figures(intrasplat, tiny, tmp_path):
+def test_evaluate_run_trained_on_all_frames_has_no_heldout_scores(intrasplat, tiny, tmp_path):
     assert intrasplat("replay", tiny, "--out", tmp_path / "run", "--steps-per-frame", 1).code == 0
     done = intrasplat("evaluate", tmp_path / "run", tiny, "--protocol", "heldout")
     assert done.code == 2 and "trained on the held-out frames" in done.err
@@ -128,7 +128,7 @@ def test_a_run_that_trained_on_every_frame_has_no_held_out_figures(intrasplat, t
     assert done.code == 2 and "not a live run" in done.err
 
 
-def test_another_recording_is_named_or_refused(intrasplat, long, offline, tiny, tmp_path):
+def test_evaluate_notes_or_refuses_other_recording(intrasplat, long, offline, tiny, tmp_path):
     report = evaluated(intrasplat, offline, tiny, "--protocol", "retention")
     assert any("made from other files" in note for note in report.notes)
     other = synthesize(tmp_path / "wide", frames=3, width_px=96, height_px=48, stereo=False)
@@ -142,14 +142,14 @@ def test_another_recording_is_named_or_refused(intrasplat, long, offline, tiny, 
     assert done.code == 2 and "focal length" in done.err
 
 
-def test_a_part_of_the_time_is_said(intrasplat, long, tmp_path):
+def test_evaluate_notes_partially_covered_recording(intrasplat, long, tmp_path):
     assert intrasplat("reconstruct", long, "--out", tmp_path / "run", "--steps", 5, "--max-frames", 4).code == 0
     report = evaluated(intrasplat, tmp_path / "run", long)
     assert any("the first 5 of the 12 frames" in note for note in report.notes)
     assert {each.frames for each in report.baselines if each.age_frames == 1} == {4}
 
 
-def test_the_size_of_the_model_is_taken_unless_another_one_is_asked_for(intrasplat, long, tmp_path):
+def test_evaluate_uses_size_of_model_unless_scale_is_given(intrasplat, long, tmp_path):
     assert intrasplat("reconstruct", long, "--out", tmp_path / "run", "--steps", 5, "--scale", 0.5).code == 0
     report = evaluated(intrasplat, tmp_path / "run", long, "--protocol", "heldout")
     assert (report.recording.width_px, report.evaluated.scale) == (32, 0.5)
@@ -173,12 +173,12 @@ def test_the_size_of_the_model_is_taken_unless_another_one_is_asked_for(intraspl
         (["--renderer", "crayon"], "crayon"),
     ],
 )
-def test_a_wrong_option_is_one_sentence(intrasplat, long, offline, arguments, said):
+def test_evaluate_prints_error_for_invalid_option(intrasplat, long, offline, arguments, said):
     done = intrasplat("evaluate", offline, long, *arguments)
     assert done.code == 2 and said in done.err and done.err.count("\n") <= 2
 
 
-def test_what_is_no_model_or_run_is_refused(intrasplat, long, offline, tmp_path):
+def test_evaluate_refuses_paths_without_valid_model_or_run(intrasplat, long, offline, tmp_path):
     for path in (tmp_path / "missing", tmp_path):
         done = intrasplat("evaluate", path, long)
         assert done.code == 2 and done.err.startswith("error: "), done.err
@@ -195,7 +195,7 @@ def test_what_is_no_model_or_run_is_refused(intrasplat, long, offline, tmp_path)
     assert "report.json" not in intrasplat("evaluate", other / "model", long, "--protocol", "heldout").err
 
 
-def test_results_go_neither_into_the_run_nor_over_strangers_files(intrasplat, long, offline, tmp_path, fingerprints):
+def test_evaluate_refuses_output_in_run_or_foreign_folder(intrasplat, long, offline, tmp_path, fingerprints):
     before = fingerprints(offline)
     assert intrasplat("evaluate", offline, long, "--out", offline / "evaluation").code == 2
     assert intrasplat("evaluate", offline, long, "--out", offline).code == 2
@@ -205,7 +205,7 @@ def test_results_go_neither_into_the_run_nor_over_strangers_files(intrasplat, lo
     assert [path.name for path in tmp_path.iterdir()] == ["mine.png"]
 
 
-def test_places_are_named_by_their_times(intrasplat, long, offline):
+def test_evaluate_place_option_selects_time_ranges(intrasplat, long, offline):
     report = evaluated(intrasplat, offline, long, "--protocol", "retention", "--place", "0:0.05,0.2:0.3")
     assert report.retention is not None
     (place,) = report.retention.places
@@ -216,7 +216,7 @@ def test_places_are_named_by_their_times(intrasplat, long, offline):
 
 
 @pytest.mark.slow
-def test_an_interrupted_evaluation_leaves_what_it_reached(long, offline, tmp_path, start):
+def test_interrupted_evaluate_writes_partial_report(long, offline, tmp_path, start):
     process = start(
         "evaluate", offline, long, "--protocol", "causal", "--steps-per-frame", 3000, "--out", tmp_path / "out"
     )
@@ -232,7 +232,7 @@ def test_an_interrupted_evaluation_leaves_what_it_reached(long, offline, tmp_pat
     assert report.causal is not None and report.causal.score.frames < 11
 
 
-def test_a_long_series_is_summed_up(intrasplat, long, offline, monkeypatch):
+def test_evaluate_bins_long_series(intrasplat, long, offline, monkeypatch):
     monkeypatch.setattr("services.reports.evaluation.MAX_SERIES", 4)
     report = evaluated(intrasplat, offline, long, "--protocol", "retention")
     assert report.series_frames_per_entry == {"baselines": 3, "retention": 3}
@@ -241,7 +241,7 @@ def test_a_long_series_is_summed_up(intrasplat, long, offline, monkeypatch):
     assert own["frames"] == 3 and own["psnr_tissue_min_db"] <= own["psnr_tissue_db"]
 
 
-def test_a_live_run_that_looped_faster_than_the_recording_is_seen_at_its_own_times(intrasplat, long, offline, tmp_path):
+def test_evaluate_looped_live_run_uses_its_own_frame_times(intrasplat, long, offline, tmp_path):
     """Imitate the output of `live --loop --fps 60`: the model's time is 2.5 rounds of 0.2 s."""
     folder = shutil.copytree(offline, tmp_path / "live")
     manifest = json.loads((folder / "model" / "manifest.json").read_text())

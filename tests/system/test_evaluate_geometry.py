@@ -39,7 +39,7 @@ def geometry(intrasplat, *arguments):
     return found
 
 
-def test_everything_that_is_known_is_measured(intrasplat, known, made):
+def test_geometry_measures_all_known_ground_truth(intrasplat, known, made):
     found = geometry(intrasplat, made, known)
     assert found.frames == 9 and found.depth is not None and found.normals is not None and found.parts is not None
     assert 0 < found.depth.scaled_rmse_share < 0.2 and found.depth.plane_rmse_share < found.depth.level_rmse_share
@@ -49,7 +49,7 @@ def test_everything_that_is_known_is_measured(intrasplat, known, made):
     assert found.trajectory is None  # the model has the recording's own poses
 
 
-def test_it_is_printed_and_written_with_units_and_marks(intrasplat, known, made, tmp_path):
+def test_geometry_is_printed_and_written_with_baselines(intrasplat, known, made, tmp_path):
     out = tmp_path / "out"
     done = intrasplat("evaluate", made, known, "--protocol", "geometry", "--out", out)
     assert done.code == 0, done.err
@@ -67,7 +67,7 @@ def test_it_is_printed_and_written_with_units_and_marks(intrasplat, known, made,
     assert json.loads((out / "evaluation.json").read_text())["geometry"]["depth"]["frames"] == 9
 
 
-def test_the_poses_that_a_model_was_made_with_are_compared(intrasplat, known, made, tmp_path):
+def test_geometry_poses_option_scores_trajectory(intrasplat, known, made, tmp_path):
     """Halve the trajectory's lengths: its scale is wrong, and the model is away from its stated place."""
     recording = open_recording(known)
     poses = np.stack([recording.camera_at(k).world_to_camera for k in range(9)])
@@ -83,7 +83,7 @@ def test_the_poses_that_a_model_was_made_with_are_compared(intrasplat, known, ma
     assert done.code == 2 and "poses.npy" in done.err
 
 
-def test_pictures_alone_have_no_figure(intrasplat, tmp_path):
+def test_geometry_without_ground_truth_has_no_depth_or_tracking(intrasplat, tmp_path):
     folder = synthesize(tmp_path / "plain", frames=3, fps=3, width_px=48, height_px=40, stereo=False)
     for path in (folder / "depth").iterdir():
         path.unlink()
@@ -122,7 +122,7 @@ def small(tmp_path_factory) -> Path:
         (lambda folder: np.save(folder / "tracks.npy", np.full((3, 63, 3), np.nan, np.float32)), "finite"),
     ],
 )
-def test_truth_that_cannot_be_read_is_said(intrasplat, small, tmp_path, break_it, said):
+def test_geometry_refuses_unreadable_ground_truth(intrasplat, small, tmp_path, break_it, said):
     folder = shutil.copytree(small / "x", tmp_path / "x")
     break_it(folder)
     done = intrasplat("evaluate", small / "run", folder, "--protocol", "geometry")

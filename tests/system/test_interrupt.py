@@ -30,7 +30,7 @@ def wait_for_line(process, beginning: str) -> None:
 
 
 @pytest.mark.parametrize("engine", ["embedded", pytest.param("holoscan", marks=pytest.mark.holoscan)])
-def test_an_interrupted_replay_writes_what_it_has(request, long, tmp_path, start, engine):
+def test_interrupted_replay_writes_results_so_far(request, long, tmp_path, start, engine):
     if engine == "holoscan":
         request.getfixturevalue("sdk")
     out = tmp_path / "out"
@@ -49,7 +49,7 @@ def test_an_interrupted_replay_writes_what_it_has(request, long, tmp_path, start
     assert "interrupted" in (out / "report.html").read_text()
 
 
-def test_an_interrupted_reconstruction_keeps_the_model_as_it_is(long, tmp_path, start):
+def test_interrupted_reconstruct_saves_model_so_far(long, tmp_path, start):
     out = tmp_path / "out"
     process = start("reconstruct", long, "--out", out, "--steps", 100_000)
     wait_for_line(process, "train 1/100000")

@@ -62,7 +62,7 @@ def one_sentence(err):
 
 
 @pytest.mark.slow
-def test_a_signal_is_how_a_stream_is_ended(scope, tmp_path, start):
+def test_sigterm_ends_live_with_exit_code_0(scope, tmp_path, start):
     process = showing(start, scope, tmp_path / "out")
     process.send_signal(signal.SIGTERM)  # SIGINT: test_recorded_sessions
     out, err = process.communicate(timeout=300)
@@ -72,7 +72,7 @@ def test_a_signal_is_how_a_stream_is_ended(scope, tmp_path, start):
     assert report.run.interrupted and report.run.stop_reason == "interrupted"
 
 
-def test_seconds_end_a_stream(scope, tmp_path, intrasplat):
+def test_live_ends_after_seconds_option(scope, tmp_path, intrasplat):
     for seconds in (2, 20, 200):  # a very busy machine shows nothing in the first ones
         done = intrasplat("live", scope, "--loop", "--seconds", seconds, "--out", tmp_path / "out", "--json")
         if done.code != NOTHING_SHOWN:
@@ -97,7 +97,7 @@ class Dying(RealtimeSource):
 
 
 @pytest.mark.slow
-def test_a_source_that_dies(scope, tmp_path, intrasplat, monkeypatch):
+def test_live_saves_results_if_source_is_lost(scope, tmp_path, intrasplat, monkeypatch):
     def dying(address, options):
         source = play(address, options)
         return Dying(source.recording, replace(options, process=False))
@@ -110,7 +110,7 @@ def test_a_source_that_dies(scope, tmp_path, intrasplat, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_device_without_memory(scope, tmp_path, monkeypatch):
+def test_live_saves_results_if_gpu_is_out_of_memory(scope, tmp_path, monkeypatch):
     observe = Reconstructor.observe
 
     def observing(self, frame, **more):
@@ -131,7 +131,7 @@ def test_a_device_without_memory(scope, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_disk_that_fills_up(scope, small_disk, start):
+def test_live_saves_results_if_disk_fills_up(scope, small_disk, start):
     """Somebody else takes the room: the model and the report find what was kept free for them."""
     process = showing(start, scope, small_disk / "out")
     with open(small_disk / "ballast", "ab") as ballast:

@@ -29,7 +29,7 @@ def dry_run(*arguments: str, **environment: str) -> str:
     return done.stdout
 
 
-def test_the_demo_builds_for_a_gpu_only_where_there_is_one():
+def test_make_demo_builds_cuda_only_with_gpu():
     """`make` runs what is under `$(MAKE)` even in a dry run, so its line is read here."""
     recipe = (ROOT / "Makefile").read_text().partition("\ndemo:")[2].partition("\n\n")[0]
     assert "set -e; if $(BIN)/python -m services.cli.doctor; then" in recipe
@@ -37,16 +37,16 @@ def test_the_demo_builds_for_a_gpu_only_where_there_is_one():
 
 
 @pytest.mark.parametrize("value", [None, "", " "])
-def test_without_a_compiler_named_the_one_from_pip_is_installed(value):
+def test_make_cuda_installs_toolkit_without_cudacxx(value):
     environment = {} if value is None else {"CUDACXX": value}
     assert "build/cuda-toolkit" in dry_run("cuda", **environment)
 
 
-def test_a_compiler_that_is_named_is_used():
+def test_make_cuda_uses_cudacxx():
     assert "build/cuda-toolkit" not in dry_run("cuda", CUDACXX="/usr/local/cuda/bin/nvcc")
 
 
-def test_make_cuda_builds_for_the_gpu_at_hand_unless_told():
+def test_make_cuda_builds_native_architecture_by_default():
     assert '-DINTRASPLAT_CUDA_ARCHITECTURES="native"' in dry_run("cuda")
     assert '-DINTRASPLAT_CUDA_ARCHITECTURES="portable"' in dry_run("cuda", "CUDA_ARCHITECTURES=portable")
 
@@ -60,7 +60,7 @@ def test_ci_builds_the_cuda_kernels_and_requires_them():
 
 
 @pytest.mark.parametrize(("target", "selected"), [("test", True), ("test-all", False)])
-def test_slow_tests_are_left_out_by_the_fast_command_alone(target, selected):
+def test_make_test_is_fast_and_make_test_all_is_not(target, selected):
     (command,) = [line for line in dry_run(target).splitlines() if "-m tests.groups" in line]
     assert ("--fast" in command.split()) == selected
 

@@ -30,7 +30,7 @@ def drapes(tmp_path):
     return folder
 
 
-def test_a_live_run_and_the_replay_of_its_session(drapes, tmp_path, capsys):
+def test_runs_and_batch_with_only_withheld_frames_exit_3(drapes, tmp_path, capsys):
     """A single test, because a live run takes seconds."""
     assert (
         run(
@@ -69,7 +69,7 @@ def test_a_live_run_and_the_replay_of_its_session(drapes, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_with_the_gate_off_the_same_run_shows_its_frames(drapes, tmp_path, capsys):
+def test_live_with_out_of_body_off_shows_frames(drapes, tmp_path, capsys):
     assert (
         run(
             [
@@ -93,7 +93,7 @@ def test_with_the_gate_off_the_same_run_shows_its_frames(drapes, tmp_path, capsy
 
 
 @pytest.mark.parametrize(("level", "bits"), [(0, 8), (4095, 16)])
-def test_black_pictures_are_not_reconstructed(level, bits, tmp_path, capsys):
+def test_reconstruct_exits_3_for_black_images(level, bits, tmp_path, capsys):
     folder = tmp_path / "black" / "images"
     folder.mkdir(parents=True)
     for k in range(5):
@@ -113,7 +113,7 @@ def black_beginning(tiny, tmp_path):
     return recording
 
 
-def test_a_black_beginning_is_left_out_offline_and_by_evaluate(black_beginning, tmp_path, capsys):
+def test_reconstruct_and_evaluate_omit_black_frames(black_beginning, tmp_path, capsys):
     out = tmp_path / "out"
     assert run(["reconstruct", str(black_beginning), "--out", str(out), "--steps", "2", "--device", "cpu"]) == OK
     assert "2 frames were withheld and not scored (black: 2)" in capsys.readouterr().err
@@ -124,7 +124,7 @@ def test_a_black_beginning_is_left_out_offline_and_by_evaluate(black_beginning, 
     assert copy.frames == 3 and copy.psnr_tissue_db < 50
 
 
-def test_the_previous_frame_of_a_replay_is_compared_where_its_pictures_are(black_beginning, tmp_path, capsys):
+def test_replay_previous_frame_baseline_omits_black_frames(black_beginning, tmp_path, capsys):
     out = tmp_path / "out"
     assert run(["replay", str(black_beginning), "--out", str(out), "--steps-per-frame", "2", "--device", "cpu"]) == OK
     quality = RunReport.read(out / "report.json").quality

@@ -43,7 +43,7 @@ def replayed(intrasplat, folder, out):
     return RunReport.read(out / "report.json")
 
 
-def test_a_killed_session_is_replayed_and_stays_when_the_next_one_is_recorded(scope, tmp_path, start, intrasplat):
+def test_killed_session_is_replayable_and_kept_until_record_keep(scope, tmp_path, start, intrasplat):
     out = tmp_path / "out"
     process = recording_under_way(start, scope, out)
     process.kill()
@@ -72,7 +72,7 @@ def test_a_killed_session_is_replayed_and_stays_when_the_next_one_is_recorded(sc
     )
 
 
-def test_an_interrupted_session_is_complete(scope, tmp_path, start, intrasplat):
+def test_interrupted_session_is_complete_and_replayable(scope, tmp_path, start, intrasplat):
     process = recording_under_way(start, scope, tmp_path / "out")
     process.send_signal(signal.SIGINT)
     _, stderr = process.communicate(timeout=300)
@@ -84,13 +84,13 @@ def test_an_interrupted_session_is_complete(scope, tmp_path, start, intrasplat):
     assert any("byte for byte" in note for note in notes), notes
 
 
-def test_without_a_folder_that_stays_nothing_is_recorded(scope, intrasplat):
+def test_live_record_without_out_is_refused(scope, intrasplat):
     done = intrasplat("live", scope, "--record", "--seconds", "1")
     assert done.code == 2
     assert "--out" in done.err and "Traceback" not in done.err
 
 
-def test_a_session_is_evaluated_at_its_own_size_and_times(scope, tmp_path, intrasplat):
+def test_evaluate_session_uses_its_own_size_and_times(scope, tmp_path, intrasplat):
     """Scale and time are those of the recorded run and are not applied again, even after loops of the source."""
     out = tmp_path / "out"
     arguments = ("--loop", "--max-frames", "60", "--scale", "0.5", "--fps", "60", "--record", "--json")

@@ -15,7 +15,7 @@ def replayed(intrasplat, recording, out, *options) -> RunReport:
     return RunReport.model_validate_json(done.out)
 
 
-def test_cutting_gives_the_same_frames_twice_and_on_both_engines(request, recordings_dir, tmp_path, intrasplat):
+def test_replay_of_cutting_is_deterministic_and_same_on_both_engines(request, recordings_dir, tmp_path, intrasplat):
     options = ("--max-frames", 20, "--scale", 0.5, "--steps-per-frame", 3)
     recording = recordings_dir / "cutting"
     first = replayed(intrasplat, recording, tmp_path / "first", *options)
@@ -31,7 +31,7 @@ def test_cutting_gives_the_same_frames_twice_and_on_both_engines(request, record
     assert {name: o.calls for name, o in holoscan.operators.items()} == {n: o.calls for n, o in first.operators.items()}
 
 
-def test_sinus_with_its_moving_camera_replays(recordings_dir, tmp_path, intrasplat):
+def test_replay_of_sinus_beats_previous_frame(recordings_dir, tmp_path, intrasplat):
     report = replayed(
         intrasplat,
         recordings_dir / "sinus",

@@ -14,7 +14,7 @@ QUICK = ("--steps-per-frame", "2")
 PATH = "source,analysis,reconstruct,deform,rasterize,"
 
 
-def test_everything_is_written_and_fits_together(finished, tiny):
+def test_replay_writes_consistent_outputs(finished, tiny):
     assert {p.name for p in finished.iterdir()} == {
         ".intrasplat.json",
         "reconstruction.mp4",
@@ -52,7 +52,7 @@ def test_everything_is_written_and_fits_together(finished, tiny):
     assert "Research use only" in (finished / "report.html").read_text()
 
 
-def test_quality_is_told_apart_and_stands_beside_its_baselines(finished):
+def test_replay_report_has_live_and_heldout_quality_with_baselines(finished):
     report = RunReport.read(finished / "report.json")
     live, held_out = report.quality.live, report.quality.heldout
     assert live is not None and held_out is not None
@@ -64,7 +64,7 @@ def test_quality_is_told_apart_and_stands_beside_its_baselines(finished):
 
 
 @pytest.mark.parametrize("engine", ["embedded", pytest.param("holoscan", marks=pytest.mark.holoscan)])
-def test_one_seed_gives_the_same_bytes(request, tiny, tmp_path, intrasplat, finished, engine):
+def test_replay_with_same_seed_is_identical(request, tiny, tmp_path, intrasplat, finished, engine):
     if engine == "holoscan":
         request.getfixturevalue("sdk")
     done = intrasplat("replay", tiny, "--out", tmp_path / "again", "--heldout", "--json", "--engine", engine, *QUICK)
@@ -76,7 +76,7 @@ def test_one_seed_gives_the_same_bytes(request, tiny, tmp_path, intrasplat, fini
     assert (again.frames, again.quality) == (before.frames, before.quality)
 
 
-def test_another_seed_gives_other_bytes(tiny, tmp_path, intrasplat):
+def test_replay_with_other_seed_differs(tiny, tmp_path, intrasplat):
     digests = {
         json.loads(
             intrasplat(
@@ -88,7 +88,7 @@ def test_another_seed_gives_other_bytes(tiny, tmp_path, intrasplat):
     assert len(digests) == 2
 
 
-def test_plain_output_ends_with_the_page(tiny, tmp_path, intrasplat):
+def test_replay_output_ends_with_report_path(tiny, tmp_path, intrasplat):
     done = intrasplat("replay", tiny, "--out", tmp_path / "out", "--max-frames", 2, "--scale", 0.5, *QUICK)
     assert done.code == 0
     assert done.out.splitlines()[-1] == str(tmp_path / "out" / "report.html")
@@ -96,14 +96,14 @@ def test_plain_output_ends_with_the_page(tiny, tmp_path, intrasplat):
     assert RunReport.read(tmp_path / "out" / "report.json").recording.width_px == 32
 
 
-def test_a_second_run_replaces_the_first_and_says_so(tiny, tmp_path, intrasplat):
+def test_second_replay_replaces_first_with_note(tiny, tmp_path, intrasplat):
     for _ in range(2):
         done = intrasplat("replay", tiny, "--out", tmp_path / "out", "--max-frames", 1, *QUICK)
         assert done.code == 0
     assert "note: the output folder held an earlier run; this one replaces its files" in done.err
 
 
-def test_a_model_renders_to_a_video_and_to_images(finished, tmp_path, intrasplat):
+def test_render_writes_video_and_images(finished, tmp_path, intrasplat):
     done = intrasplat("render", finished / "model", "--out", tmp_path / "model.mp4", "--fps", 30)
     assert done.code == 0 and done.out.strip() == str(tmp_path / "model.mp4")
     video = cv2.VideoCapture(str(tmp_path / "model.mp4"))
@@ -115,7 +115,7 @@ def test_a_model_renders_to_a_video_and_to_images(finished, tmp_path, intrasplat
     assert cv2.imread(str(tmp_path / "images" / names[0])).shape == (96, 128, 3)
 
 
-def test_reconstruct_trains_on_all_training_frames_and_scores_the_others(tiny, tmp_path, intrasplat):
+def test_reconstruct_scores_training_and_heldout_frames(tiny, tmp_path, intrasplat):
     done = intrasplat("reconstruct", tiny, "--out", tmp_path / "out", "--steps", 40, "--json")
     assert done.code == 0, done.err
     report = RunReport.model_validate_json(done.out)
@@ -126,7 +126,7 @@ def test_reconstruct_trains_on_all_training_frames_and_scores_the_others(tiny, t
     assert load_bundle(tmp_path / "out" / "model").sha256() == report.model.sha256
 
 
-def test_synthesize_gives_a_valid_recording(tmp_path, intrasplat):
+def test_synthesize_writes_valid_recording(tmp_path, intrasplat):
     done = intrasplat("synthesize", "--out", tmp_path / "take", "--frames", 2, "--width", 48, "--height", 40, "--json")
     assert done.code == 0
     assert json.loads(done.out)["frames"] == 2
@@ -134,7 +134,7 @@ def test_synthesize_gives_a_valid_recording(tmp_path, intrasplat):
     assert done.code == 0 and json.loads(done.out)["ok"]
 
 
-def test_doctor_says_what_runs_where(intrasplat):
+def test_doctor_lists_instruction_set_ops_and_gpu(intrasplat):
     done = intrasplat("doctor", "--json")
     checks = {check["name"]: check for check in json.loads(done.out)["checks"]}
     assert done.code == 0

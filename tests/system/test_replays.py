@@ -120,7 +120,7 @@ def results(server):
     }
 
 
-def test_a_recording_is_replayed_and_its_report_read(server, tmp_path):
+def test_service_replays_recording_and_serves_results(server, tmp_path):
     job = server.client.start_replay("tiny", QUICK, idempotency_key="first")
     assert server.client.start_replay("tiny", QUICK, idempotency_key="first").id == job.id
     done = server.client.ended_replay(job.id, within_s=WITHIN_S)
@@ -137,12 +137,12 @@ def test_a_recording_is_replayed_and_its_report_read(server, tmp_path):
         server.client.start_replay("nobody")
 
 
-def test_a_replay_that_fails_says_why(server):
+def test_failed_replay_has_reason(server):
     job = server.client.ended_replay(server.client.start_replay("tiny", {"scale": 0.01}).id, within_s=WITHIN_S)
     assert job.state == "failed" and "scale" in job.reason and job.results == []
 
 
-def test_a_recording_in_use_stays_and_a_cancelled_replay_leaves_nothing(server):
+def test_recording_in_use_is_kept_and_cancelled_replay_leaves_no_files(server):
     job = server.client.start_replay("tiny", LONG)
     attempt = running(server, job.id)
     with pytest.raises(Refused, match="has not ended uses"):
@@ -154,7 +154,7 @@ def test_a_recording_in_use_stays_and_a_cancelled_replay_leaves_nothing(server):
     assert job.id not in results(server)
 
 
-def test_the_same_from_a_shell(server, tiny, tmp_path, monkeypatch, intrasplat):
+def test_ctl_uploads_replays_keeps_and_deletes_recording(server, tiny, tmp_path, monkeypatch, intrasplat):
     monkeypatch.setenv("INTRASPLAT_URL", server.url)
     monkeypatch.setenv("INTRASPLAT_KEY", server.client._key)
     added = intrasplat("ctl", "add-recording", "from-a-folder", tiny)
@@ -193,7 +193,7 @@ def page(server):
         assert said == [], "the page failed, or asked for something from elsewhere"
 
 
-def test_a_recording_is_uploaded_and_replayed_from_the_page(server, page):
+def test_console_uploads_and_replays_recording(server, page):
     page.click("#tab-recordings")
     page.fill("#recording-name", "by-hand")
     page.set_input_files("#recording-file", server.folder / "tiny.zip")
@@ -211,7 +211,7 @@ def test_a_recording_is_uploaded_and_replayed_from_the_page(server, page):
     assert "6 of 6 frames" in replay.inner_text() and "steps per frame 2" in replay.inner_text()
 
 
-def test_the_chosen_recording_is_chosen_before_the_list_comes_and_stays_so(server, page):
+def test_console_keeps_chosen_recording_while_list_loads(server, page):
     """Answers may arrive in any order: one that was requested before the choice does not know the recording."""
     held: list = []
     page.click("#tab-recordings")
@@ -242,7 +242,7 @@ def until_true(found, page):
         page.wait_for_timeout(20)
 
 
-def test_its_report_and_its_video_are_shown(server, page):
+def test_console_shows_report_and_video_of_replay(server, page):
     replay = page.locator("#replay-rows tr", has_text="by-hand")
     with page.context.expect_page() as opened:
         replay.get_by_text("Report", exact=True).click()
@@ -261,7 +261,7 @@ def test_its_report_and_its_video_are_shown(server, page):
     assert page.evaluate("document.getElementById('replay-video').videoWidth") >= 128
 
 
-def test_its_model_is_kept_from_the_page_by_the_keyboard(server, page):
+def test_console_keeps_model_of_replay_by_keyboard(server, page):
     replay = page.locator("#replay-rows tr", has_text="by-hand")
     replay.get_by_text("Keep model").focus()
     page.keyboard.press("Enter")
@@ -272,7 +272,7 @@ def test_its_model_is_kept_from_the_page_by_the_keyboard(server, page):
     assert server.client.checked("from-a-replay", 1).state == "ready"
 
 
-def test_the_pages_digest_of_a_file_in_pieces_is_sha256(page):
+def test_console_sha256_of_pieces_matches_hashlib(page):
     content = bytes(range(256)) * 1001 + b"end"
     found = page.evaluate(
         """async (sizes) => { const { Sha256 } = await import("/console/sha256.js");
@@ -287,7 +287,7 @@ def test_the_pages_digest_of_a_file_in_pieces_is_sha256(page):
 
 
 @pytest.mark.parametrize("who", ["attempt", "pool", "server"])
-def test_a_replay_whose_process_is_killed_is_made_once(server, who):
+def test_replay_with_killed_process_is_made_once(server, who):
     job = server.client.start_replay("tiny", LONG)
     attempt = running(server, job.id)
     os.kill({"attempt": attempt, "pool": server.pool(), "server": server.process.pid}[who], signal.SIGKILL)
@@ -301,7 +301,7 @@ def test_a_replay_whose_process_is_killed_is_made_once(server, who):
     assert results(server)[job.id]["frames"]["displayed"] == 6
 
 
-def test_it_ends_with_its_pool(server):
+def test_sigterm_ends_service_and_job_pool(server):
     job = server.client.start_replay("tiny", LONG)
     running(server, job.id)
     pool = server.pool()

@@ -65,7 +65,7 @@ def until(found, log, within_s=WITHIN_S):
     raise AssertionError(f"it did not come about within {within_s} s:\n{log.read_text()[-4000:]}")
 
 
-def test_what_it_serves_is_what_it_says(served):
+def test_service_reports_its_parts_and_stream(served):
     client, _, _ = served
     assert {"streams", "models", "display"} <= set(client.about()["parts"])
     stream = client.stream("theatre")
@@ -74,7 +74,7 @@ def test_what_it_serves_is_what_it_says(served):
 
 
 @pytest.mark.parametrize("kind", ["raw", "shown"])
-def test_a_viewer_gets_pictures_with_their_age(served, kind):
+def test_viewer_receives_pictures_with_age(served, kind):
     client, _, _ = served
     shown = client.pictures("theatre", kind)
     headers = [next(shown).header for _ in range(5)]
@@ -84,7 +84,7 @@ def test_a_viewer_gets_pictures_with_their_age(served, kind):
     assert all((header["width_px"], header["height_px"]) == (160, 128) for header in headers)
 
 
-def test_the_cameras_picture_goes_on_while_a_killed_engine_comes_back(served):
+def test_raw_pictures_continue_while_killed_engine_restarts(served):
     client, _, log = served
     before = client.stream("theatre").processes["engine"]
     raw = client.pictures("theatre", "raw")
@@ -123,7 +123,7 @@ def colour_shown(client, stream):
     return ("red", "green", "blue")[int(middle.argmax())], picture.header["model_version"]
 
 
-def test_a_model_is_uploaded_checked_activated_and_rolled_back(served, walls):
+def test_model_stream_follows_activation_and_rollback(served, walls):
     client, _, log = served
     versions = []
     for name in ("red", "green"):
@@ -147,7 +147,7 @@ def test_a_model_is_uploaded_checked_activated_and_rolled_back(served, walls):
         client.stream("playback")
 
 
-def test_what_is_no_model_is_refused_before_it_is_kept(served, tmp_path):
+def test_upload_of_invalid_model_returns_422(served, tmp_path):
     client, _, _ = served
     (tmp_path / "x.isplat").write_bytes(b"\x80\x04" + bytes(3000))
     with pytest.raises(Refused) as refused:
@@ -155,7 +155,7 @@ def test_what_is_no_model_is_refused_before_it_is_kept(served, tmp_path):
     assert refused.value.status == 422
 
 
-def test_what_is_not_there_is_refused_with_a_sentence(served):
+def test_unknown_stream_key_and_source_are_refused(served):
     client, url, _ = served
     with pytest.raises(Refused, match="no stream with this name") as refused:
         client.stream("nobody")
@@ -197,14 +197,14 @@ def brightness(page, canvas):
     )
 
 
-def test_the_page_shows_camera_and_reconstruction(page):
+def test_console_shows_camera_and_reconstruction(page):
     # Both come by streams of their own: the first picture of one may come a moment after the other's.
     page.wait_for_function("raw.width === shown.width && raw.height === shown.height")
     assert page.evaluate("[raw.width, raw.height, shown.width, shown.height].join()") == "160,128,160,128"
     assert 30 < brightness(page, "raw") < 225 and abs(brightness(page, "raw") - brightness(page, "shown")) < 25
 
 
-def test_a_stream_is_stopped_and_started_from_the_page(page):
+def test_console_stops_and_starts_stream(page):
     page.click("#tab-streams")
     page.click("#stream-rows >> text=Stop")
     page.click("#confirm-yes")
@@ -214,7 +214,7 @@ def test_a_stream_is_stopped_and_started_from_the_page(page):
     page.wait_for_selector("#state[data-state=live]")
 
 
-def test_pages_are_reached_by_the_keyboard(page):
+def test_console_tabs_are_reachable_by_arrow_keys(page):
     page.focus("#tab-streams")
     page.keyboard.press("ArrowRight")
     page.wait_for_selector("#key-rows tr")
@@ -226,7 +226,7 @@ def test_pages_are_reached_by_the_keyboard(page):
     assert page.evaluate("document.activeElement.id") == "tab-live" and page.is_visible("#raw")
 
 
-def test_a_model_is_uploaded_and_activated_from_the_page(page, walls):
+def test_console_uploads_and_activates_model(page, walls):
     page.click("#tab-models")
     page.fill("#model-name", "from-the-page")
     page.set_input_files("#model-file", walls / "green.isplat")
@@ -236,7 +236,7 @@ def test_a_model_is_uploaded_and_activated_from_the_page(page, walls):
     mine.get_by_text("active").wait_for()
 
 
-def test_what_the_server_refuses_is_said_on_the_page(page):
+def test_console_shows_refusal_of_server(page):
     page.click("#tab-streams")
     page.fill("#stream-name", "spy")
     page.fill("#stream-source", "file:///etc/passwd")

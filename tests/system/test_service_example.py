@@ -29,7 +29,7 @@ def programs() -> None:
         missing(f"the example needs {', '.join(absent)}; install it")
 
 
-def test_the_life_cycle_with_curl(tiny, tmp_path):
+def test_service_life_cycle_example_succeeds(tiny, tmp_path):
     for name, colour in (("one", (0.9, 0.1, 0.1)), ("two", (0.1, 0.9, 0.1))):
         save_bundle(uniform(colour), tmp_path / name)
         pack(tmp_path / name, tmp_path / f"{name}.isplat")

@@ -26,7 +26,7 @@ def layers_of(client):
 
 
 @pytest.mark.parametrize("kind", ["depth", "confidence", "orbit"])
-def test_a_layer_is_drawn_while_somebody_watches_and_not_longer(served, kind):
+def test_layer_is_drawn_only_while_watched(served, kind):
     client, _, log = served
     assert not layers_of(client)[kind]["watched"]
     shown = client.pictures("theatre", kind)
@@ -48,7 +48,7 @@ def test_a_layer_is_drawn_while_somebody_watches_and_not_longer(served, kind):
     until(rests, log)  # one may be drawn while the figures already report no viewer
 
 
-def test_the_virtual_camera_turns(served):
+def test_turn_camera_changes_virtual_view(served):
     client, _, _ = served
     client.turn_camera("theatre", azimuth_deg=30)
     shown = client.pictures("theatre", "orbit")
@@ -59,7 +59,7 @@ def test_the_virtual_camera_turns(served):
         client.turn_camera("theatre", elevation_deg=80)
 
 
-def test_a_snapshot_is_taken_fetched_and_uploaded(served, tmp_path):
+def test_snapshot_is_taken_exported_and_deleted(served, tmp_path):
     client, _, _ = served
     taken = client.take_snapshot("theatre", idempotency_key="one")
     assert client.take_snapshot("theatre", idempotency_key="one") == taken
@@ -80,7 +80,7 @@ def test_a_snapshot_is_taken_fetched_and_uploaded(served, tmp_path):
     assert not (tmp_path / "y.ply").exists()
 
 
-def test_a_snapshot_becomes_a_version_that_is_shown_and_exported(served, tmp_path):
+def test_snapshot_as_model_version_is_activated_and_exported(served, tmp_path):
     client, _, _ = served
     taken = client.take_snapshot("theatre", "liver")
     number = taken.version.version
@@ -97,7 +97,7 @@ def test_a_snapshot_becomes_a_version_that_is_shown_and_exported(served, tmp_pat
         client.export_version("liver", number, "ply", tmp_path / "z.ply", time_s=end_s + 100)
 
 
-def test_a_finished_model_has_layers_too(served, walls):
+def test_model_stream_has_layers_but_no_snapshots(served, walls):
     client, _, log = served
     made = client.upload("wall", walls / "red.isplat")
     assert client.checked("wall", made.version).state == "ready"
@@ -115,7 +115,7 @@ def test_a_finished_model_has_layers_too(served, walls):
     client.delete_stream("playback")
 
 
-def test_the_page_shows_layers_and_turns_the_virtual_camera(page):
+def test_console_shows_layers_and_turns_virtual_camera(page):
     for layer in ("depth", "confidence", "orbit"):
         page.click(f"#choose-{layer}")
         page.wait_for_selector(f".layer.{layer} .badge:not([data-state='no picture'])")
@@ -141,7 +141,7 @@ def test_the_page_shows_layers_and_turns_the_virtual_camera(page):
     assert page.locator("#pictures canvas").count() == 2
 
 
-def test_a_snapshot_is_taken_and_saved_from_the_page(page, tmp_path):
+def test_console_takes_and_saves_snapshot(page, tmp_path):
     page.click("#take-snapshot")
     page.locator(".said", has_text="Gaussians").wait_for()
     page.locator(".files select").first.select_option("glb")

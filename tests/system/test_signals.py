@@ -32,7 +32,7 @@ def started(start, *arguments):
 
 
 @pytest.mark.parametrize("number", [signal.SIGHUP])
-def test_a_closed_terminal_saves_all(long, tmp_path, start, number):
+def test_sighup_ends_replay_and_saves_results(long, tmp_path, start, number):
     process = started(start, "replay", long, "--out", tmp_path / "out", "--steps-per-frame", 12)
     process.send_signal(number)
     if number == signal.SIGHUP:
@@ -45,7 +45,7 @@ def test_a_closed_terminal_saves_all(long, tmp_path, start, number):
     assert (tmp_path / "out" / "reconstruction.mp4").stat().st_size > 0
 
 
-def test_the_second_interrupt_ends_at_once_and_leaves_the_earlier_run(long, finished, tmp_path, start, fingerprints):
+def test_second_interrupt_ends_immediately_and_keeps_earlier_run(long, finished, tmp_path, start, fingerprints):
     import shutil
 
     out = shutil.copytree(finished, tmp_path / "out")
@@ -66,7 +66,7 @@ def test_the_second_interrupt_ends_at_once_and_leaves_the_earlier_run(long, fini
 
 
 @pytest.mark.parametrize("after_s", [0.1, 0.6])
-def test_an_interrupt_while_the_program_starts_shows_no_traceback(long, tmp_path, start, after_s):
+def test_interrupt_during_start_exits_130_without_traceback(long, tmp_path, start, after_s):
     process = start("replay", long, "--out", tmp_path / "out", "--steps-per-frame", 100_000)
     # The handler is there as soon as our first module runs.
     deadline_s = time.monotonic() + 300
@@ -93,7 +93,7 @@ def catches_interrupts(pid):
         return False
 
 
-def test_an_interrupted_synthesize_leaves_what_was_there(tmp_path, start, fingerprints):
+def test_interrupted_synthesize_keeps_earlier_recording(tmp_path, start, fingerprints):
     take = synthesize(tmp_path / "take", frames=1, width_px=32, height_px=32, stereo=False)
     before = fingerprints(take)
     process = start("synthesize", "--out", take, "--frames", 5000, "--width", 64, "--height", 48)

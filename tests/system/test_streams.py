@@ -36,7 +36,7 @@ def shell(command: str, folder: Path, **environment: str) -> subprocess.Complete
     ],
 )
 @pytest.mark.slow
-def test_a_run_writes_all_whatever_becomes_of_its_streams(tiny, tmp_path, redirection, code):
+def test_replay_writes_outputs_with_closed_or_broken_standard_streams(tiny, tmp_path, redirection, code):
     done = shell(f"$I replay {tiny} --out out --max-frames 2 --steps-per-frame 1 {redirection}", tmp_path)
     assert done.returncode == code, done.stderr
     assert b"Traceback" not in done.stderr and b"Exception ignored" not in done.stderr
@@ -47,13 +47,13 @@ def test_a_run_writes_all_whatever_becomes_of_its_streams(tiny, tmp_path, redire
 
 
 @pytest.mark.parametrize(("command", "code"), [("--help | true", 141), ("--help >/dev/full", 2)])
-def test_help_too(tmp_path, command, code):
+def test_help_with_broken_stdout_exits_without_traceback(tmp_path, command, code):
     done = shell(f"$I {command}", tmp_path)
     assert done.returncode == code and b"Traceback" not in done.stderr
 
 
 @pytest.mark.slow
-def test_names_that_are_not_ascii_or_not_text(tiny, tmp_path):
+def test_replay_and_render_accept_non_utf8_names(tiny, tmp_path):
     name = b"caf\xe9" + "\u00e9\u2192\n\U0001f600".encode()
     folder = os.fsencode(tmp_path) + b"/" + name
     os.symlink(tiny, folder)
@@ -68,7 +68,7 @@ def test_names_that_are_not_ascii_or_not_text(tiny, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_file_size_limit_is_a_sentence_and_the_earlier_run_stays(finished, tiny, tmp_path, fingerprints):
+def test_replay_over_file_size_limit_prints_error_and_keeps_earlier_run(finished, tiny, tmp_path, fingerprints):
     import shutil
 
     out = shutil.copytree(finished, tmp_path / "out")
