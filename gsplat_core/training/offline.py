@@ -533,9 +533,10 @@ class Trial:
     seconds: float = 0.0
     """Duration of the training and its validation, without the time before the first step."""
 
-    def duration_s(self, steps: int) -> float:
-        """Return the expected duration in seconds of a training with another number of steps."""
-        return self.setup_s + steps * self.seconds / self.steps
+    @property
+    def duration_s(self) -> float:
+        """Duration in seconds of the training and its validation."""
+        return self.setup_s + self.seconds
 
 
 @dataclass(frozen=True)
@@ -608,15 +609,30 @@ def choose_steps(
     while 2 * best.steps <= MOST_STEPS:
         steps = 2 * best.steps
         left_s = limit_s - (clock() - begin)
+        per_step_s = _per_step_s(trials)
+        expected_s = best.duration_s + (steps - best.steps) * per_step_s
         # A trial is followed by a training of the same length on all frames.
-        if 2 * best.duration_s(steps) > left_s:
-            longest = int((left_s - best.setup_s) * best.steps / best.seconds) if best.seconds else 0
-            if longest < best.steps:
+        if 2 * expected_s > left_s:
+            if best.duration_s > left_s:
                 return ChosenSteps(best.steps, tuple(trials), "limit", keeps_trial=True)
-            return ChosenSteps(min(steps, longest), tuple(trials), "limit")
+            if expected_s > left_s:
+                steps = best.steps + math.floor((left_s - best.duration_s) / per_step_s)
+            return ChosenSteps(steps, tuple(trials), "limit")
         trial = trial_of(train, steps, clock)
         trials.append(trial)
         if trial.psnr_db < best.psnr_db + LEAST_GAIN_DB:
             return ChosenSteps(max(trial, best, key=lambda one: one.psnr_db).steps, tuple(trials), "best")
         best = trial
     return ChosenSteps(best.steps, tuple(trials), "most")
+
+
+def _per_step_s(trials: Sequence[Trial]) -> float:
+    """Return the expected time in seconds of further steps, by the last two trials. Trainings also take time that does not grow with
+    the number of steps, as when Gaussians are added."""
+    last = trials[-1]
+    mean_s = last.seconds / last.steps
+    if len(trials) == 1:
+        return mean_s
+    before = trials[-2]
+    grown_s = (last.seconds - before.seconds) / (last.steps - before.steps)
+    return max(0.0, min(grown_s, mean_s))

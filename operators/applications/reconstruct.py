@@ -359,7 +359,7 @@ class _Fitting:
         learned = self._learning
 
         def is_late() -> bool:
-            ends_s = self._clock() - self._begin_s + first.duration_s(first.steps)
+            ends_s = self._clock() - self._begin_s + first.duration_s
             return self._is_stopped or self._stop_requested() or ends_s > until_s
 
         for reason, other_than in (

@@ -8,14 +8,16 @@ from gsplat_core.training.offline import Trained, choose_steps, validating
 
 
 class Training:
-    """Trainings whose scores are given, at a fixed time per step after a fixed time before the first step."""
+    """Trainings whose scores are given, at a fixed time per step after a fixed time before the first step, and a fixed time between steps
+    (`growth_s`)."""
 
-    def __init__(self, scores, step_s=0.0, setup_s=0.0):
-        self.scores, self.step_s, self.setup_s, self.now_s, self.steps = scores, step_s, setup_s, 0.0, []
+    def __init__(self, scores, step_s=0.0, setup_s=0.0, growth_s=0.0):
+        self.scores, self.step_s, self.setup_s, self.growth_s = scores, step_s, setup_s, growth_s
+        self.now_s, self.steps = 0.0, []
 
     def __call__(self, steps):
         self.steps.append(steps)
-        self.now_s += self.setup_s + steps * self.step_s
+        self.now_s += self.setup_s + self.growth_s + steps * self.step_s
         return Trained(self.scores[len(self.steps) - 1], self.setup_s)
 
     def clock(self):
@@ -36,12 +38,13 @@ def test_a_worse_trial_is_not_chosen():
 
 
 @pytest.mark.parametrize("setup_s", [0.0, 3.0])
+@pytest.mark.parametrize("growth_s", [0.0, 2.0])
 @pytest.mark.parametrize("limit_s", [20.0, 60.0, 300.0])
-def test_search_and_training_stay_within_the_time_limit(limit_s, setup_s):
-    training = Training([30.0 + k for k in range(20)], 0.01, setup_s)
+def test_search_and_training_stay_within_the_time_limit(limit_s, setup_s, growth_s):
+    training = Training([30.0 + k for k in range(20)], 0.01, setup_s, growth_s)
     chosen = choose_steps(training, limit_s, training.clock)
     assert chosen.reason == "limit" and "--minutes" in chosen.sentence
-    assert training.now_s + setup_s + chosen.steps * training.step_s <= limit_s
+    assert training.now_s + setup_s + growth_s + chosen.steps * training.step_s <= limit_s
     assert chosen.steps >= training.steps[-1]
 
 
@@ -55,6 +58,26 @@ def test_without_time_for_a_second_training_the_trial_is_the_result():
 def test_time_before_the_first_step_does_not_count_as_steps():
     training = Training([30.0 + k for k in range(20)], step_s=0.002, setup_s=6.0)
     assert choose_steps(training, 60, training.clock).steps >= 4000
+
+
+def test_time_of_growth_does_not_count_as_steps():
+    training = Training([30.0 + k for k in range(20)], step_s=0.0005, growth_s=6.0)
+    chosen = choose_steps(training, 45, training.clock)
+    assert training.steps == [500, 1000, 2000, 4000] and chosen.steps == 8000
+
+
+def test_first_trial_slower_than_the_second_does_not_make_steps_free():
+    """As on a GPU, on which the first trial loads the kernels: the time of more steps is unknown, and the search stays within the limit."""
+    training = Training([30.0 + k for k in range(20)], step_s=0.002, growth_s=10.0)
+
+    def train(steps):
+        trained = training(steps)
+        training.growth_s = 0.0
+        return trained
+
+    chosen = choose_steps(train, 60, training.clock)
+    assert training.steps == [500, 1000, 2000, 4000, 8000]
+    assert training.now_s + chosen.steps * training.step_s <= 60
 
 
 def test_time_that_was_spent_before_counts():
