@@ -17,7 +17,7 @@ def values(rng):
 
 
 @pytest.mark.parametrize("factor", [3.0, -0.2])
-def test_what_was_done_is_found(values, factor):
+def test_fitted_recovers_factor_and_summand(values, factor):
     found = fitted(values, factor * values + 5)
     assert found is not None
     assert found[:2] == pytest.approx((factor, 5)) and found.alike == pytest.approx(np.sign(factor))
@@ -25,7 +25,7 @@ def test_what_was_done_is_found(values, factor):
 
 
 @pytest.mark.parametrize("wrong", ["another place", "anything"])
-def test_a_fifth_of_it_may_be_wrong(values, rng, wrong):
+def test_fitted_tolerates_a_fifth_of_outliers(values, rng, wrong):
     known = 3 * values + 5
     part = slice(0, COUNT // 5)
     known[part] = known[part] + 30 if wrong == "another place" else 20 * rng.normal(size=COUNT // 5)
@@ -33,7 +33,7 @@ def test_a_fifth_of_it_may_be_wrong(values, rng, wrong):
     assert found is not None and found[:2] == pytest.approx((3, 5), rel=1e-6)
 
 
-def test_relief_stays_however_often_noisy_values_are_fitted_to_those_before(values, rng):
+def test_fitted_repeatedly_on_noise_keeps_relief(values, rng):
     last = values.copy()
     for _ in range(200):
         seen = (values + 0.1 * rng.normal(size=COUNT)) * rng.uniform(0.5, 2) + rng.normal()
@@ -43,18 +43,18 @@ def test_relief_stays_however_often_noisy_values_are_fitted_to_those_before(valu
     assert last.std() == pytest.approx(values.std(), rel=0.05) and last.mean() == pytest.approx(3.0, abs=0.1)
 
 
-def test_what_has_nothing_to_do_with_each_other_is_not_alike(values, rng):
+def test_fitted_alike_is_small_for_unrelated_values(values, rng):
     found = fitted(values, rng.normal(size=COUNT))
     assert found is not None and abs(found.alike) < 0.4
 
 
-def test_too_few_values_or_one_distance_give_nothing(values):
+def test_fitted_is_none_for_few_or_constant_values(values):
     few = values[: LEAST_VALUES - 1]
     assert fitted(few, few) is None
     assert fitted(values, np.full(COUNT, 7.0)) is None and fitted(np.full(COUNT, 7.0), values) is None
 
 
-def test_half_of_the_values_may_be_one_and_the_same(values):
+def test_fitted_tolerates_majority_of_equal_values(values):
     values[: COUNT * 2 // 3] = 2.0
     found = fitted(values, 2 * values)
     assert found is not None and found[:2] == pytest.approx((2, 0), abs=1e-6)
@@ -69,11 +69,11 @@ def test_half_of_the_values_may_be_one_and_the_same(values):
         (np.linspace(4, 4.1, 99), False),
     ],
 )
-def test_one_distance_is_recognised_at_any_size(values, constant):
+def test_is_constant_is_independent_of_scale(values, constant):
     assert is_constant(values) == is_constant(1e6 * values) == constant
 
 
-def test_an_assumed_zero_bounds_how_deep_a_picture_is():
+def test_with_assumed_zero_limits_depth_span():
     assert with_assumed_zero(np.linspace(2, 4, 99)).summand == 0
     for low, high in ((0, 1), (-5, -1), (-3, 8), (0.1, 3)):
         moved = with_assumed_zero(np.linspace(low, high, 1001)).of(np.linspace(low, high, 1001))
@@ -85,19 +85,19 @@ def test_an_assumed_zero_bounds_how_deep_a_picture_is():
     ("given", "middle", "spread"),
     [([1.0, 2, 3, 4, 100], 3, 1), ([-5.0, -5, -1, 3, 3], -1, 4), ([2.0, 2, 2, 2, 12], 2, 4.0), ([7.0] * 5, 7, 0)],
 )
-def test_the_middle_of_values_is_their_median_with_its_deviation(given, middle, spread):
+def test_middle_returns_median_and_deviation(given, middle, spread):
     """The standard deviation stands in where more than half of the values are the median itself."""
     assert learned._middle(np.array(given)) == pytest.approx((middle, spread))
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_a_start_value_maps_one_median_and_deviation_to_the_other(sign):
+def test_by_medians_maps_median_and_deviation(sign):
     values, known = np.array([1.0, 2, 3, 4, 100]), np.array([10.0, 16, 20, 24, -900])
     found = learned._by_medians(values, known, sign)
     assert found.factor == pytest.approx(sign * 6) and found.of(np.array([3.0]))[0] == pytest.approx(16)
 
 
-def test_weighted_spread_and_correlation_are_those_of_repeated_values(rng):
+def test_weighted_spread_and_correlation_equal_repeated_values(rng):
     x, y, counts = rng.normal(2, 3, 30), rng.normal(-1, 2, 30), rng.integers(1, 5, 30)
     y += 0.5 * x
     many_x, many_y = np.repeat(x, counts), np.repeat(y, counts)
@@ -107,12 +107,12 @@ def test_weighted_spread_and_correlation_are_those_of_repeated_values(rng):
 
 
 @pytest.mark.parametrize(("count", "is_fitted"), [(LEAST_VALUES - 1, False), (LEAST_VALUES, True)])
-def test_so_many_values_are_enough(count, is_fitted):
+def test_fitted_requires_minimum_number_of_values(count, is_fitted):
     values = np.linspace(1, 2, count)
     assert (fitted(values, 2 * values) is not None) == is_fitted
 
 
-def test_exact_values_have_an_exact_map_at_any_size(rng):
+def test_fitted_is_exact_for_exact_values_of_any_scale(rng):
     """Differences of 0 give all values the same weight."""
     values = rng.normal(size=200)
     for size in (1e-6, 1.0, 1e6):
@@ -123,7 +123,7 @@ def test_exact_values_have_an_exact_map_at_any_size(rng):
 
 
 @pytest.mark.parametrize(("low", "high", "summand"), [(1.0, 5.0, 0.0), (1.0, 9.0, 1.0), (0.0, 4.0, 1.0), (-1.0, 3.0, 2.0), (2.0, 3.0, 0.0)])  # fmt: skip
-def test_an_assumed_zero_makes_the_far_end_five_times_the_near_one(low, high, summand):
+def test_with_assumed_zero_summand_for_given_range(low, high, summand):
     values = np.concatenate([np.full(100, low), np.full(100, high)])
     found = with_assumed_zero(values)
     assert found == (1.0, pytest.approx(summand), 1.0)

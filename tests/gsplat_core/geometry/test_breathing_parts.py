@@ -44,13 +44,13 @@ def search(monkeypatch):
 
 
 @pytest.mark.parametrize(("deep", "expected"), [(24.0, ()), (26.0, (0.3,))])
-def test_breathing_is_accepted_if_it_lowers_the_cost_by_a_quarter(search, deep, expected):
+def test_breathing_frequency_requires_a_quarter_lower_cost(search, deep, expected):
     hz, _ = search(lambda hz: 100 - valley(hz[0], 0.3, deep))
     assert hz == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(("share", "expected"), [(0.05, (0.3,)), (0.07, (0.3, 1.2))])
-def test_a_heart_is_accepted_if_it_costs_less_than_94_per_cent_of_the_usual(search, share, expected):
+def test_heart_frequency_requires_cost_below_94_percent(search, share, expected):
     hz, _ = search(
         lambda hz: (100 - valley(hz[0], 0.3, 50)) * (1 - (valley(hz[1], 1.2, share) if len(hz) > 1 else 0.0))
     )
@@ -61,9 +61,7 @@ def test_a_heart_is_accepted_if_it_costs_less_than_94_per_cent_of_the_usual(sear
     ("length_s", "fastest_hz", "slowest", "last", "heart"),
     [(20.0, 3.0, 0.1, 0.8, 3.0), (4.0, 3.0, 0.125, 0.8, 3.0), (20.0, 1.5, 0.1, 0.8, 1.5), (20.0, 0.5, 0.1, 0.5, None)],
 )
-def test_breathing_is_tried_every_quarter_of_a_cycle_and_the_heart_every_half(
-    search, length_s, fastest_hz, slowest, last, heart
-):
+def test_frequency_search_steps_and_bounds(search, length_s, fastest_hz, slowest, last, heart):
     """From a tenth of a Hertz, or half a cycle in the recording, to 0.8 Hz, and from there to three."""
     _, tried = search(lambda hz: 100 - valley(hz[0], 0.45, 50, 0.4), length_s, fastest_hz)
     breaths = [hz[0] for hz in tried if len(hz) == 1]
@@ -79,7 +77,7 @@ def test_breathing_is_tried_every_quarter_of_a_cycle_and_the_heart_every_half(
         assert heart - 0.5 / length_s - 1e-9 <= beats[-1] < heart
 
 
-def test_less_than_one_and_a_half_breaths_are_not_breathing(search):
+def test_frequency_below_one_and_a_half_cycles_is_not_breathing(search):
     """A slower frequency that explains more is motion of the scope, and twice its value is not breathing."""
     cost = lambda slow: lambda hz: 100 - valley(hz[0], 0.125, slow, 0.03) - valley(hz[0], 0.275, 40, 0.03)
     assert search(cost(60.0), 10.0)[0] == ()
@@ -89,11 +87,11 @@ def test_less_than_one_and_a_half_breaths_are_not_breathing(search):
 
 
 @pytest.mark.parametrize("at", [0.05, 0.85])
-def test_a_frequency_at_the_end_of_the_band_belongs_to_one_outside(search, at):
+def test_frequency_at_band_end_is_rejected(search, at):
     assert search(lambda hz: 100 - valley(hz[0], at, 90, 0.3))[0] == ()
 
 
-def test_breathing_is_searched_again_with_a_strong_heart(search):
+def test_breathing_frequency_is_refined_after_heart_is_found(search):
     """Without the heart, weak breathing at 0.3 Hz is hidden and another frequency looks a little better."""
 
     def cost(hz: tuple[float, ...]) -> float:
@@ -117,7 +115,7 @@ def way(breath: float, sway_hz: float) -> torch.Tensor:
     return poses
 
 
-def test_breathing_is_separated_from_a_slow_scope_and_its_size_is_the_motion_taken_away():
+def test_separability_of_breathing_from_slow_scope():
     phases = 2 * torch.pi * 0.4 * TIMES_S[:, None]
     reliable, mistaken = separability(way(0.03, 0.08), way(0.0, 0.08), TIMES_S, phases)
     assert reliable and mistaken < 0.001
@@ -126,7 +124,7 @@ def test_breathing_is_separated_from_a_slow_scope_and_its_size_is_the_motion_tak
 
 
 @pytest.mark.parametrize("sway_hz", [0.375, 0.425])
-def test_breathing_is_not_separated_from_a_scope_that_sways_at_both_neighbours(sway_hz):
+def test_separability_fails_if_scope_sways_at_both_neighbour_frequencies(sway_hz):
     both = way(0.0, 0.375)
     both[:, :3, 3] += way(0.0, 0.425)[:, :3, 3]
     phases = 2 * torch.pi * 0.4 * TIMES_S[:, None]
@@ -137,7 +135,7 @@ def test_breathing_is_not_separated_from_a_scope_that_sways_at_both_neighbours(s
 
 
 @pytest.mark.parametrize(("ratio", "reliable"), [(1.9, False), (2.1, True)])
-def test_breathing_must_be_twice_what_its_neighbours_take(monkeypatch, ratio, reliable):
+def test_separability_requires_twice_the_neighbour_amplitude(monkeypatch, ratio, reliable):
     phases = 2 * torch.pi * 0.4 * TIMES_S[:, None]
     before, poses = way(0.03, 0.08), way(0.0, 0.08)
     monkeypatch.setattr(breathing, "_given_to_tissue", lambda poses, *_: ratio if poses is before else 1.0)
@@ -145,7 +143,7 @@ def test_breathing_must_be_twice_what_its_neighbours_take(monkeypatch, ratio, re
 
 
 @pytest.mark.parametrize(("count", "most"), [(500, 100), (500, 150), (120, 100), (3000, 40)])
-def test_some_frames_are_spread_irregularly_over_all(count, most):
+def test_some_frames_are_irregularly_spread_over_recording(count, most):
     frames = torch.arange(count) * 3 + 7
     some = breathing._some(frames, most)
     assert some[0] == frames[0] and some[-1] == frames[-1] and bool(torch.isin(some, frames).all())
@@ -170,7 +168,7 @@ def sightings(frames: int = 12, points: int = 80, seed: int = 0) -> tuple[Sighti
     return Sightings(frame, point, local[:, :2] / local[:, 2:], times_s, poses, at), twist
 
 
-def test_a_bundle_has_the_points_seen_most_often_in_its_frames_and_the_depth_as_its_unit():
+def test_breathing_bundle_keeps_most_seen_points_and_unit_depth():
     seen, _ = sightings()
     frames = torch.arange(2, 11)
     # 0 to 9 are seen in four frames, 10 to 19 in five and 20 to 29 in eight of the nine.
@@ -191,12 +189,12 @@ def test_a_bundle_has_the_points_seen_most_often_in_its_frames_and_the_depth_as_
 
 
 @pytest.mark.parametrize(("points", "enough"), [(59, False), (60, True)])
-def test_sixty_points_are_enough_for_a_bundle(points, enough):
+def test_breathing_bundle_requires_sixty_points(points, enough):
     seen, _ = sightings(points=points)
     assert (breathing._bundle(seen, torch.arange(12), 400, 16) is not None) == enough
 
 
-def test_points_at_implausible_depths_start_at_the_median_on_their_first_ray():
+def test_limited_moves_implausible_points_to_median_depth():
     seen, _ = sightings(points=9)
     local = torch.tensor([2.0] * 5 + [0.98, 1.02, 3.96, 4.04], dtype=torch.float64)
     rest = torch.cat([seen.rays[:9], torch.ones(9, 1)], 1) * local[:, None]
@@ -205,7 +203,7 @@ def test_points_at_implausible_depths_start_at_the_median_on_their_first_ray():
     torch.testing.assert_close(found[:, :2] / found[:, 2:], seen.rays[:9])
 
 
-def test_poses_between_frames_follow_the_screw_and_stay_beyond_the_ends():
+def test_between_interpolates_screw_motion_and_holds_ends():
     frames = torch.tensor([2, 5, 9])
     seen, twist = sightings()
     found = breathing._between(frames, seen.poses[frames], 12)
@@ -213,7 +211,7 @@ def test_poses_between_frames_follow_the_screw_and_stay_beyond_the_ends():
         torch.testing.assert_close(found[number], exp(min(max(number, 2), 9) * twist[None])[0])
 
 
-def test_frames_between_are_placed_before_the_moving_points_if_they_see_24_of_them():
+def test_all_placed_uses_frames_with_24_or_more_points():
     """Their true poses are not between those of their neighbours. Frame 5 sees 23 of the points and frame 7 sees 24."""
     seen, _ = sightings()
     frames = torch.tensor([0, 2, 4, 6, 8, 11])
@@ -240,14 +238,14 @@ def test_frames_between_are_placed_before_the_moving_points_if_they_see_24_of_th
         torch.testing.assert_close(placed[number], expected, atol=1e-6, rtol=0)
 
 
-def test_phases_between_frames_are_interpolated():
+def test_interpolated_phases_are_linear_in_time():
     known_s, times_s = torch.tensor([0.0, 1.0, 3.0]).double(), torch.tensor([0.0, 0.5, 2.0, 3.0]).double()
     phases = torch.tensor([[0.0, 1.0], [2.0, 5.0], [4.0, 6.0]]).double()
     expected = [[0.0, 1.0], [1.0, 3.0], [3.0, 5.5], [4.0, 6.0]]
     assert breathing._interpolated(times_s, known_s, phases).tolist() == expected
 
 
-def test_new_nodes_carry_the_motion_that_was_there():
+def test_with_new_nodes_keeps_motion():
     seen, _ = sightings()
     bundle = bundle_of(seen, waves(seen.times_s, (0.4,)), 30)
     linear = torch.tensor([[0.1, 0.0, 0.02], [0.0, -0.05, 0.0], [0.03, 0.0, 0.0]], dtype=torch.float64)
@@ -277,7 +275,7 @@ class Reached(Exception):
         (40, 20.0, (40, 101)),
     ],
 )
-def test_frames_are_chosen_by_the_length_of_the_recording(monkeypatch, count, length_s, chosen):
+def test_breathing_trajectory_frame_count_by_recording_length(monkeypatch, count, length_s, chosen):
     """About 100 for the frequencies, and then five per second, from 40 to 150, in recordings of 1.875 to 60 seconds."""
     times_s = torch.linspace(0, length_s, count, dtype=torch.float64)
     seen = Sightings(*(torch.zeros(0),) * 3, times_s, torch.zeros(count, 4, 4), torch.zeros(0, 3))

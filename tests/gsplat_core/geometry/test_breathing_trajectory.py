@@ -31,7 +31,7 @@ def breathing():
 
 
 @pytest.mark.slow
-def test_breathing_and_heart_are_told_from_the_way(breathing):
+def test_breathing_trajectory_separates_breathing_and_heart(breathing):
     sightings, true, found = breathing
     assert found is not None
     assert off_share(sightings.poses, true) > 0.02
@@ -41,7 +41,7 @@ def test_breathing_and_heart_are_told_from_the_way(breathing):
 
 
 @pytest.mark.slow
-def test_how_uncertain_the_way_is_is_about_how_far_it_is_off(breathing):
+def test_breathing_trajectory_uncertainty_matches_error(breathing):
     _, true, found = breathing
     assert found is not None
     way = np.linalg.norm(np.diff(np.linalg.inv(found.poses.numpy())[:, :3, 3], axis=0), axis=1).sum()
@@ -49,7 +49,7 @@ def test_how_uncertain_the_way_is_is_about_how_far_it_is_off(breathing):
 
 
 @pytest.mark.slow
-def test_poses_start_at_the_identity_and_the_unit_is_the_distance(breathing):
+def test_breathing_trajectory_starts_at_identity_with_unit_distance(breathing):
     *_, found = breathing
     assert found is not None
     torch.testing.assert_close(found.poses[0], torch.eye(4, dtype=torch.float64))
@@ -57,7 +57,7 @@ def test_poses_start_at_the_identity_and_the_unit_is_the_distance(breathing):
 
 
 @pytest.mark.slow
-def test_what_is_pulled_about_does_not_take_the_way_with_it():
+def test_breathing_trajectory_is_robust_to_pulled_tissue():
     sightings, true = seen_for(12.0, rate_hz=4.0, pulled=30, points=150)
     found = found_in(sightings)
     assert found is not None
@@ -65,7 +65,7 @@ def test_what_is_pulled_about_does_not_take_the_way_with_it():
 
 
 @pytest.mark.slow
-def test_smaller_and_faster_breaths_are_told_too():
+def test_breathing_trajectory_finds_smaller_and_faster_breaths():
     sightings, true = seen_for(14.0, breathes=0.5, rate_hz=5.0, points=150)
     faster = replace(sightings, times_s=sightings.times_s / 1.5)
     found = found_in(faster)
@@ -75,21 +75,21 @@ def test_smaller_and_faster_breaths_are_told_too():
 
 
 @pytest.mark.slow
-def test_tissue_at_rest_is_said_to_be_at_rest():
+def test_breathing_trajectory_is_none_for_tissue_at_rest():
     assert found_in(seen_for(20.0, breathes=0.0, rate_hz=5.0, points=150)[0]) is None
 
 
 @pytest.mark.parametrize("length_s", [1.0, 2.5, 4.5])
-def test_less_than_one_and_a_half_breaths_tell_nothing(length_s):
+def test_breathing_trajectory_is_none_below_one_and_a_half_breaths(length_s):
     assert found_in(seen_for(length_s, rate_hz=30.0, points=100)[0]) is None
 
 
-def test_a_recording_that_is_too_long_is_left_as_it_is():
+def test_breathing_trajectory_is_none_for_too_long_recording():
     sightings, _ = seen_for(8.0)
     assert found_in(replace(sightings, times_s=sightings.times_s * (LONGEST_S + 1) / 7.9)) is None
 
 
-def test_few_points_or_few_placed_frames_tell_nothing():
+def test_breathing_trajectory_is_none_for_few_points_or_frames():
     sightings, _ = seen_for(12.0)
     some = sightings.point < 50
     few = replace(sightings, frame=sightings.frame[some], point=sightings.point[some], rays=sightings.rays[some])
@@ -98,7 +98,7 @@ def test_few_points_or_few_placed_frames_tell_nothing():
 
 
 @pytest.mark.slow
-def test_bad_starts_and_frames_that_are_not_placed_do_no_harm():
+def test_breathing_trajectory_tolerates_bad_points_and_unplaced_frames():
     """Some points start behind the scope or far away, and four frames have neither a pose nor observations."""
     sightings, true = seen_for(12.0, rate_hz=4.0, points=150)
     points = sightings.points.clone()
@@ -115,7 +115,7 @@ def test_bad_starts_and_frames_that_are_not_placed_do_no_harm():
 
 
 @pytest.mark.slow
-def test_frequencies_are_found_without_knowing_the_way_and_none_at_rest():
+def test_frequencies_of_finds_breathing_and_heart_and_none_at_rest():
     """To half a step of the search, 0.25 cycles for breathing and 0.5 for the heart; `refined` estimates them further."""
     for breathes, expected in ((1.0, (BREATHING_HZ, HEART_HZ)), (0.0, ())):
         sightings, _ = seen_for(12.0, breathes, rate_hz=4.0, points=100)

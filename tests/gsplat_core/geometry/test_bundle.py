@@ -49,7 +49,7 @@ def way_off(found: Bundle, true: Bundle) -> float:
     return float((scale * ours - theirs).norm(dim=1).max())
 
 
-def test_a_scene_without_noise_is_found_again():
+def test_adjust_recovers_noise_free_scene():
     true = known_scene()
     start = disturbed(true)
     assert float(errors_px(start).median()) > 2
@@ -59,7 +59,7 @@ def test_a_scene_without_noise_is_found_again():
     assert torch.equal(found.poses[0], true.poses[0])
 
 
-def test_points_that_move_by_themselves_decide_little():
+def test_adjust_is_robust_to_moving_points():
     true = known_scene()
     random = torch.Generator().manual_seed(3)
     rays = true.rays.clone()
@@ -72,7 +72,7 @@ def test_points_that_move_by_themselves_decide_little():
     assert float(errors_px(found)[~astray].median()) < 0.3
 
 
-def test_cameras_alone_are_placed_before_known_points():
+def test_place_cameras_recovers_poses_for_known_points():
     true = known_scene()
     start = replace(disturbed(true), points=true.points)
     found = place_cameras(start, fixed=first_only(true), rounds=20)
@@ -87,7 +87,7 @@ def stepped(start: Bundle, rounds: int, points_move: bool) -> Bundle:
 
 
 @pytest.mark.parametrize("points_move", [True, False])
-def test_a_step_never_makes_it_worse(points_move):
+def test_bundle_step_never_increases_cost(points_move):
     true = known_scene(cameras=4, points=12)
     bundle = disturbed(true, 0.1)
     before = float(torch.log1p(errors_px(bundle).square()).sum())
@@ -98,7 +98,7 @@ def test_a_step_never_makes_it_worse(points_move):
         before = cost
 
 
-def test_a_point_behind_a_camera_is_finite():
+def test_adjust_tolerates_point_behind_camera():
     true = known_scene(cameras=3, points=30)
     points = true.points.clone()
     points[0, 2] = -5
@@ -107,7 +107,7 @@ def test_a_point_behind_a_camera_is_finite():
     assert float(errors_px(found)[true.point != 0].max()) < 1
 
 
-def test_a_point_that_is_not_finite_changes_nothing():
+def test_adjust_with_non_finite_point_changes_nothing():
     true = known_scene(cameras=3, points=30)
     start = disturbed(true)
     start.points[4, 0] = float("nan")
@@ -116,7 +116,7 @@ def test_a_point_that_is_not_finite_changes_nothing():
 
 
 @pytest.mark.parametrize("points_move", [True, False])
-def test_exact_derivatives_converge_quadratically(points_move):
+def test_bundle_steps_converge_quadratically(points_move):
     """With an error in a derivative, steps still improve, but five of them do not reach 1e-7 px from 20 px."""
     true = known_scene()
     start = disturbed(true)
@@ -159,7 +159,7 @@ def turned_deg(bundle: Bundle) -> float:
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_sliding_before_moderate_relief_is_not_explained_by_rotation(seed):
+def test_flat_px_prevents_explaining_sliding_by_rotation(seed):
     true = sliding_scope(seed)
     start, fixed = with_rotation(true), first_only(true)
     without = adjust(start, fixed=fixed, rounds=50)
@@ -170,7 +170,7 @@ def test_sliding_before_moderate_relief_is_not_explained_by_rotation(seed):
     assert turned_deg(released) < 0.3 and way_off(released, true) < 0.005
 
 
-def test_little_relief_is_a_squared_error_in_pixels():
+def test_flat_px_adds_squared_relief_to_cost():
     """The minimum of a cost that is written out in numpy, by its differences in all directions of the points."""
     true = sliding_scope(0)
     true = replace(true, poses=true.poses[::6], camera=true.camera // 6)
@@ -197,7 +197,7 @@ def test_little_relief_is_a_squared_error_in_pixels():
         assert abs(ahead - behind) < 0.02 * (ahead + behind - 2 * here)
 
 
-def test_errors_are_distances_in_pixels():
+def test_errors_px_are_distances_in_pixels():
     true = known_scene(cameras=2, points=5)
     rays = true.rays.clone()
     rays[3] += torch.tensor([3.0, -4.0], dtype=torch.float64) / FOCAL
@@ -206,7 +206,7 @@ def test_errors_are_distances_in_pixels():
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-13, 1e-6, 9e-5, 1.1e-4, 0.01, 0.7, 2.5])
-def test_a_small_motion_is_the_exponential_of_its_twist(size):
+def test_moved_pose_equals_matrix_exponential_of_twist(size):
     twist = np.array([0.3, -0.2, 0.5, *(size * np.array([0.6, -0.64, 0.48]))])
     pose = exp(torch.tensor([1.0, 2.0, -3.0, 0.4, 0.5, -0.6], dtype=torch.float64))
     generator = torch.zeros(4, 4, dtype=torch.float64)
@@ -223,7 +223,7 @@ def one_camera(index: int = 3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("size", [0.01, 0.05])
-def test_a_camera_before_known_points_is_placed_exactly_in_eight_rounds(size):
+def test_placed_camera_is_exact_for_exact_rays(size):
     pose, points, rays = one_camera()
     start = moved(pose, size * np.array([1.0, -2.0, 3.0, 1.0, -1.0, 0.5]))
     start[:3, :3] *= 1.001  # a rotation that has accumulated rounding errors
@@ -232,7 +232,7 @@ def test_a_camera_before_known_points_is_placed_exactly_in_eight_rounds(size):
     assert errors.max() < 1e-8
 
 
-def test_points_astray_hardly_move_a_placed_camera_and_keep_their_errors():
+def test_placed_camera_is_robust_to_outliers():
     pose, points, rays = one_camera()
     rays[:15] += np.array([30.0, -40.0]) / FOCAL
     found, errors = placed(moved(pose, np.full(6, 0.01)), points, rays, FOCAL)
@@ -240,7 +240,7 @@ def test_points_astray_hardly_move_a_placed_camera_and_keep_their_errors():
     assert np.abs(found[:3, 3] - pose[:3, 3]).max() < 0.05
 
 
-def test_points_behind_a_placed_camera_do_not_hinder_it():
+def test_placed_camera_tolerates_points_behind_camera():
     pose, points, rays = one_camera()
     points = points.copy()
     points[:4, 2] -= 200
@@ -248,7 +248,7 @@ def test_points_behind_a_placed_camera_do_not_hinder_it():
     assert np.isfinite(errors).all() and errors[4:].max() < 1.5 and np.isfinite(found).all()
 
 
-def test_damping_falls_after_a_success_and_grows_after_a_failure():
+def test_descend_adapts_damping_to_success_and_failure():
     """Steps succeed while the state is above 3, as the cost then falls."""
     dampings = []
 
@@ -265,7 +265,7 @@ def test_damping_falls_after_a_success_and_grows_after_a_failure():
     assert dampings[-1] * 8 > 1e4 >= dampings[-1]
 
 
-def test_a_descent_ends_when_the_cost_hardly_falls_or_after_its_rounds():
+def test_descend_ends_at_convergence_or_after_rounds():
     calls = []
 
     def step(state, damping):

@@ -41,7 +41,7 @@ def test_perturbed_poses_are_recovered_from_pictures():
     assert error(found) < 0.05 * error(wrong)
 
 
-def test_chosen_cameras_and_batches():
+def test_camera_corrections_by_ids_and_batches():
     corrections = CameraCorrections(4, **SIGMAS, fixed=(2,))
     corrections.normalised.data.normal_(generator=torch.Generator().manual_seed(0))
     poses = torch.eye(4).expand(2, 3, 4, 4)
@@ -51,7 +51,7 @@ def test_chosen_cameras_and_batches():
     torch.testing.assert_close(log(corrected[1, 0]), corrections.normalised[3] * corrections.sigmas)
 
 
-def test_priors_are_those_of_normal_distributions():
+def test_camera_corrections_priors_equal_normal_distributions():
     corrections = CameraCorrections(3, **SIGMAS, fixed=())
     corrections.normalised.data[1, 4] = 2.0
     corrections.requires_grad_(False)
@@ -62,7 +62,7 @@ def test_priors_are_those_of_normal_distributions():
     assert float(CameraCorrections(1, **SIGMAS).smoothness().detach()) == 0
 
 
-def test_wrong_arguments_are_refused():
+def test_camera_corrections_refuse_invalid_arguments():
     with pytest.raises(InvalidInput, match="must be positive"):
         CameraCorrections(2, translation_sigma=0, rotation_sigma=1)
     with pytest.raises(InvalidInput, match="no camera 2"):
@@ -71,7 +71,7 @@ def test_wrong_arguments_are_refused():
         CameraCorrections(2, **SIGMAS)(torch.eye(4)[None])
 
 
-def test_fixed_cameras_count_as_not_corrected_in_priors():
+def test_camera_corrections_priors_treat_fixed_cameras_as_zero():
     corrections = CameraCorrections(4, **SIGMAS, fixed=(2,))
     corrections.normalised.data.normal_(generator=torch.Generator().manual_seed(0))
     free = corrections.normalised.detach().clone()

@@ -22,7 +22,7 @@ def frames():
     return [frame.with_fields(seq=n, pts_ns=n * 100_000_000) for n, frame in enumerate(video(12, SIDEWAYS)[0])]
 
 
-def test_only_a_moving_scope_moves_the_picture_rigidly(frames):
+def test_rigid_share_is_high_only_for_moving_scope(frames):
     assert rigid_share(frames) > MOVING_SHARE
     still = [frames[0].with_fields(seq=frame.seq, pts_ns=frame.pts_ns) for frame in frames]
     assert rigid_share(still) == 0.0
@@ -35,7 +35,7 @@ def test_only_a_moving_scope_moves_the_picture_rigidly(frames):
     assert rigid_share(pulled) < MOVING_SHARE
 
 
-def test_frames_that_were_not_read_get_poses_between_their_neighbours():
+def test_camera_path_interpolates_poses_between_frames():
     twists = torch.tensor([[0.0] * 6, [0.2, 0.0, 0.1, 0.0, 0.1, 0.0]], dtype=torch.float64)
     ends = exp(twists).numpy()
     path = CameraPath(np.array([1.0, 2.0, 3.0]), np.stack([ends[0], np.eye(4) * 7, ends[1]]), None)
@@ -44,7 +44,7 @@ def test_frames_that_were_not_read_get_poses_between_their_neighbours():
     np.testing.assert_allclose(path.interpolated(2.0), exp(0.5 * twists[1]).numpy(), atol=1e-12)
 
 
-def test_the_path_has_the_unit_of_the_depth(frames):
+def test_camera_path_of_has_unit_of_depth(frames):
     trained = [frame for frame in frames if frame.seq != 5]
     trained[0] = trained[0].with_fields(depth=depth_of_surface())
     path = camera_path_of(trained, FIRST)
@@ -52,7 +52,7 @@ def test_the_path_has_the_unit_of_the_depth(frames):
     np.testing.assert_allclose(centre, 5 * np.array(SIDEWAYS), atol=0.02)
 
 
-def test_a_path_of_many_frames_is_left_to_the_command(frames):
+def test_camera_path_of_refuses_more_than_600_frames(frames):
     with pytest.raises(InvalidInput, match="at most 600 frames, not for 601"):
         camera_path_of([frames[0]] * 601, FIRST)
 
@@ -78,7 +78,7 @@ def compared(monkeypatch):
 
 
 @pytest.mark.parametrize(("rate_hz", "count", "gap"), [(10, 100, 3), (30, 100, 9), (2, 100, 1), (10, 3, 2), (10, 2, 1)])
-def test_twelve_pairs_of_frames_three_tenths_of_a_second_apart_are_compared(compared, rate_hz, count, gap):
+def test_rigid_share_compares_twelve_pairs_0_3_s_apart(compared, rate_hz, count, gap):
     times_s = [number / rate_hz for number in range(count)]
     assert rigid_share(at_times(times_s)) == pytest.approx(0.99)
     first, second = np.array(compared[0]).T
@@ -87,13 +87,13 @@ def test_twelve_pairs_of_frames_three_tenths_of_a_second_apart_are_compared(comp
     assert len(first) == min(12, count - gap) and (len(first) < 12 or np.ptp(np.diff(first)) <= 1)
 
 
-def test_frames_at_one_time_and_one_frame_have_no_motion(compared):
+def test_rigid_share_is_zero_for_one_frame_or_one_time(compared):
     assert rigid_share(at_times([2.0] * 9)) == rigid_share(at_times([2.0])) == 0.0 and compared[0] == []
     assert rigid_share(at_times([0, 0, 0.3, 0.3, 0.6, 0.6])) > 0 and compared[0][0] == (0, 1)
 
 
 @pytest.mark.parametrize(("motion_px", "share"), [(1.55, 0.0), (1.65, 0.75)])
-def test_half_a_per_cent_of_the_longer_side_counts_as_motion(compared, motion_px, share):
+def test_rigid_share_requires_motion_of_half_a_percent_of_side(compared, motion_px, share):
     compared[1].update({number: (motion_px, motion_px / 2) for number in range(12)})
     compared[1][0], compared[1][1] = (99.0, 0.0), (0.1, 0.1)
     assert rigid_share(at_times([0.3 * number for number in range(9)])) == pytest.approx(share)
@@ -101,7 +101,7 @@ def test_half_a_per_cent_of_the_longer_side_counts_as_motion(compared, motion_px
     assert rigid_share(at_times([0.3 * number for number in range(9)])) == 0.0, "no point was found again"
 
 
-def test_a_stream_is_tested_by_its_five_newest_pairs(compared):
+def test_motion_test_uses_five_newest_pairs(compared):
     pairs, answers = compared
     answers.update({0: (10.0, 10.0), 3: (10.0, 10.0), 6: (10.0, 5.0), 9: (10.0, 0.0), 12: (10.0, 0.0), 15: (10.0, 1.0)})
     answers[18] = None
@@ -113,7 +113,7 @@ def test_a_stream_is_tested_by_its_five_newest_pairs(compared):
 
 
 @pytest.mark.parametrize(("gap_s", "begun"), [(0.95, False), (1.05, True)])
-def test_a_stream_begins_anew_after_a_gap_of_a_second(compared, gap_s, begun):
+def test_motion_test_resets_after_gap_of_one_second(compared, gap_s, begun):
     times_s = [0.31 * number for number in range(4)]
     test = MotionTest()
     shares = [test.share(each) for each in at_times([*times_s, *(times_s[-1] + gap_s + each for each in times_s)])]
@@ -121,7 +121,7 @@ def test_a_stream_begins_anew_after_a_gap_of_a_second(compared, gap_s, begun):
     assert known == ([3, 7] if begun else [3, 4, 5, 6, 7])
 
 
-def test_a_stream_begins_anew_with_another_size(compared):
+def test_motion_test_resets_at_other_picture_size(compared):
     test = MotionTest()
     first, later = (at_times([start + 0.31 * number for number in range(5)]) for start in (0.0, 1.55))
     shares = [test.share(each) for each in [*first, *(each.with_fields(image=BLANK[:6].copy()) for each in later)]]
@@ -135,14 +135,14 @@ def moved(by_px: int, side_px: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("side_px", [640, 320, 240])
-def test_motion_is_measured_in_pictures_of_320_pixels(side_px):
+def test_compared_motion_is_in_pixels_at_width_320(side_px):
     first, second = (Frame(number, 0, moved(6 * number, side_px)) for number in range(2))
     pair = odometry._compared(first, second)
     assert pair is not None
     assert pair[0] == pytest.approx(6 * 320 / side_px, abs=0.05) and pair[1] < 0.1
 
 
-def test_what_is_masked_is_not_compared():
+def test_compared_ignores_masked_pixels():
     """Tissue moves by 4 pixels in the left half. The right half stands still, or is a tool."""
     picture, image = moved(0, 320), moved(4, 320)
     image[:, 150:] = picture[:, 150:]
@@ -154,7 +154,7 @@ def test_what_is_masked_is_not_compared():
 
 
 @pytest.mark.parametrize(("side_px", "found"), [(40, False), (90, True)])
-def test_two_dozen_points_must_be_found_again(side_px, found):
+def test_compared_requires_24_points(side_px, found):
     mask = np.zeros((240, 320), np.uint8)
     mask[60 : 60 + side_px, 60 : 60 + side_px] = 1
     pair = odometry._compared(Frame(0, 0, moved(0, 320), mask=mask), Frame(1, 0, moved(2, 320)))
@@ -179,7 +179,7 @@ def unit_of(*frames: Frame) -> float:
     return odometry._unit(frames, Trajectory(poses, np.concatenate([shown, hidden]), 0.1, 1.0, ()), camera)
 
 
-def test_the_unit_is_the_median_over_frames_of_the_ratio_of_depths():
+def test_path_unit_is_median_ratio_of_depths():
     none = Frame(0, 0, np.zeros((90, 120, 3), np.uint8))
     assert unit_of(none) == 1.0 and unit_of(none, measured(30.0)) == pytest.approx(30, rel=1e-5)
     assert unit_of(measured(20.0), measured(90.0), measured(30.0)) == pytest.approx(30, rel=1e-5)

@@ -28,21 +28,21 @@ def rays_of(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e-6, 0.0])
-def test_a_twist_moves_a_pose_as_the_exponential_of_the_public_module(scale):
+def test_bundle_moved_equals_pose_exp(scale):
     start = moved(np.eye(4), -0.5 * TWIST)
     expected = (exp(torch.from_numpy(scale * TWIST)) @ torch.from_numpy(start)).numpy()
     np.testing.assert_allclose(moved(start, scale * TWIST), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("relief", [4.0, 0.0])
-def test_a_start_that_is_off_by_many_pixels_is_good_enough(relief):
+def test_placed_converges_from_distant_start(relief):
     points, pose, rays = scene(relief=relief)
     found, off = placed(np.eye(4), points, rays, FOCAL_PX)
     np.testing.assert_allclose(found, pose, atol=1e-6)
     assert off.max() < 1e-5
 
 
-def test_points_that_move_by_themselves_decide_little():
+def test_placed_is_robust_to_moving_points():
     points, pose, rays = scene()
     rays[:60] += 12 / FOCAL_PX
     found, off = placed(np.eye(4), points, rays, FOCAL_PX)
@@ -50,7 +50,7 @@ def test_points_that_move_by_themselves_decide_little():
     assert np.median(off[:60]) > 11 and np.median(off[60:]) < 0.1
 
 
-def test_it_agrees_with_bundle_adjustment_of_points_that_stand():
+def test_placed_agrees_with_place_cameras():
     points, pose, rays = scene()
     rays += np.random.default_rng(1).normal(0, 0.5 / FOCAL_PX, rays.shape)
     found, _ = placed(pose, points, rays, FOCAL_PX)
@@ -63,7 +63,7 @@ def test_it_agrees_with_bundle_adjustment_of_points_that_stand():
     np.testing.assert_allclose(found, expected, atol=1e-4)
 
 
-def test_rounding_errors_do_not_grow():
+def test_placed_returns_orthogonal_rotation():
     """Products of many poses are no rotations any more; what is placed is one."""
     points, pose, rays = scene()
     crooked = pose.copy()
@@ -73,7 +73,7 @@ def test_rounding_errors_do_not_grow():
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-6, 9e-5, 1.1e-4, 0.3, 2.0])
-def test_a_twist_is_the_matrix_exponential(size):
+def test_bundle_moved_equals_power_series(size):
     """The motion equals the power series of the 4 x 4 matrix for angles on both sides of the switch of the closed form."""
     twist = np.array([0.4, -0.3, 0.2, *(size * np.array([0.6, -0.48, 0.64]))])
     generator = np.zeros((4, 4))
@@ -86,7 +86,7 @@ def test_a_twist_is_the_matrix_exponential(size):
     np.testing.assert_allclose(bundle.moved(np.eye(4), twist), series, atol=1e-12)
 
 
-def test_derivatives_by_a_twist_are_those_of_finite_differences():
+def test_by_twist_equals_finite_differences():
     points = np.random.default_rng(0).uniform([-20, -15, 40], [20, 15, 70], (6, 3))
     found = bundle._by_twist(points)
     for k in range(6):

@@ -20,7 +20,7 @@ def off(found: np.ndarray, true: np.ndarray, where: np.ndarray) -> float:
     return float(np.abs(found / true - 1)[where].max())
 
 
-def test_a_plane_goes_on_below_a_tool():
+def test_filled_depth_continues_plane_below_tool():
     depth, known = tilted(), np.ones((HEIGHT, WIDTH), bool)
     known[30:60, 50:90] = False
     depth[~known] = 7.0
@@ -28,7 +28,7 @@ def test_a_plane_goes_on_below_a_tool():
     assert off(found, tilted(), ~known) < 0.01 and off(found, tilted(), known) < 0.03
 
 
-def test_a_plane_goes_on_beyond_the_edge_of_what_two_eyes_see():
+def test_filled_depth_continues_plane_beyond_stereo_edge():
     known = np.ones((HEIGHT, WIDTH), bool)
     known[:, :16] = False
     nearest = tilted()[:, 16]
@@ -36,24 +36,24 @@ def test_a_plane_goes_on_beyond_the_edge_of_what_two_eyes_see():
     assert off(found, tilted(), ~known) < 0.4 * off(np.repeat(nearest[:, None], WIDTH, 1), tilted(), ~known)
 
 
-def test_where_nothing_is_known_there_is_nothing():
+def test_filled_depth_without_known_pixels_is_zero():
     assert not filled_depth(tilted(), np.zeros((HEIGHT, WIDTH), bool)).any()
 
 
 @pytest.mark.parametrize("pixel", [(0, 0), (HEIGHT - 1, WIDTH - 1), (40, 60)])
-def test_one_known_pixel_is_everywhere(pixel):
+def test_filled_depth_of_one_known_pixel_is_constant(pixel):
     known = np.zeros((HEIGHT, WIDTH), bool)
     known[pixel] = True
     assert filled_depth(tilted(), known) == pytest.approx(np.full((HEIGHT, WIDTH), tilted()[pixel]), rel=0.01)
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 40), (33, 1), (5, 3)])
-def test_pictures_of_any_size(shape):
+def test_filled_depth_of_any_picture_size(shape):
     found = filled_depth(np.full(shape, 50, np.float32), np.ones(shape, bool))
     assert found.shape == shape and found == pytest.approx(np.full(shape, 50), rel=1e-3)
 
 
-def test_it_does_not_run_away_from_what_is_known():
+def test_filled_depth_is_bounded_by_known_depth():
     rng = np.random.default_rng(0)
     known = np.zeros((HEIGHT, WIDTH), bool)
     known[:6, :6] = True
@@ -62,7 +62,7 @@ def test_it_does_not_run_away_from_what_is_known():
     assert found.min() >= 20 and found.max() <= 160 and np.isfinite(found).all()
 
 
-def test_one_known_cell_is_believed_by_its_share_of_the_window():
+def test_local_plane_weights_single_cell_by_window_share():
     """The middle of a window of 2 cells weighs 1 / (2 pi 2²) = 0.0398, twice the weight of half confidence."""
     values, weight = np.zeros((21, 21), np.float32), np.zeros((21, 21), np.float32)
     values[10, 10], weight[10, 10] = 0.6, 1.0
@@ -73,7 +73,7 @@ def test_one_known_cell_is_believed_by_its_share_of_the_window():
 
 
 @pytest.mark.parametrize(("slope", "bound"), [(0.9, 2.0), (-0.9, 2.0)])
-def test_a_surface_goes_on_to_half_the_nearest_and_twice_the_farthest_depth_at_most(slope, bound):
+def test_filled_depth_extrapolates_by_factor_two_at_most(slope, bound):
     depth, known = tilted(slope), np.zeros((HEIGHT, WIDTH), bool)
     known[:, 56:72] = True
     found = filled_depth(depth, known)

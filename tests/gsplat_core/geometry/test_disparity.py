@@ -13,7 +13,7 @@ HEIGHT, WIDTH = 64, 96
 
 
 @pytest.mark.parametrize(("low", "high"), [(3.0, 18.0), (3.2, 18.9), (-7.5, 7.4), (-7.5, 8.5), (0.0, 0.0), (2.9, 60.0)])
-def test_a_span_is_the_smallest_multiple_of_16_that_contains_its_ends(low, high):
+def test_span_around_is_smallest_multiple_of_16(low, high):
     span = Span.around(low, high)
     highest = span.lowest + span.count - 1
     assert span.lowest <= low < span.lowest + 1 and highest >= high
@@ -36,7 +36,7 @@ def pair():
     return left, right, true
 
 
-def test_a_square_before_a_wall_is_matched_and_its_edges_are_uncertain():
+def test_find_disparity_of_square_before_wall():
     left, right, true = pair()
     found = find_disparity(torch.from_numpy(left), torch.from_numpy(right), Span(0, 32))
     inner = np.zeros((HEIGHT, WIDTH), bool)
@@ -62,7 +62,7 @@ def halves(left, right):
     return np.where(np.arange(8)[None] < np.full((8, 1), 4), left, right)
 
 
-def test_sure_disparities_outweigh_doubtful_ones_on_an_even_picture():
+def test_smoothed_disparity_weights_by_inverse_variance():
     """Inverse variances with a floor of 0.05 px² weigh 0.1 px 17 times as much as 1 px."""
     found = smoothed(planes(halves(10.0, 20.0), halves(0.1, 1.0)), torch.full((8, 8), 100, dtype=torch.uint8))
     assert 10 < found.px.mean() < 12.5
@@ -71,7 +71,7 @@ def test_sure_disparities_outweigh_doubtful_ones_on_an_even_picture():
     assert 13 < floored.px.mean() < 15.5
 
 
-def test_disparities_are_not_smoothed_across_edges_of_the_picture_and_holes_stay():
+def test_smoothed_disparity_keeps_picture_edges_and_holes():
     known = np.ones((8, 8), bool)
     known[3, 3] = False
     guide = torch.from_numpy(halves(20, 220).astype(np.uint8))
@@ -81,14 +81,14 @@ def test_disparities_are_not_smoothed_across_edges_of_the_picture_and_holes_stay
     assert found.error_px[3, 3] == np.inf and found.error_px[0, 0] == pytest.approx(0.2)
 
 
-def test_pictures_are_reduced_by_the_mean_of_blocks():
+def test_shrunk_picture_is_mean_of_blocks():
     picture = np.random.default_rng(0).integers(0, 256, (12, 18), np.uint8)
     np.testing.assert_array_equal(shrunk(picture, 1), picture)
     means = picture.reshape(4, 3, 6, 3).astype(float).mean((1, 3))
     assert shrunk(picture, 3).shape == (4, 6) and np.abs(shrunk(picture, 3) - means).max() <= 0.5
 
 
-def test_enlarged_disparities_and_errors_are_in_pixels_of_the_large_picture():
+def test_enlarged_disparity_is_in_pixels_of_large_picture():
     small = planes(np.tile(np.arange(10.0), (6, 1)), np.full((6, 10), 0.25))
     large = enlarged(small, 30, 18)
     x = np.clip((np.arange(30) + 0.5) / 3 - 0.5, 0, 9)
@@ -97,7 +97,7 @@ def test_enlarged_disparities_and_errors_are_in_pixels_of_the_large_picture():
     assert large.known.all() and enlarged(small, 10, 6) is small
 
 
-def test_only_pixels_between_known_disparities_are_known_when_enlarged():
+def test_enlarged_disparity_is_known_only_between_known_pixels():
     known = np.ones((6, 10), bool)
     known[2, 4] = False
     large = enlarged(planes(np.where(known, 5.0, 0), np.where(known, 0.25, np.inf), known), 20, 12)

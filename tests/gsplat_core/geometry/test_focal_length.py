@@ -78,7 +78,7 @@ def search(monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("true_px", [250.0, 400.0])
-def test_a_scope_that_turns_around_tissue_tells_it(search, true_px):
+def test_focal_length_is_known_for_orbiting_scope(search, true_px):
     found = search(orbit, true_px, assumed_px=288.0)
     assert found is not None and found.known is True and found.assumed_px == 288
     assert found.best_px == pytest.approx(true_px, rel=0.05)
@@ -86,29 +86,29 @@ def test_a_scope_that_turns_around_tissue_tells_it(search, true_px):
     assert low_px < true_px < high_px and high_px / low_px < 1.3
 
 
-def test_a_scope_that_slides_along_tells_nothing(search):
+def test_focal_length_is_unknown_for_sliding_scope(search):
     found = search(sideways, 288.0, assumed_px=288.0)
     assert found is not None and found.known is False
     assert found.range_px == pytest.approx((SHORTEST * WIDTH, LONGEST * WIDTH))
 
 
 @pytest.mark.slow
-def test_one_beyond_the_bounds_is_not_known(search):
+def test_focal_length_beyond_bounds_is_unknown(search):
     found = search(orbit, 700.0, assumed_px=288.0, points=120)
     assert found is not None and not found.known and found.range_px[1] == pytest.approx(LONGEST * WIDTH)
 
 
-def test_too_few_points_tell_nothing(search):
+def test_focal_length_search_is_none_for_few_points(search):
     assert search(orbit, 288.0, 288.0, points=LEAST_POINTS - 1) is None
 
 
 @pytest.mark.slow
-def test_the_same_points_give_the_same_answer(search):
+def test_focal_length_search_is_deterministic(search):
     assert search(sideways, 330.0, 288.0) == search(sideways, 330.0, 288.0)
 
 
 @pytest.mark.parametrize("known", [True, False])
-def test_poses_are_estimated_again_only_for_a_focal_length_that_is_known(monkeypatch, known):
+def test_trajectory_is_estimated_again_only_for_known_focal_length(monkeypatch, known):
     asked = []
 
     def trajectory_of(frames, camera):
@@ -123,14 +123,14 @@ def test_poses_are_estimated_again_only_for_a_focal_length_that_is_known(monkeyp
     assert asked == [(["a", "b", "c"], 288.0), *([(["a", "b", "c"], 330.0)] if known else [])]
 
 
-def test_another_focal_length_leaves_the_rest_of_a_camera():
+def test_with_focal_length_keeps_principal_point_and_pose():
     camera = Camera.from_focal(288.0, WIDTH, HEIGHT, orbit(0.3))
     other = with_focal_length(camera, 300.0)
     assert (other.K[0, 0], other.K[1, 1]) == (300, 300) and np.array_equal(other.K[:, 2], camera.K[:, 2])
     assert np.array_equal(other.world_to_camera, camera.world_to_camera) and camera.K[0, 0] == 288
 
 
-def test_the_best_candidate_is_refined_from_its_nearest_neighbours():
+def test_refine_starts_from_nearest_tried_focal_lengths():
     """Expected value: the minimum of a parabola in log focal length, between candidates a factor of 1.5 apart."""
     starts = []
 
@@ -152,7 +152,7 @@ def test_the_best_candidate_is_refined_from_its_nearest_neighbours():
         known.add(focal_px)
 
 
-def test_a_point_before_the_lens_is_an_outlier_however_far_the_scope_was_moved():
+def test_without_outliers_removes_point_close_to_lens():
     """All rays are exact. The scope was withdrawn by 40, so that the scene is 60 away and one point is 1 away."""
     points = torch.tensor([[1.0, 2, 20], [-3, 1, 21], [2, -2, 19], [0.01, 0.01, -39]], dtype=torch.float64)
     poses = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
@@ -188,7 +188,7 @@ def bowl(steep: float):
     return lambda focal_px: 0.5 + steep * np.log(focal_px / 170.0) ** 2
 
 
-def test_focal_lengths_are_tried_outwards_from_the_assumed_one(monkeypatch):
+def test_focal_length_search_proceeds_outwards_from_assumed(monkeypatch):
     found, tries = searched(monkeypatch, bowl(3.0), assumed_px=210.0)
     first = tries[:8]
     asked = sorted(focal_px for focal_px, _ in first)
@@ -204,14 +204,14 @@ def test_focal_lengths_are_tried_outwards_from_the_assumed_one(monkeypatch):
 @pytest.mark.parametrize(
     ("steep", "known", "ends"), [(3.0, True, (1.0, 1.5)), (0.11, True, (1.2, 1.5)), (0.05, False, (1.5, 2.6))]
 )
-def test_a_focal_length_is_known_if_the_plausible_ones_differ_by_less_than_half(monkeypatch, steep, known, ends):
+def test_focal_length_is_known_if_plausible_range_is_below_factor_1_5(monkeypatch, steep, known, ends):
     """The robust cost at the ends of the range is one per cent above the least."""
     found, _ = searched(monkeypatch, bowl(steep), assumed_px=200.0)
     low, high = found.range_px
     assert found.known == known and ends[0] < high / low < ends[1] and low < 170 < high
 
 
-def test_the_plausible_range_ends_where_the_cost_is_one_per_cent_higher():
+def test_plausible_focal_range_ends_at_one_percent_higher_cost():
     tries = {
         focal_px: focal_length._Try(None, cost) for focal_px, cost in ((50.0, 1.0), (100.0, 4.0), (200.0, 2.0), (400.0, 2.01), (800.0, 2.03))
     }  # fmt: skip
@@ -220,7 +220,7 @@ def test_the_plausible_range_ends_where_the_cost_is_one_per_cent_higher():
     assert focal_length._range({100.0: tries[200.0], 150.0: tries[200.0]}, 100.0) == (100.0, 150.0)
 
 
-def test_another_focal_length_shows_a_flat_scene_at_the_same_pixels():
+def test_with_focal_keeps_pixels_of_flat_scene():
     random = np.random.default_rng(1)
     points = torch.from_numpy(np.concatenate([random.uniform(-10, 10, (40, 2)), np.full((40, 1), 60.0)], 1))
     poses = exp(torch.tensor([[0.0] * 6, [2, -1, 3, 0, 0, 0.2], [-3, 2, -4, 0, 0, -0.4]], dtype=torch.float64))
@@ -239,7 +239,7 @@ def test_another_focal_length_shows_a_flat_scene_at_the_same_pixels():
     assert float(errors_px(focal_length._with_focal(turned, 450.0)).max()) < 0.3
 
 
-def test_points_are_triangulated_from_their_rays():
+def test_triangulated_points_equal_true_points():
     observations, trajectory = seen(orbit, 288.0)
     poses, points = torch.from_numpy(trajectory.poses), torch.from_numpy(trajectory.points)
     frame, number = torch.from_numpy(observations.frame), torch.from_numpy(observations.point)
@@ -248,7 +248,7 @@ def test_points_are_triangulated_from_their_rays():
     torch.testing.assert_close(found, points, atol=1e-4, rtol=0)
 
 
-def test_observations_far_off_and_points_seen_twice_are_no_start():
+def test_focal_start_excludes_outliers_and_points_seen_twice():
     """Four of 70 points are seen in two frames only. Five others are seen in three, with one observation off by 5 pixels."""
     observations, trajectory = seen(orbit, 288.0)
     kept, rank = np.ones(len(observations.frame), bool), np.zeros(POINTS, int)
@@ -266,7 +266,7 @@ def test_observations_far_off_and_points_seen_twice_are_no_start():
     assert float(errors_px(start).max()) < 3 and float(errors_px(start).median()) < 2 * NOISE_PX
 
 
-def test_twenty_key_frames_spread_over_the_recording_are_a_start():
+def test_focal_start_uses_twenty_key_frames():
     observations, trajectory = seen(lambda share: orbit(share / 5), 288.0)
     pieces = []
     for repeat in range(5):
@@ -281,7 +281,7 @@ def test_twenty_key_frames_spread_over_the_recording_are_a_start():
 
 
 @pytest.mark.parametrize(("points", "enough"), [(49, False), (50, True)])
-def test_fifty_points_are_enough_to_start(points, enough):
+def test_focal_start_requires_fifty_points(points, enough):
     observations, trajectory = seen(lambda share: orbit(share / 3), 250.0, points)
     assert (
         focal_length._start(observations, Camera.from_focal(250.0, WIDTH, HEIGHT), trajectory) is not None

@@ -22,7 +22,7 @@ def shifted(by_px: tuple[float, float], gain: float = 1.0) -> Frame:
     return Frame(0, 0, np.asarray(np.clip(picture * gain, 0, 255), np.uint8))
 
 
-def test_points_are_found_in_another_light_and_where_they_leave_the_picture_they_are_not() -> None:
+def test_follow_grids_tolerates_brightness_change_and_drops_points_outside() -> None:
     ways = [(0.0, 0.0), (3.5, -2.0), (8.0, -4.5), (30.0, 0.0)]
     pictures = [seen_by(shifted(way, 1 - 0.1 * number), FIRST) for number, way in enumerate(ways)]
     tracks = follow_grids(pictures, np.arange(4.0), [0, 2])
@@ -38,7 +38,7 @@ def test_points_are_found_in_another_light_and_where_they_leave_the_picture_they
     assert tracks.seen[3].mean() < tracks.seen[1].mean()
 
 
-def test_nothing_is_followed_on_tools_nor_out_of_the_field_of_view() -> None:
+def test_follow_grids_excludes_tools_and_outside_field_of_view() -> None:
     mask, field = np.ones((HEIGHT, WIDTH), np.uint8), np.ones((HEIGHT, WIDTH), np.uint8)
     mask[:, :60], field[100:] = 0, 0
     frames = [shifted(way).with_fields(mask=mask, loss_mask=field) for way in ((0.0, 0.0), (2.0, 1.0))]
@@ -49,14 +49,14 @@ def test_nothing_is_followed_on_tools_nor_out_of_the_field_of_view() -> None:
     assert (y[tracks.seen] < 100).all()
 
 
-def test_large_pictures_are_made_small() -> None:
+def test_seen_by_reduces_large_pictures() -> None:
     image = cv2.resize(texture(), (700, 500))
     small = seen_by(Frame(0, 0, np.asarray(image, np.uint8)), Camera.from_focal(600.0, 700, 500))
     assert small.texture.shape[1] == LONGEST_PX == small.camera.width_px
     assert small.usable.shape == small.texture.shape
 
 
-def test_the_usable_part_keeps_one_pixel_from_the_field_of_view_and_six_from_tools() -> None:
+def test_usable_part_margins_from_field_of_view_and_tools() -> None:
     mask, field = np.ones((HEIGHT, WIDTH), np.uint8), np.ones((HEIGHT, WIDTH), np.uint8)
     mask[:, :40], field[80:] = 0, 0
     usable = seen_by(shifted((0.0, 0.0)).with_fields(mask=mask, loss_mask=field), FIRST).usable
@@ -65,7 +65,7 @@ def test_the_usable_part_keeps_one_pixel_from_the_field_of_view_and_six_from_too
     assert rows[-1] == 79 - 1
 
 
-def test_texture_is_centred_and_as_strong_in_weak_light() -> None:
+def test_texture_is_centred_and_independent_of_brightness() -> None:
     bright, dim = (seen_by(shifted((0.0, 0.0), gain), FIRST) for gain in (1.0, 0.5))
     inner = bright.usable[20:-20, 20:-20] > 0
     values = bright.texture[20:-20, 20:-20][inner].astype(float)
@@ -74,13 +74,13 @@ def test_texture_is_centred_and_as_strong_in_weak_light() -> None:
     assert abs(again.std() - values.std()) < 5 and np.corrcoef(values, again)[0, 1] > 0.98
 
 
-def test_flat_pictures_have_no_texture() -> None:
+def test_texture_of_flat_picture_is_weak() -> None:
     noise = np.random.default_rng(0).integers(0, 2, (HEIGHT, WIDTH, 1), np.uint8)
     flat = seen_by(Frame(0, 0, np.repeat(120 + noise, 3, 2).astype(np.uint8)), FIRST)
     assert flat.texture.astype(float).std() < 20
 
 
-def test_a_grid_has_a_point_every_ten_pixels_that_is_seen_in_three_of_ten_pictures() -> None:
+def test_follow_grids_spacing_and_minimum_visibility() -> None:
     still = seen_by(shifted((0.0, 0.0)), FIRST)
     hidden = TexturedPicture(still.texture, still.usable.copy(), FIRST)
     hidden.usable[:, : WIDTH // 2] = 0
@@ -99,7 +99,7 @@ def test_a_grid_has_a_point_every_ten_pixels_that_is_seen_in_three_of_ten_pictur
     assert part.times_s.tolist() == [1.0, 2.0]
 
 
-def test_pictures_are_compared_with_the_key_from_the_nearest_on_in_both_directions(monkeypatch) -> None:
+def test_from_key_compares_outwards_from_key_picture(monkeypatch) -> None:
     """Each flow starts from that of the picture before, so that it is found over large distances."""
     pictures = [seen_by(shifted((0.5 * number, 0.0)), FIRST) for number in range(5)]
     numbers, compared = {id(each.texture): number for number, each in enumerate(pictures)}, []
@@ -134,9 +134,7 @@ def test_pictures_are_compared_with_the_key_from_the_nearest_on_in_both_directio
         ((30.0, 39.9), 0, True), ((30.0, 40.0), 0, False), ((45.0, 20.0), 0, False),
     ],
 )  # fmt: skip
-def test_a_point_is_found_inside_of_the_border_on_tissue_and_within_a_pixel_of_its_start(
-    at, misses_px, is_found
-) -> None:
+def test_found_requires_border_tissue_and_return_within_one_pixel(at, misses_px, is_found) -> None:
     """Positions are relative to the border that is left out. A tool is at columns 40 to 50."""
     border = grid_tracks.BORDER_PX
     usable = np.ones((40 + 2 * border, 60 + 2 * border), np.uint8)

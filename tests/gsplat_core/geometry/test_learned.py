@@ -64,7 +64,7 @@ def off(found: np.ndarray, depth: np.ndarray) -> float:
     return float(np.abs(ratio / np.median(ratio) - 1).max())
 
 
-def test_inverse_depth_becomes_depth_around_the_distance_of_a_scene_without_depth(network):
+def test_learned_depth_scales_inverse_depth_to_relative_distance(network):
     found = LearnedDepth(str(network())).estimate(seen(inverse(surface())), CAMERA)
     assert found is not None and found.doubt is None and found.remark is None
     assert (found.origin, found.metric) == (DEPTH_ORIGINS["learned"], False)
@@ -74,7 +74,7 @@ def test_inverse_depth_becomes_depth_around_the_distance_of_a_scene_without_dept
 
 
 @pytest.mark.parametrize("stated", ["address", "metadata"])
-def test_depth_itself_is_taken_where_that_is_stated(network, stated):
+def test_learned_depth_values_option_depth(network, stated):
     if stated == "address":
         address = f"{network()}?values=depth"
     else:
@@ -83,7 +83,7 @@ def test_depth_itself_is_taken_where_that_is_stated(network, stated):
     assert found is not None and off(found.depth, surface()) < 0.03
 
 
-def test_the_address_goes_before_the_models_own_settings(network):
+def test_learned_depth_address_overrides_model_metadata(network):
     address = f"{network(metadata={**PLAIN, 'values': 'depth'})}?values=inverse"
     found = LearnedDepth(address).estimate(seen(inverse(surface())), CAMERA)
     assert found is not None and off(found.depth, surface()) < 0.03
@@ -91,7 +91,7 @@ def test_the_address_goes_before_the_models_own_settings(network):
 
 @pytest.mark.parametrize("size", [(HEIGHT, WIDTH), (48, 64), ("height", "width")])
 @pytest.mark.parametrize("flat", [True, False])
-def test_any_size_and_both_shapes_of_an_answer(network, size, flat):
+def test_learned_depth_accepts_any_size_and_answer_shape(network, size, flat):
     axes = numpy_helper.from_array(np.array([1], np.int64), "axes")
     squeeze = helper.make_node("Squeeze", ["red", "axes"], ["mask"])
     path = network(node=squeeze, size=size, parts=[axes]) if flat else network(size=size)
@@ -99,14 +99,14 @@ def test_any_size_and_both_shapes_of_an_answer(network, size, flat):
     assert found is not None and off(found.depth, surface()) < 0.06
 
 
-def test_pictures_are_normalised_as_such_networks_expect(network):
+def test_learned_depth_default_normalisation(network):
     """(255 - 0.485 · 255) / (0.229 · 255) for white; a model may state otherwise."""
     finder = LearnedDepth(str(network(metadata=None)))
     answer = finder._network.run(np.full((8, 8, 3), 255, np.uint8))
     assert answer == pytest.approx((1 - 0.485) / 0.229, rel=1e-5)
 
 
-def test_a_network_that_refuses_multiples_of_14_is_given_multiples_of_32(network):
+def test_learned_depth_falls_back_to_multiples_of_32(network):
     """A network that halves its input four times and restores its size needs multiples of 16."""
     scales = numpy_helper.from_array(np.array([1, 1, 16, 16], np.float32), "scales")
     small = helper.make_node("AveragePool", ["red"], ["small"], kernel_shape=[16, 16], strides=[16, 16])
@@ -119,7 +119,7 @@ def test_a_network_that_refuses_multiples_of_14_is_given_multiples_of_32(network
     assert LearnedDepth(str(network(size=("h", "w"))))._network.multiple_px == 14
 
 
-def test_answers_stay_where_they_were_though_each_has_another_factor_and_zero(network, rng):
+def test_learned_depth_is_steady_for_varying_factor_and_offset(network, rng):
     estimator, answers = LearnedDepth(str(network())), []
     for number in range(12):
         values = inverse(surface(), rng.uniform(8, 20), rng.uniform(0, 0.2)) + rng.normal(0, 0.004, (HEIGHT, WIDTH))
@@ -129,7 +129,7 @@ def test_answers_stay_where_they_were_though_each_has_another_factor_and_zero(ne
     assert np.median(answers[-1]) == pytest.approx(np.median(answers[0]), rel=0.02)
 
 
-def test_an_answer_holds_on_until_the_next_look_while_the_scope_stands_still(network):
+def test_learned_depth_reuses_answer_while_scope_is_still(network):
     estimator = LearnedDepth(str(network()))
     frame = seen(inverse(surface()))
     first = estimator.estimate(frame, CAMERA)
@@ -140,7 +140,7 @@ def test_an_answer_holds_on_until_the_next_look_while_the_scope_stands_still(net
     assert estimator.estimate(frame.with_fields(seq=3, pts_ns=POLL_NS), CAMERA.with_pose(moved)) is not None
 
 
-def test_depth_that_frames_came_with_says_the_factor_and_the_zero(network):
+def test_learned_depth_takes_scale_from_recorded_depth(network):
     """Known in a few places, and wrong in some of them."""
     depth = np.zeros((HEIGHT, WIDTH), np.float32)
     depth[::3, ::4] = surface()[::3, ::4]
@@ -155,7 +155,7 @@ def test_depth_that_frames_came_with_says_the_factor_and_the_zero(network):
     assert np.median(np.abs(without.depth / surface() - 1)) < 0.02, "and goes on to say it"
 
 
-def test_depth_that_is_not_believed_says_nothing(network):
+def test_learned_depth_ignores_unconfident_recorded_depth(network):
     wrong = np.full((HEIGHT, WIDTH), 500, np.float32) + np.arange(WIDTH, dtype=np.float32)
     frame = seen(inverse(surface()), depth=wrong, depth_confidence=np.full_like(wrong, 0.4))
     found = LearnedDepth(str(network())).estimate(frame, CAMERA)
@@ -166,7 +166,7 @@ def test_depth_that_is_not_believed_says_nothing(network):
     )
 
 
-def test_another_scene_starts_anew(network, rng):
+def test_learned_depth_resets_at_new_scene(network, rng):
     estimator = LearnedDepth(str(network()))
     estimator.estimate(seen(inverse(surface())), CAMERA)
     noise = cv2.GaussianBlur(rng.uniform(0, 1, (HEIGHT, WIDTH)), (0, 0), 4)
@@ -191,7 +191,7 @@ def test_another_scene_starts_anew(network, rng):
         ),
     ],
 )
-def test_what_cannot_be_right_is_doubted(network, frame, doubt):
+def test_learned_depth_doubts_implausible_answers(network, frame, doubt):
     estimator = LearnedDepth(str(network()))
     found = estimator.estimate(frame, CAMERA)
     assert found is not None and found.doubt == doubt and not found.confidence.any()
@@ -199,7 +199,7 @@ def test_what_cannot_be_right_is_doubted(network, frame, doubt):
     assert good is not None and good.doubt is None, "and the next one is not"
 
 
-def test_values_that_are_not_finite_are_doubted(network):
+def test_learned_depth_doubts_non_finite_values(network):
     path = network(node=helper.make_node("Log", ["red"], ["mask"]))
     dark = inverse(surface())
     dark[:8] = 0
@@ -207,7 +207,7 @@ def test_values_that_are_not_finite_are_doubted(network):
     assert found is not None and found.doubt == NOT_FINITE
 
 
-def test_the_same_stream_gives_the_same_bytes(network):
+def test_learned_depth_is_deterministic(network):
     frames = [seen(inverse(surface(), 10 + number), number) for number in range(4)]
     one, other = (
         [estimator.estimate(frame, CAMERA) for frame in frames]
@@ -216,7 +216,7 @@ def test_the_same_stream_gives_the_same_bytes(network):
     assert [found.depth.tobytes() for found in one] == [found.depth.tobytes() for found in other]
 
 
-def test_a_network_is_loaded_once_until_its_files_change(network):
+def test_depth_network_is_cached_until_files_change(network):
     path = network()
     before = LearnedDepth(str(path))._network
     assert LearnedDepth(f"{path}?values=depth")._network is before
@@ -232,7 +232,7 @@ def test_a_network_is_loaded_once_until_its_files_change(network):
         ("Shape", {}, "gives int64 [4]"),
     ],
 )
-def test_answers_of_another_shape_are_refused(network, operator, options, sentence):
+def test_depth_network_with_wrong_output_shape_is_refused(network, operator, options, sentence):
     kind = TensorProto.INT64 if operator == "Shape" else TensorProto.FLOAT
     nodes, weights = conv(*RED, output="red")
     path = network().with_name("other.onnx")
@@ -248,21 +248,21 @@ def test_answers_of_another_shape_are_refused(network, operator, options, senten
     assert sentence in str(caught.value) and "it must give floats [1, h, w] or [1, 1, h, w]" in str(caught.value)
 
 
-def test_several_channels_are_refused(network):
+def test_depth_network_with_several_channels_is_refused(network):
     nodes, weights = conv([[1, 0, 0], [0, 1, 0]], [0, 0])
     path = write(network().with_name("two.onnx"), nodes, weights)
     with pytest.raises(InvalidSetting, match=r"gives float32 \[1, 2, 32, 40\]; it must give floats"):
         LearnedDepth(str(path))
 
 
-def test_the_checks_of_a_file_from_elsewhere_are_those_of_tool_networks(tmp_path):
+def test_depth_network_file_checks(tmp_path):
     with pytest.raises(InvalidSetting, match=r"depth network .* keeps data in other files"):
         check_depth(f"onnx:{external_weights(tmp_path / 'net.onnx', 'weights.bin')}")
     with pytest.raises(InvalidSetting, match=r"depth network .*missing\.onnx cannot be read"):
         check_depth(f"onnx:{tmp_path / 'missing.onnx'}")
 
 
-def test_settings_of_tool_networks_are_refused(network):
+def test_depth_network_refuses_tool_network_settings(network):
     with pytest.raises(InvalidSetting, match="threshold: Extra inputs are not permitted"):
         LearnedDepth(str(network(metadata={"threshold": 0.4})))
 
@@ -280,13 +280,13 @@ def test_settings_of_tool_networks_are_refused(network):
         ("onnx:net.onnx?values=metres", "has values 'metres'; choose inverse or depth"),
     ],
 )
-def test_other_addresses_are_refused(choice, said):
+def test_check_depth_refuses_invalid_addresses(choice, said):
     with pytest.raises(InvalidSetting) as caught:
         check_depth(choice)
     assert said in str(caught.value)
 
 
-def test_it_is_found_by_its_address(network):
+def test_new_estimator_of_onnx_address_is_learned_depth(network):
     choice = f"onnx:{network('my:net?.onnx')}"
     check_depth(choice)
     assert isinstance(new_estimator(choice), LearnedDepth)
@@ -295,7 +295,7 @@ def test_it_is_found_by_its_address(network):
 
 
 @pytest.mark.parametrize("size", [(30, 80), (80, 30), (64, 64), (500, 2)])
-def test_planes_are_compared_with_the_same_number_of_pixels_along_their_longer_side(size):
+def test_on_grid_longer_side_is_grid_px(size):
     plane = learned._on_grid(np.ones((7, 9)), size)
     assert max(plane.shape) == learned.GRID_PX and plane.shape == pytest.approx(
         [max(1, side * learned.GRID_PX / max(size)) for side in size], abs=0.5

@@ -53,11 +53,11 @@ def found(rigid) -> np.ndarray:
     return placed(blind(rigid), LiveOdometry(rigid.camera))
 
 
-def test_the_way_of_a_moving_scope_is_found_as_it_goes(rigid, found):
+def test_live_odometry_follows_moving_scope(rigid, found):
     assert errors(found, rigid).similarity_share < 0.02
 
 
-def test_it_says_how_much_of_the_motion_the_poses_explain(rigid):
+def test_live_odometry_reports_explained_share(rigid):
     odometry = LiveOdometry(rigid.camera)
     placed(blind(rigid), odometry)
     assert (odometry.frames, odometry.not_placed, odometry.begun) == (COUNT, 0, 1)
@@ -65,7 +65,7 @@ def test_it_says_how_much_of_the_motion_the_poses_explain(rigid):
 
 
 @pytest.mark.parametrize("threads", [1, 3])
-def test_the_same_frames_give_the_same_bytes_whatever_comes_after(rigid, found, threads):
+def test_live_odometry_is_deterministic_for_any_thread_count(rigid, found, threads):
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
@@ -75,7 +75,7 @@ def test_the_same_frames_give_the_same_bytes_whatever_comes_after(rigid, found, 
     assert again.tobytes() == found[:15].tobytes()
 
 
-def test_the_first_frame_stands_where_the_camera_says(rigid, found):
+def test_live_odometry_first_pose_is_camera_pose(rigid, found):
     pose = np.eye(4)
     pose[:3, 3] = 1, -2, 3
     moved = placed(blind(rigid)[:5], LiveOdometry(rigid.camera.with_pose(pose)))
@@ -84,7 +84,7 @@ def test_the_first_frame_stands_where_the_camera_says(rigid, found):
 
 
 @pytest.mark.parametrize("kept", ["depth", "right_image"])
-def test_lengths_have_the_unit_of_the_depth_of_the_frames(rigid, kept):
+def test_live_odometry_has_unit_of_frame_depth(rigid, kept):
     fields = {"depth": ("depth", "depth_origin"), "right_image": ("right_image", "right_camera")}[kept]
     frames = [
         each.with_fields(**{name: getattr(frame, name) for name in fields})
@@ -98,7 +98,7 @@ def test_lengths_have_the_unit_of_the_depth_of_the_frames(rigid, kept):
     assert not unmeasured.is_measured
 
 
-def test_the_first_points_have_the_depth_of_their_pixels_and_its_median_in_holes(rigid):
+def test_live_odometry_first_points_take_pixel_depth_or_median(rigid):
     first = next(iter(rigid))
     depth = first.depth.copy()
     depth[:, : rigid.camera.width_px // 2] = 0
@@ -113,7 +113,7 @@ def test_the_first_points_have_the_depth_of_their_pixels_and_its_median_in_holes
 
 
 @pytest.mark.parametrize("side_px", [256, 100])
-def test_points_at_the_edge_have_the_depth_of_the_edge(rigid, side_px):
+def test_seen_depth_clamps_points_to_picture_edge(rigid, side_px):
     """Positions between pixels are up to a pixel outside at each edge."""
     first = next(iter(rigid))
     picture = SmallPictures(rigid.camera, side_px).of(first)
@@ -124,7 +124,7 @@ def test_points_at_the_edge_have_the_depth_of_the_edge(rigid, side_px):
     assert np.array_equal(found, depth[[0, 0, -1, -1], [0, -1, 0, -1]])
 
 
-def test_a_frame_that_tells_nothing_stands_where_the_one_before_stood(rigid):
+def test_live_odometry_repeats_pose_for_unusable_frame(rigid):
     frames = blind(rigid)
     frames[8] = frames[8].with_fields(image=np.full_like(frames[8].image, 90))
     frames[12] = frames[12].with_fields(withheld="blur")
@@ -138,7 +138,7 @@ def test_a_frame_that_tells_nothing_stands_where_the_one_before_stood(rigid):
     assert errors(poses, rigid, others).similarity_share < 0.02, "points are found again behind it"
 
 
-def test_a_stream_that_begins_with_nothing_waits(rigid):
+def test_live_odometry_waits_for_first_textured_frame(rigid):
     frames = blind(rigid)
     grey = np.full_like(frames[0].image, 90)
     odometry = LiveOdometry(rigid.camera)
@@ -147,7 +147,7 @@ def test_a_stream_that_begins_with_nothing_waits(rigid):
     assert (odometry.not_placed, odometry.begun) == (3, 1)
 
 
-def test_fifteen_frames_without_points_are_waited_for(rigid):
+def test_live_odometry_starts_new_map_after_15_frames_without_points(rigid):
     """A new map begins where a frame has points again after more of them."""
     first = blind([next(iter(rigid))])[0]
     grey, other = (first.with_fields(image=each) for each in (np.full_like(first.image, 120), first.image[::-1].copy()))
@@ -157,7 +157,7 @@ def test_fifteen_frames_without_points_are_waited_for(rigid):
         assert odometry.begun == begun
 
 
-def test_another_scene_is_begun_anew_after_a_while(rigid, monkeypatch):
+def test_live_odometry_starts_new_map_for_other_scene(rigid, monkeypatch):
     monkeypatch.setattr(live_odometry, "MOST_NOT_PLACED", 3)
     frames = blind(rigid)
     other = [frame.with_fields(image=np.ascontiguousarray(frame.image[::-1])) for frame in frames[8:20]]
@@ -167,7 +167,7 @@ def test_another_scene_is_begun_anew_after_a_while(rigid, monkeypatch):
     assert not np.array_equal(poses[-1], poses[-2]), "poses go on in the other scene"
 
 
-def test_a_scope_that_was_lost_is_found_by_the_key_frames(rigid, found, monkeypatch):
+def test_live_odometry_relocalises_lost_scope_by_key_frames(rigid, found, monkeypatch):
     frames = blind(rigid)
     grey = [frame.with_fields(image=np.full_like(frame.image, 90)) for frame in frames[:2]]
     odometry = LiveOdometry(rigid.camera)
@@ -182,7 +182,7 @@ def test_a_scope_that_was_lost_is_found_by_the_key_frames(rigid, found, monkeypa
     assert apart.max() < 0.5 < np.linalg.norm(centres(found[15:16]) - centres(found[2:3]))
 
 
-def test_a_place_that_was_left_is_gone_on_with_behind_another_scene(rigid, found):
+def test_live_odometry_resumes_left_map_after_other_scene(rigid, found):
     frames = blind(rigid)
     other = [frame.with_fields(image=np.ascontiguousarray(frame.image[::-1])) for frame in frames[8:14]]
     other[0] = other[0].with_fields(new_scene="cut")
@@ -199,7 +199,7 @@ def centres(poses: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_memory_is_bounded(rigid, monkeypatch):
+def test_live_odometry_memory_is_bounded(rigid, monkeypatch):
     monkeypatch.setattr(live_odometry, "MOST_KEY_FRAMES", 5)
     monkeypatch.setattr(live_odometry, "WINDOW", 3)
     odometry = LiveOdometry(rigid.camera)
@@ -212,13 +212,13 @@ def test_memory_is_bounded(rigid, monkeypatch):
     assert odometry.map.keys[0].pose.equal(torch.eye(4, dtype=torch.float64)), "the first one says where the world is"
 
 
-def test_a_camera_that_is_no_pinhole_is_refused():
+def test_live_odometry_refuses_fisheye_camera():
     fisheye = Camera(np.array([[100.0, 0, 40], [0, 100, 32], [0, 0, 1]]), 80, 64, model="fisheye")
     with pytest.raises(InvalidInput, match="this one is fisheye: undistort"):
         LiveOdometry(fisheye)
 
 
-def test_the_unit_without_depth_is_that_of_a_scene_without_depth(rigid):
+def test_live_odometry_unit_without_depth_is_relative_distance(rigid):
     odometry = LiveOdometry(rigid.camera)
     placed(blind(rigid), odometry)
     first = odometry.map.keys[0]

@@ -63,14 +63,14 @@ def round_about(count: int, far_px: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("count", "begun"), [(19, 0), (20, 1)])
-def test_twenty_corners_begin_a_map(count, begun, monkeypatch):
+def test_live_odometry_starts_map_from_20_corners(count, begun, monkeypatch):
     stream = Stream(count, monkeypatch)
     stream.place()
     assert (stream.odometry.begun, stream.odometry.not_placed) == (begun, 1 - begun)
 
 
 @pytest.mark.parametrize(("lost", "placed"), [(10, True), (11, False)])
-def test_twenty_found_points_place_a_frame(lost, placed, monkeypatch):
+def test_live_odometry_places_frame_from_20_points(lost, placed, monkeypatch):
     stream = Stream(30, monkeypatch)
     stream.place()
     stream.found[:lost] = False
@@ -82,7 +82,7 @@ def test_twenty_found_points_place_a_frame(lost, placed, monkeypatch):
 @pytest.mark.parametrize(
     ("count", "wrong", "placed"), [(30, 10, True), (30, 11, False), (100, 58, True), (100, 63, False)]
 )
-def test_twenty_points_and_four_tenths_must_fit_to_four_pixels(count, wrong, placed, monkeypatch):
+def test_live_odometry_requires_20_points_and_40_percent_within_4_px(count, wrong, placed, monkeypatch):
     stream = Stream(count, monkeypatch)
     stream.place()
     stream.off_px[:wrong] = round_about(wrong, 6.0)
@@ -90,7 +90,7 @@ def test_twenty_points_and_four_tenths_must_fit_to_four_pixels(count, wrong, pla
     assert stream.odometry.not_placed == (not placed)
 
 
-def test_points_fit_to_four_pixels_and_are_given_up_from_eight(monkeypatch):
+def test_live_odometry_drops_points_off_by_8_px(monkeypatch):
     stream = Stream(60, monkeypatch)
     stream.place()
     stream.off_px[:12] = np.repeat([3.7, 4.3, 7.6, 8.4], 3)[:, None] * round_about(12, 1.0)
@@ -107,7 +107,7 @@ def test_points_fit_to_four_pixels_and_are_given_up_from_eight(monkeypatch):
     assert few.odometry.not_placed == 1
 
 
-def test_key_frames_are_half_a_pixel_apart_at_first_and_then_sixteen(monkeypatch):
+def test_live_odometry_key_frame_spacing(monkeypatch):
     """Bundles are adjusted with every frame at first, and then in the two frames from a key frame on."""
     adjusted, grown = [], []
     stream = Stream(60, monkeypatch)
@@ -124,7 +124,7 @@ def test_key_frames_are_half_a_pixel_apart_at_first_and_then_sixteen(monkeypatch
 
 
 @pytest.mark.parametrize(("left", "keys"), [(71, 1), (69, 2)])
-def test_a_key_frame_is_due_when_less_than_seven_tenths_of_its_points_are_left(left, keys, monkeypatch):
+def test_key_frame_is_added_below_70_percent_of_points(left, keys, monkeypatch):
     stream = Stream(100, monkeypatch)
     stream.place()
     stream.found[left:] = False
@@ -133,7 +133,7 @@ def test_a_key_frame_is_due_when_less_than_seven_tenths_of_its_points_are_left(l
 
 
 @pytest.mark.parametrize(("off_px", "keys"), [(0.35, []), (0.45, [5, 10])])
-def test_a_key_frame_is_due_every_five_frames_while_points_are_off_by_four_tenths_of_a_pixel(off_px, keys, monkeypatch):
+def test_key_frame_is_added_every_five_frames_for_errors_above_0_4_px(off_px, keys, monkeypatch):
     stream, grown = Stream(100, monkeypatch), []
     monkeypatch.setattr(LocalMap, "adjust", lambda places: None)
     stream.place()
@@ -145,7 +145,7 @@ def test_a_key_frame_is_due_every_five_frames_while_points_are_off_by_four_tenth
     assert grown == keys
 
 
-def test_points_are_searched_where_a_constant_motion_takes_them(monkeypatch):
+def test_live_odometry_predicts_points_by_constant_motion(monkeypatch):
     stream = Stream(60, monkeypatch)
     for shift_px in (0.0, 3.0, 6.0):
         stream.place(shift_px)
@@ -159,7 +159,7 @@ def test_points_are_searched_where_a_constant_motion_takes_them(monkeypatch):
     np.testing.assert_allclose(stream.guessed, stream.at + [6, 0], atol=0.05, err_msg="the way before is unknown")
 
 
-def test_the_share_of_the_motion_that_poses_explain_is_that_of_its_square(monkeypatch):
+def test_live_odometry_explained_is_share_of_squared_motion(monkeypatch):
     """Points are off by 0.3 pixels to all sides, and the scope moves them by 2 pixels from where they were first."""
     stream = Stream(100, monkeypatch)
     monkeypatch.setattr(LocalMap, "adjust", lambda places: None)
@@ -170,7 +170,7 @@ def test_the_share_of_the_motion_that_poses_explain_is_that_of_its_square(monkey
     assert stream.odometry.explained == pytest.approx(1 - (0.3 / 2) ** 2, abs=0.003)
 
 
-def test_depth_is_taken_where_it_is_sure_and_a_positive_number():
+def test_seen_depth_ignores_invalid_and_unconfident_depth():
     depth = np.full((256, 320), 50.0, np.float32)
     depth[10, 10:14] = [np.nan, np.inf, 0, -3]
     sure = np.full((256, 320), BELIEVED, np.float32)
@@ -184,7 +184,7 @@ def test_depth_is_taken_where_it_is_sure_and_a_positive_number():
 
 
 @pytest.mark.parametrize("size", [1, 2])
-def test_the_right_eye_gives_the_depth_of_points_in_the_same_row_that_come_back(monkeypatch, size):
+def test_seen_depth_of_right_eye_requires_same_row_and_return(monkeypatch, size):
     """A point 20 away is shifted by 40 pixels for a baseline of 4 and a focal length of 200 pixels."""
     misses = np.array([0.0, 0.45, 0.55, 0, 0, 0, 0, 0, 0], np.float32)
     shifts = np.array([[40, 0], [40, 0], [40, 0], [20, 1.4], [20, 1.6], [20, -1.6], [0.6, 0], [0.4, 0], [-9, 0]])

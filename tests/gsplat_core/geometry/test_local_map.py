@@ -27,7 +27,7 @@ def known(places):
     return made
 
 
-def test_forty_key_frames_are_kept_and_the_one_nearest_to_another_leaves_with_its_points():
+def test_local_map_drops_nearest_key_frame_beyond_forty():
     made = known([[0.0, 0, 50 + n] for n in range(41)])
     at = [10.0 * n for n in range(41)]
     at[20] = 192.0  # 2 units from another; the first one and the newest are nearer to each other still, but stay
@@ -42,7 +42,7 @@ def test_forty_key_frames_are_kept_and_the_one_nearest_to_another_leaves_with_it
     assert len(made) == 40 and not made.knows(np.array(sorted(gone)))[0]
 
 
-def test_the_first_key_frame_stays_though_another_is_beside_it():
+def test_local_map_keeps_first_key_frame():
     made = LocalMap()
     for n in range(41):
         made.add_key(key([0.0, 0.5][n] if n < 2 else 10.0 * n, []))
@@ -50,14 +50,14 @@ def test_the_first_key_frame_stays_though_another_is_beside_it():
     assert len(made.keys) == 40 and made.keys[1].position[0] == 20.0
 
 
-def test_a_new_point_is_as_far_as_the_median_of_the_five_nearest():
+def test_depth_around_is_median_of_five_nearest_points():
     made = known([[0.0, 0, z] for z in (10, 20, 30, 40, 50, 1000)])
     seen = np.array([[0.1 * n, 0.0] for n in range(1, 7)])
     depth = made.depth_around(key(0.0).pose, np.zeros((1, 2)), np.arange(6), seen)
     assert depth.tolist() == [30.0]
 
 
-def test_what_came_after_an_earlier_key_frame_is_moved_by_its_share():
+def test_brought_back_moves_later_key_frames_proportionally():
     made = known([[0.0, 0, 50], [0.0, 0, 60], [0.0, 0, 70]])
     made.keys = [key(0.0, [0]), key(1.0, [0, 1]), key(2.0, [1, 2])]
     after = torch.eye(4, dtype=torch.float64)
@@ -68,7 +68,7 @@ def test_what_came_after_an_earlier_key_frame_is_moved_by_its_share():
     np.testing.assert_allclose([each.position[0] for each in made.keys], [0, 2 * 1 + 2, 4 * 2 + 4])
 
 
-def test_all_lengths_are_scaled_as_seen_from_a_key_frame():
+def test_rescale_scales_map_about_key_frame():
     made = known([[3.0, 0, 50]])
     made.keys = [key(1.0, [0]), key(4.0)]
     made._rescale(made.keys[0], 2.0)
@@ -77,14 +77,14 @@ def test_all_lengths_are_scaled_as_seen_from_a_key_frame():
 
 
 @pytest.mark.parametrize(("factor", "is_taken"), [(0.1, False), (0.11, True), (9.9, True), (10.0, False)])
-def test_a_scale_beyond_ten_is_no_scale(factor, is_taken):
+def test_rescale_ignores_factors_beyond_ten(factor, is_taken):
     made = known([[0.0, 0, 50]])
     made.keys = [key(0.0, [0])]
     made._rescale(made.keys[0], factor)
     assert made.points(np.arange(1))[0, 2] == pytest.approx(50 * factor if is_taken else 50)
 
 
-def test_anchors_share_six_points_at_least_and_five_are_taken():
+def test_anchors_are_up_to_five_key_frames_sharing_six_points():
     made = LocalMap()
     shares = [7, 5, 6, 20, 9, 8, 30, 10]
     made.keys = [key(float(n), range(share)) for n, share in enumerate(shares)]
@@ -96,7 +96,7 @@ def test_anchors_share_six_points_at_least_and_five_are_taken():
     assert [each.position[0] for each in few._anchors(window)] == [0, 2]
 
 
-def test_positions_scaled_poses_and_unprojected_points_agree():
+def test_position_of_scaled_and_unprojected_agree():
     pose = key(3.0, y=4.0).pose
     np.testing.assert_allclose(position_of(pose), [3, 4, 0])
     np.testing.assert_allclose(position_of(scaled(pose, 2.0)), [6, 8, 0])
@@ -104,7 +104,7 @@ def test_positions_scaled_poses_and_unprojected_points_agree():
 
 
 @pytest.mark.parametrize(("count", "is_adjusted"), [(11, False), (12, True), (30, True)])
-def test_twelve_points_that_two_key_frames_show_are_adjusted(count, is_adjusted):
+def test_local_map_adjusts_from_twelve_shared_points(count, is_adjusted):
     random = np.random.default_rng(0)
     places = random.uniform([-20, -15, 45], [20, 15, 70], (count, 3))
     made = known((places + random.normal(0, 0.5, places.shape)).tolist())
@@ -128,7 +128,7 @@ def test_twelve_points_that_two_key_frames_show_are_adjusted(count, is_adjusted)
     torch.testing.assert_close(made._depth_of(made.keys[0]), depth)
 
 
-def test_one_key_frame_alone_is_not_adjusted():
+def test_local_map_does_not_adjust_single_key_frame():
     made = known([[0.0, 0, 50]] * 20)
     made.keys = [key(0.0, range(20))]
     made.adjust()
@@ -136,7 +136,7 @@ def test_one_key_frame_alone_is_not_adjusted():
 
 
 @pytest.mark.parametrize(("points", "rounds"), [(20, 5), (200, 2), (900, 1)])
-def test_an_adjustment_of_many_sightings_has_fewer_rounds(points, rounds, monkeypatch):
+def test_local_map_adjust_rounds_by_number_of_sightings(points, rounds, monkeypatch):
     """Each of three key frames sees all points. 1,500 sightings are adjusted once, and no adjustment has more than five rounds."""
     asked = []
     monkeypatch.setattr(live_odometry, "adjusted", lambda bundle, fixed, rounds: asked.append(rounds) or bundle)

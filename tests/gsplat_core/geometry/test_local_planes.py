@@ -14,7 +14,7 @@ def summed(x, y, values, weight) -> tuple[np.ndarray, ...]:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_plane_is_found_exactly(seed):
+def test_at_middles_of_plane_is_exact(seed):
     rng = np.random.default_rng(seed)
     x, y, weight = rng.uniform(-3, 5, (3, 20))
     a, b, c = rng.normal(size=3)
@@ -22,13 +22,13 @@ def test_a_plane_is_found_exactly(seed):
     assert found == pytest.approx(a + 0.7 * b - 1.2 * c, abs=1e-6)
 
 
-def test_what_speaks_for_no_slope_makes_it_the_mean():
+def test_at_middles_with_large_damping_is_mean():
     x = np.arange(5.0)
     sums = summed(x, np.zeros(5), 2 * x, np.ones(5))
     assert at_middles(sums, np.array(4.0), np.array(0.0), 1e9) == pytest.approx(4.0, abs=1e-6)
     assert at_middles(sums, np.array(4.0), np.array(0.0), 1e-9) == pytest.approx(8.0, abs=1e-6)
 
 
-def test_where_nothing_is_known_the_value_is_finite():
+def test_at_middles_without_data_is_finite():
     nothing = tuple(np.zeros((2, 2)) for _ in range(9))
     assert np.isfinite(at_middles(nothing, np.ones((2, 2)), np.ones((2, 2)), 0.01)).all()

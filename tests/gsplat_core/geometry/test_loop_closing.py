@@ -70,9 +70,7 @@ def turned(angle: float) -> torch.Tensor:
 
 
 @pytest.mark.parametrize(("off_px", "is_corrected"), [(0.8, False), (1.25, True)])
-def test_drift_is_corrected_where_the_known_points_are_seen_elsewhere(
-    odometry: LiveOdometry, off_px: float, is_corrected: bool
-) -> None:
+def test_close_loop_corrects_drift_beyond_threshold(odometry: LiveOdometry, off_px: float, is_corrected: bool) -> None:
     """A turn by one pixel at the focal length moves points by about one pixel."""
     odometry._pose = before = turned(off_px * CORRECTED_PX / 200)
     odometry._close_loop(PICTURE)
@@ -89,7 +87,7 @@ def test_drift_is_corrected_where_the_known_points_are_seen_elsewhere(
     torch.testing.assert_close(motion, inverse(TURN) @ half)
 
 
-def test_a_picture_without_an_earlier_place_changes_nothing(
+def test_close_loop_without_recognised_place_changes_nothing(
     odometry: LiveOdometry, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked = []
@@ -107,7 +105,7 @@ def test_a_picture_without_an_earlier_place_changes_nothing(
 
 
 @pytest.mark.parametrize("close", [True, False])
-def test_a_map_that_was_left_is_continued_and_the_present_one_kept(
+def test_relocalise_continues_left_map_and_keeps_present_map(
     odometry: LiveOdometry, monkeypatch: pytest.MonkeyPatch, close: bool
 ) -> None:
     found, present = odometry.found, odometry.map
@@ -138,7 +136,7 @@ def test_a_map_that_was_left_is_continued_and_the_present_one_kept(
     assert present.corrections == []
 
 
-def test_a_lost_picture_that_shows_no_kept_place_stays_lost(
+def test_relocalise_without_recognised_place_stays_lost(
     odometry: LiveOdometry, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     odometry.map.keys = []

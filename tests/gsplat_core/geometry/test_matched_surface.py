@@ -42,7 +42,7 @@ def slopes(values: np.ndarray) -> float:
     return rms(np.gradient(values, axis=0)) + rms(np.gradient(values, axis=1))
 
 
-def test_noise_goes_and_the_plane_stays():
+def test_smooth_disparity_removes_noise_of_plane():
     found = smooth_disparity(plane() + noise(), EVERYWHERE, VARIANCE) - plane()
     assert rms(found) < 0.5 * NOISE_PX
     assert slopes(found) < 0.25 * slopes(noise())
@@ -50,7 +50,7 @@ def test_noise_goes_and_the_plane_stays():
     assert np.abs(exact - plane()).max() < NOISE_PX
 
 
-def test_an_edge_of_depth_stays_sharp():
+def test_smooth_disparity_keeps_depth_edge():
     """A fold before a wall, two pixels nearer: far more than noise, so that nothing between them is made up."""
     true = plane(0.5)
     true[:, 80:] += 2
@@ -59,7 +59,7 @@ def test_an_edge_of_depth_stays_sharp():
     assert rms((found - true)[:, :60]) < 0.5 * NOISE_PX
 
 
-def test_what_is_sure_decides_where_neighbours_are_not():
+def test_smooth_disparity_weights_by_variance():
     wrong = plane()
     wrong[::3] += 1.5
     variance = VARIANCE.copy()
@@ -68,7 +68,7 @@ def test_what_is_sure_decides_where_neighbours_are_not():
     assert rms(found - plane()) < 0.1
 
 
-def test_what_is_not_known_has_no_say():
+def test_smooth_disparity_ignores_unknown_pixels():
     known = EVERYWHERE.copy()
     known[40:70, 60:110] = False
     values = (plane() + noise()).astype(np.float32)
@@ -81,7 +81,7 @@ def test_what_is_not_known_has_no_say():
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 40), (40, 1), (7, 5), (33, 300)])
-def test_disparities_of_any_size_are_smoothed(size):
+def test_smooth_disparity_of_any_size(size):
     known = np.zeros(size, bool)
     known.flat[size[0] * size[1] // 2] = True
     found = smooth_disparity(np.full(size, 12.0, np.float32), known, np.full(size, 0.02, np.float32))
@@ -95,7 +95,7 @@ def frame(depth: np.ndarray, **fields: object) -> Frame:
     return Frame(seq=0, pts_ns=0, image=image, depth=depth, **{**origin, **fields})
 
 
-def test_depth_of_a_frame_becomes_the_surface_on_tissue_alone():
+def test_with_matched_surface_changes_depth_on_tissue_only():
     camera = Camera.from_focal(150.0, WIDTH, HEIGHT)
     reach = 150.0 * 4.0
     given = frame((reach / (plane() + noise())).astype(np.float32), right_camera=camera.right_eye(4.0))
@@ -112,7 +112,7 @@ def test_depth_of_a_frame_becomes_the_surface_on_tissue_alone():
     np.testing.assert_allclose(4 * relative.depth, found.depth, rtol=1e-5)
 
 
-def test_depth_that_was_not_matched_stays_as_it_is():
+def test_with_surface_keeps_unmatched_depth():
     camera = Camera.from_focal(150.0, WIDTH, HEIGHT)
     depth = (600 / plane()).astype(np.float32)
     measured = frame(depth, depth_origin=DEPTH_ORIGINS["measured"])
@@ -126,7 +126,7 @@ def test_depth_that_was_not_matched_stays_as_it_is():
         assert with_matched_surface(lacking, camera) is lacking
 
 
-def test_a_variance_is_what_its_confidence_says():
+def test_variance_px2_by_confidence_and_width():
     """1 / (1 + variance / 0.5²), in pixels of the pictures that were matched, here at half their size."""
     confidence = 1 / (1 + np.array([[0.01, 0.3]], np.float32) / 0.25)
     np.testing.assert_allclose(variance_px2(confidence, 640, 0.0), [[0.01, 0.3]], rtol=1e-4)

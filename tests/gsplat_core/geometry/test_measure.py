@@ -38,7 +38,7 @@ def on_slope(x: float, y: float, gradient: float, distance: float = 50.0) -> np.
 
 
 @pytest.mark.parametrize("gradient", [0.0, 0.4, -0.6])
-def test_points_distances_and_lengths_on_a_plane(gradient):
+def test_measurement_of_points_distances_and_lengths_on_plane(gradient):
     found = Measurement(slope(gradient), 0.5)
     first, second = found.point(10.2, 12.9), found.point(50.0, 30.0)
     exact = [on_slope(10.5, 12.5, gradient), on_slope(50.5, 30.5, gradient)]
@@ -52,7 +52,7 @@ def test_points_distances_and_lengths_on_a_plane(gradient):
     assert found.unit == "mm" and found.distance(first, first).value == 0
 
 
-def test_a_pose_moves_points_and_not_distances():
+def test_measurement_distances_are_independent_of_pose():
     model = slope(0.2)
     pose = np.array([[0.0, -1, 0, 3], [1, 0, 0, -2], [0, 0, 1, 7], [0, 0, 0, 1]])
     turned = torch.tensor(np.linalg.inv(pose), dtype=torch.float32)
@@ -71,7 +71,7 @@ def test_a_pose_moves_points_and_not_distances():
     assert np.allclose((pose @ place)[:3], here.point(20, 20).position, atol=1e-2)
 
 
-def test_relative_models_say_so_and_are_less_sure():
+def test_measurement_unit_and_error_by_depth_source():
     errors = []
     for source in (
         MEASURED,
@@ -85,7 +85,7 @@ def test_relative_models_say_so_and_are_less_sure():
     assert errors == sorted(errors) and errors[-1] > 0.2 * 50
 
 
-def test_what_was_never_observed_is_refused():
+def test_measurement_refuses_unobserved_pixels():
     model = slope(0.0)
     some = replace(model, gaussians=model.gaussians.select(model.gaussians.means[:, 0].abs() > 8))
     found = Measurement(some, 0.0)
@@ -101,14 +101,14 @@ def test_what_was_never_observed_is_refused():
         Measurement(model, 1.5)
 
 
-def test_two_surfaces_at_one_pixel_make_a_large_error():
+def test_measurement_error_is_large_for_two_surfaces_at_pixel():
     near, far = slope(0.0, 40.0), slope(0.0, 50.0)
     veil = replace(near.gaussians, logit_opacities=torch.full_like(near.gaussians.logit_opacities, -3.2))
     both = Measurement(replace(near, gaussians=veil.append(far.gaussians)), 0.0)
     assert both.point(32, 24).depth_error > 8 * Measurement(far, 0.0).point(32, 24).depth_error
 
 
-def test_error_bars_hold_on_a_trained_model():
+def test_measurement_errors_cover_true_errors_of_trained_model():
     """On a model trained on one frame with depth, most true errors are within two standard errors, and the error bars are not much wider."""
     recording = render_recording(RenderSettings(frames=1, width_px=96, height_px=80, fps=30, seed=5))
     frame = next(iter(recording))
@@ -135,7 +135,7 @@ def test_error_bars_hold_on_a_trained_model():
         (None, DEPTH_ORIGINS["measured"], False),
     ],
 )
-def test_a_model_is_metric_only_where_all_of_its_depth_is(first, second, wanted):
+def test_model_is_metric_only_if_all_depth_is_metric(first, second, wanted):
     learning = Reconstructor(ReconstructorConfig(gaussians=60, max_gaussians=80, first_frame_steps=1), CAMERA)
     for seq, origin in enumerate((first, second)):
         depth = None if origin is None else np.full((48, 64), 50.0, np.float32)
@@ -163,14 +163,14 @@ def surface_point(position, depth, depth_error, along_ray) -> SurfacePoint:
         (surface_point((5.0, 0.0, 10.0), 20.0, 0.2, (0.5, 0.0, 1.0)), math.hypot(0.1, 0.02 * 5)),
     ],
 )
-def test_the_error_of_a_distance_is_that_of_its_ends_along_the_line(second, error):
+def test_distance_error_combines_end_errors_along_line(second, error):
     first = surface_point((0.0, 0.0, 10.0), 10.0, 0.3, (0.0, 0.0, 1.0))
     found = Measurement(slope(0.0), 0.0)
     assert found.distance(first, second).error == pytest.approx(math.sqrt(0.5) * error, rel=1e-9)
     assert found.distance(second, first).error == pytest.approx(math.sqrt(0.5) * error, rel=1e-9)
 
 
-def test_the_error_of_a_point_contains_that_of_the_depth_source():
+def test_point_error_includes_depth_source_error():
     """The published errors are 0.5 % of depth for measured depth, 1.25 % stereo, 5 % parallax, 15 % light, 20 % learned, 30 % unknown."""
     published = {"measured": 0.005, "stereo": 0.0125, "parallax": 0.05, "light": 0.15, "learned": 0.2, None: 0.3}
     points = {
@@ -187,7 +187,7 @@ def test_the_error_of_a_point_contains_that_of_the_depth_source():
     assert 0 <= without["measured"] < (0.01 * 50) ** 2
 
 
-def test_measured_errors_of_depth_replace_the_assumed_one():
+def test_depth_source_errors_replace_assumed_error():
     source = replace(MEASURED, errors=(DepthError(0.2, 0.02), DepthError(0.6, 0.04)))
     model, plain = slope(0.0, source=source), Measurement(slope(0.0), 0.0).point(20, 30)
     own = plain.depth_error**2 - plain.source_error**2
@@ -197,7 +197,7 @@ def test_measured_errors_of_depth_replace_the_assumed_one():
         assert point.depth_error == pytest.approx(math.sqrt(own + point.source_error**2))
 
 
-def test_a_point_belongs_to_the_middle_of_its_pixel():
+def test_measured_point_is_at_pixel_centre():
     point = Measurement(slope(0.0), 0.0).point(10.9, 30.1)
     assert point.pixel == (10.5, 30.5)
     np.testing.assert_allclose(point.along_ray, [(10.5 - 32) / 60, (30.5 - 24) / 60, 1.0], atol=1e-9)
@@ -205,7 +205,7 @@ def test_a_point_belongs_to_the_middle_of_its_pixel():
     assert point.position_error == pytest.approx(point.depth_error * math.dist(point.along_ray, (0, 0, 0)))
 
 
-def test_the_length_of_a_bent_path_and_its_error():
+def test_length_along_bent_path_and_error():
     """Two planes that meet in a valley: the path is longer than the straight distance, and smooth sides add no error."""
     left, right = slope(0.5).gaussians, slope(-0.5).gaussians
     model = slope(0.0)
@@ -220,7 +220,7 @@ def test_the_length_of_a_bent_path_and_its_error():
     assert straight.error <= along.error < straight.error + 0.02 * wanted
 
 
-def test_depth_errors_of_splats_do_not_lengthen_a_path():
+def test_length_along_is_not_increased_by_depth_jitter():
     model = slope(0.2)
     jitter = 1.5 * torch.randn(len(model.gaussians.means), generator=torch.Generator().manual_seed(1))
     means = model.gaussians.means + torch.stack([0 * jitter, 0 * jitter, jitter], 1)

@@ -31,7 +31,7 @@ def measurement(depth: Any = 50.0, median: Any = 50.0, pose: np.ndarray | None =
     ("x", "y", "is_inside"),
     [(0, 0, True), (39.99, 29.99, True), (-0.01, 5, False), (5, -0.01, False), (40, 5, False), (5, 30, False)],
 )
-def test_points_are_those_of_pixels_in_the_picture(x: float, y: float, is_inside: bool) -> None:
+def test_point_refuses_positions_outside_picture(x: float, y: float, is_inside: bool) -> None:
     if not is_inside:
         with pytest.raises(InvalidSetting, match="outside of the picture of 40x30 px"):
             measurement().point(x, y)
@@ -45,7 +45,7 @@ def test_points_are_those_of_pixels_in_the_picture(x: float, y: float, is_inside
     ("changed", "is_observed"),
     [({"alpha": measure.COVERED}, True), ({"alpha": measure.COVERED - 1e-6}, False), ({"depth": 0.0}, False), ({"depth": -1.0}, False)],
 )  # fmt: skip
-def test_points_must_have_been_observed(changed: dict[str, float], is_observed: bool) -> None:
+def test_point_refuses_unobserved_pixel(changed: dict[str, float], is_observed: bool) -> None:
     if is_observed:
         assert measurement(**changed).point(5, 5).depth == 50
     else:
@@ -54,14 +54,14 @@ def test_points_must_have_been_observed(changed: dict[str, float], is_observed: 
 
 
 @pytest.mark.parametrize(("median", "split"), [(50.0, 0.0), (47.0, 3.0), (54.0, 4.0), (0.0, 7.0)])
-def test_the_error_of_a_depth_is_that_of_its_source_and_of_several_surfaces(median: float, split: float) -> None:
+def test_depth_error_combines_source_and_surface_split(median: float, split: float) -> None:
     """A pixel without a median depth has the spread of its depths."""
     point = measurement(median=median).point(5, 5)
     assert point.source_error == pytest.approx(1.0) and point.depth_error == pytest.approx(math.hypot(split, 1.0))
     assert (point.opacity, point.confidence) == (1.0, 0.8)
 
 
-def test_points_and_their_rays_are_in_the_world() -> None:
+def test_point_position_and_ray_are_in_world_coordinates() -> None:
     pose = np.array([[0.0, -1, 0, 3], [1, 0, 0, -2], [0, 0, 1, 7], [0, 0, 0, 1]])
     point = measurement(pose=pose).point(30, 15)
     local = pose[:3, :3] @ np.array(point.position) + pose[:3, 3]
@@ -69,7 +69,7 @@ def test_points_and_their_rays_are_in_the_world() -> None:
     np.testing.assert_allclose(pose[:3, :3] @ np.array(point.along_ray), [10.5 / 50, 0.5 / 50, 1])
 
 
-def test_the_error_of_a_distance_has_a_common_part_and_those_of_both_ends() -> None:
+def test_distance_error_has_common_and_end_parts() -> None:
     """Half of the variance of the source is common to the scene and grows with the distance; the rest is of each end."""
     made = measurement(median=np.where(np.arange(WIDTH) < 20, 50, 53))
     first, second = made.point(5, 15), made.point(35, 15)
@@ -83,12 +83,12 @@ def test_the_error_of_a_distance_has_a_common_part_and_those_of_both_ends() -> N
 
 
 @pytest.mark.parametrize(("apart_px", "steps"), [(0, 1), (1, 1), (2, 1), (3, 2), (10, 5), (25, 12)])
-def test_a_path_has_a_step_every_two_pixels(apart_px: int, steps: int) -> None:
+def test_path_steps_are_two_pixels(apart_px: int, steps: int) -> None:
     made = measurement()
     assert made._steps(made.point(3, 5), made.point(3 + apart_px, 5)) == steps
 
 
-def test_a_length_along_a_plane_is_the_distance_and_that_of_one_point_is_0() -> None:
+def test_length_along_plane_equals_distance() -> None:
     x = np.arange(WIDTH) + 0.5
     made = measurement(depth=1 / (1 / 50 + 2e-4 * (x - 20)))
     first, second = made.point(5, 5), made.point(35, 25)
@@ -98,7 +98,7 @@ def test_a_length_along_a_plane_is_the_distance_and_that_of_one_point_is_0() -> 
     assert made.length_along(first, first).value == 0
 
 
-def test_an_error_of_a_length_grows_with_its_detour_and_with_what_smoothing_took() -> None:
+def test_length_error_grows_with_detour_and_smoothing() -> None:
     x = np.arange(WIDTH) + 0.5
     hill = measurement(depth=50 - 15 * np.exp(-(((x - 20) / 6) ** 2)))
     hill._splat_px = 0.1  # no smoothing
@@ -118,7 +118,7 @@ def test_an_error_of_a_length_grows_with_its_detour_and_with_what_smoothing_took
 
 
 @pytest.mark.parametrize("sigma", [0.1, 1.0, 4.0, 50.0])
-def test_smoothing_keeps_slopes_and_ends(sigma: float) -> None:
+def test_smoothed_line_keeps_slope_and_ends(sigma: float) -> None:
     line = 3 + 0.5 * np.arange(20.0)
     np.testing.assert_allclose(measure._smoothed(line, sigma), line)
     bent = line + np.random.default_rng(0).normal(size=20)
@@ -128,7 +128,7 @@ def test_smoothing_keeps_slopes_and_ends(sigma: float) -> None:
     assert measure._smoothed(bent[:1], sigma).tolist() == bent[:1].tolist()
 
 
-def test_smoothing_is_by_a_gaussian_of_three_standard_deviations() -> None:
+def test_smoothed_kernel_is_gaussian_of_three_standard_deviations() -> None:
     one = np.zeros(41)
     one[20] = 1
     found = measure._smoothed(one, 2.0)

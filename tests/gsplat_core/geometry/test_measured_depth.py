@@ -35,13 +35,13 @@ def one_by_one(depth: np.ndarray) -> np.ndarray:
     return believed
 
 
-def test_a_smooth_surface_and_both_sides_of_a_clean_edge_are_believed():
+def test_measured_confidence_accepts_smooth_surface_and_clean_edge():
     depth = slope()
     depth[:, 20:] *= 2.5
     assert measured_confidence(depth).all()
 
 
-def test_what_lies_between_two_sides_is_not():
+def test_measured_confidence_rejects_values_between_edge_sides():
     depth = slope()
     depth[:, 21:] *= 2.5
     depth[:, 20] = 80.0
@@ -51,7 +51,7 @@ def test_what_lies_between_two_sides_is_not():
 
 
 @pytest.mark.parametrize("border", [np.s_[:, -1], np.s_[0, :]])
-def test_a_border_of_something_else_is_not(border):
+def test_measured_confidence_rejects_deviating_border(border):
     depth = slope()
     depth[border] = 229.0
     believed = measured_confidence(depth)
@@ -59,7 +59,7 @@ def test_a_border_of_something_else_is_not(border):
     assert believed.sum() == believed.size - believed[border].size
 
 
-def test_blends_with_what_is_unknown_and_noise_about_zero_are_not():
+def test_measured_confidence_rejects_blends_and_noise_near_zero():
     depth = slope()
     depth[:, :10] = 0
     depth[10:20, :8] = 2.0  # a patch that agrees with itself
@@ -69,14 +69,14 @@ def test_blends_with_what_is_unknown_and_noise_about_zero_are_not():
     assert believed[:, 11:].all()
 
 
-def test_single_points_of_a_sparse_sensor_are_believed():
+def test_measured_confidence_accepts_sparse_points():
     depth = np.zeros((ROWS, COLUMNS), np.float32)
     depth[1::4, 1::4] = 60.0
     assert np.array_equal(measured_confidence(depth) > 0, depth > 0)
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 7), (5, 1), (2, 2), (23, 31)])
-def test_any_shape_and_any_value_as_pixel_by_pixel(shape):
+def test_measured_confidence_equals_per_pixel_reference(shape):
     random = np.random.default_rng(0)
     depth = np.exp(random.normal(4, 0.08, shape)).astype(np.float32)
     depth[random.random(shape) < 0.15] = 0
@@ -85,12 +85,12 @@ def test_any_shape_and_any_value_as_pixel_by_pixel(shape):
     assert np.array_equal(measured_confidence(depth), one_by_one(depth))
 
 
-def test_nothing_known_is_nothing_believed():
+def test_measured_confidence_is_zero_without_known_depth():
     for value in (0, np.nan, -1):
         assert not measured_confidence(np.full((9, 9), value, np.float32)).any()
 
 
-def test_recorded_depth_keeps_its_values_and_says_which_it_doubts():
+def test_depth_finder_adds_confidence_to_recorded_depth():
     depth = slope()
     depth[:, -1] = 229.0
     frame = Frame(0, 0, np.zeros((ROWS, COLUMNS, 3), np.uint8), depth=depth, depth_origin=DEPTH_ORIGINS["measured"])
@@ -110,7 +110,7 @@ def square(margin_px: int) -> np.ndarray:
     return inside
 
 
-def test_start_values_keep_half_of_the_margin_of_depth_that_is_trained_on() -> None:
+def test_possible_depth_has_half_margin_of_believed_depth() -> None:
     """Stereo has margins of 2 px around unknown pixels and 4 px around tools."""
     depth, mask = slope(), np.ones((ROWS, COLUMNS), np.uint8)
     mask[:, 45:] = 0
@@ -128,14 +128,14 @@ def test_start_values_keep_half_of_the_margin_of_depth_that_is_trained_on() -> N
     assert np.array_equal(possible_depth(frame), np.where(known, depth, 0))
 
 
-def test_depth_without_a_confidence_is_believed_and_no_depth_is_unknown() -> None:
+def test_believed_depth_without_confidence_or_depth() -> None:
     frame = Frame(0, 0, np.zeros((ROWS, COLUMNS, 3), np.uint8), depth=slope(), depth_origin=DEPTH_ORIGINS["parallax"])
     assert np.array_equal(possible_depth(frame), slope()) and np.array_equal(believed_depth(frame), slope())
     frame = frame.with_fields(depth=None, depth_origin=None)
     assert not possible_depth(frame).any() and not believed_depth(frame).any()
 
 
-def test_a_median_is_that_of_samples_or_of_all_values_if_no_sample_is_known():
+def test_median_of_samples_or_all_values():
     depth = np.zeros((3 * STRIDE, 5 * STRIDE), np.float32)
     assert _median(depth) == 0
     depth[0, :3] = 3, 4, 9

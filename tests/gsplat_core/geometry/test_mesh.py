@@ -20,7 +20,7 @@ def picture(camera: Camera = CAMERA) -> np.ndarray:
     )
 
 
-def test_a_whole_map_is_two_triangles_a_square_facing_the_camera():
+def test_mesh_of_depth_has_two_camera_facing_triangles_per_square():
     mesh = mesh_of_depth(np.full((14, 20), 40.0, np.float32), picture(), CAMERA)
     assert len(mesh.vertices) == 280 and len(mesh.triangles) == 2 * 13 * 19
     assert np.allclose(mesh.normals, [0, 0, -1]) and np.allclose(mesh.vertices[:, 2], 40)
@@ -31,7 +31,7 @@ def test_a_whole_map_is_two_triangles_a_square_facing_the_camera():
     assert area == pytest.approx(13 * 19 * (40 / 50) ** 2, rel=1e-5), "every square once"
 
 
-def test_surfaces_one_behind_the_other_are_cut_and_holes_stay_holes():
+def test_mesh_of_depth_cuts_at_depth_steps_and_holes():
     depth = np.full((14, 20), 40.0, np.float32)
     depth[:, 10:] = 30.0
     depth[5, 4] = 0.0
@@ -42,7 +42,7 @@ def test_surfaces_one_behind_the_other_are_cut_and_holes_stay_holes():
     assert len(mesh.triangles) == 2 * 13 * 18 - 4 and len(mesh.vertices) == 279
 
 
-def test_a_pose_turns_positions_and_normals():
+def test_mesh_of_depth_applies_camera_pose():
     pose = np.array([[0.0, -1, 0, 3], [1, 0, 0, -2], [0, 0, 1, 7], [0, 0, 0, 1]])
     depth = np.linspace(30, 36, 280, dtype=np.float32).reshape(14, 20)
     here, there = (mesh_of_depth(depth, picture(), camera) for camera in (CAMERA, CAMERA.with_pose(pose)))
@@ -51,7 +51,7 @@ def test_a_pose_turns_positions_and_normals():
     assert np.array_equal(here.triangles, there.triangles)
 
 
-def test_nothing_to_join_is_refused():
+def test_mesh_of_depth_without_surface_is_refused():
     for depth in (np.zeros((14, 20), np.float32), np.full((14, 20), np.nan, np.float32)):
         with pytest.raises(ExportError, match="no surface"):
             mesh_of_depth(depth, picture(), CAMERA)
@@ -60,13 +60,13 @@ def test_nothing_to_join_is_refused():
         mesh_of_depth(checker, picture(), CAMERA)
 
 
-def test_normals_of_vertices_are_weighted_by_area():
+def test_vertex_normals_are_weighted_by_area():
     vertices = np.array([[0, 0, 0], [3, 0, 0], [0, 3, 0], [0, 0, 1], [9, 9, 9]], float)
     normals = vertex_normals(vertices, np.array([[0, 1, 2], [0, 2, 3]]))
     assert np.allclose(normals[0], np.array([3, 0, 9]) / np.hypot(3, 9)) and not normals[4].any()
 
 
-def test_the_mesh_of_a_model_lies_on_the_tissue():
+def test_mesh_of_model_lies_on_tissue():
     recording = render_recording(RenderSettings(frames=1, width_px=96, height_px=80, seed=4))
     frame = next(iter(recording))
     frame = frame.with_fields(mask=np.ones_like(frame.mask))

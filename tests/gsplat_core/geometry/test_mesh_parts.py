@@ -33,7 +33,7 @@ def project(points: np.ndarray, of: Camera) -> np.ndarray:
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_points_on_the_ray_of_a_pixel_are_seen_at_it(model: str) -> None:
+def test_rays_of_pixels_reproject_to_pixels(model: str) -> None:
     pixels = np.concatenate([np.random.default_rng(0).uniform([0, 0], [40, 30], (50, 2)), [[20.0, 15.0]]])
     start, step = rays_of(camera(model), pixels)
     assert (start[:, 2] == 0).all() and (step[:, 2] == 1).all()
@@ -41,14 +41,14 @@ def test_points_on_the_ray_of_a_pixel_are_seen_at_it(model: str) -> None:
         np.testing.assert_allclose(project(start + z * step, camera(model)), pixels, atol=1e-8)
 
 
-def test_rays_of_a_fisheye_end_before_90_degrees() -> None:
+def test_fisheye_rays_are_limited_below_90_degrees() -> None:
     wide = Camera(np.array([[10.0, 0, 20], [0, 10, 15], [0, 0, 1]]), 40, 30, model="fisheye")
     _, step = rays_of(wide, np.array([[20 + 10 * np.pi, 15.0]]))
     assert np.isfinite(step).all() and 10 < step[0, 0] < 1e6
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_points_of_a_map_are_at_the_centres_of_pixels(model: str) -> None:
+def test_points_of_depth_map_project_to_pixel_centres(model: str) -> None:
     depth = np.random.default_rng(0).uniform(40, 60, (30, 40))
     points = points_of(depth, camera(model))
     np.testing.assert_allclose(points[..., 2], depth)
@@ -56,14 +56,14 @@ def test_points_of_a_map_are_at_the_centres_of_pixels(model: str) -> None:
     np.testing.assert_allclose(project(points, camera(model)), np.stack([x, y], -1), atol=1e-8)
 
 
-def test_depth_is_known_where_it_is_positive_and_finite() -> None:
+def test_known_requires_positive_finite_depth() -> None:
     assert known(np.array([[1.0, 0.0, -1.0, np.nan, np.inf]])).tolist() == [[True, False, False, False, False]]
 
 
 @pytest.mark.parametrize("model", ["pinhole", "ortho"])
 @pytest.mark.parametrize("axis", [0, 1])
 @pytest.mark.parametrize(("share", "is_joined"), [(0.98, True), (1.02, False), (-0.98, True), (-1.02, False)])
-def test_neighbours_are_joined_up_to_a_tilt(model: str, axis: int, share: float, is_joined: bool) -> None:
+def test_joined_neighbours_up_to_tilt_limit(model: str, axis: int, share: float, is_joined: bool) -> None:
     """A pixel is as wide as the mean depth of both over the focal length of that axis, or as the inverse scale."""
     of = camera(model)
     slope = share * np.tan(np.radians(TORN_DEGREES)) / of.K[1 - axis, 1 - axis]
@@ -84,7 +84,7 @@ def test_neighbours_are_joined_up_to_a_tilt(model: str, axis: int, share: float,
 
 @pytest.mark.parametrize("model", MODELS)
 @pytest.mark.parametrize("tilt", [(0.0, 0.0), (0.5, 0.0), (0.0, -0.4), (0.3, 0.6)])
-def test_normals_of_a_plane_face_the_camera(model: str, tilt: tuple[float, float]) -> None:
+def test_normals_of_plane_face_camera(model: str, tilt: tuple[float, float]) -> None:
     """The plane n · p = d. Its normal points back."""
     of, normal = camera(model), np.array([tilt[0], tilt[1], -1.0])
     y, x = np.mgrid[:30, :40] + 0.5
@@ -95,7 +95,7 @@ def test_normals_of_a_plane_face_the_camera(model: str, tilt: tuple[float, float
     assert np.abs(found[5:-5, 5:-5] - normal / np.linalg.norm(normal)).max() < 2e-3
 
 
-def test_a_pixel_without_a_neighbour_in_both_directions_has_no_normal() -> None:
+def test_normals_require_neighbour_in_both_directions() -> None:
     depth = np.zeros((30, 40))
     depth[2, 1:4], depth[4, 4] = 50, 50
     assert not normals_of(depth, camera("pinhole")).any()
@@ -105,7 +105,7 @@ def test_a_pixel_without_a_neighbour_in_both_directions_has_no_normal() -> None:
 
 
 @pytest.mark.parametrize("sides", list(itertools.product([False, True], repeat=4)))
-def test_a_square_is_split_where_its_sides_are_connected(sides: tuple[bool, ...]) -> None:
+def test_triangles_of_square_by_connected_sides(sides: tuple[bool, ...]) -> None:
     """Two connected sides that share a corner span a triangle; four span two. All are seen counter-clockwise."""
     top, bottom, left, right = sides
     found = mesh._triangles(np.array([[top], [bottom]]), np.array([[left, right]]))
@@ -123,7 +123,7 @@ def test_a_square_is_split_where_its_sides_are_connected(sides: tuple[bool, ...]
         assert set().union(*corners) == {0, 1, 2, 3}
 
 
-def test_vertices_without_triangles_and_triangles_without_an_area_have_no_normal() -> None:
+def test_vertex_normals_ignore_degenerate_triangles() -> None:
     vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [5, 5, 5], [2, 0, 0]])
     found = vertex_normals(vertices, np.array([[0, 1, 2], [0, 1, 4]]))
     np.testing.assert_allclose(found[:3], [[0, 0, 1]] * 3)

@@ -22,14 +22,14 @@ def breathing(length_s=9.0, rate_hz=4.0, noise_px=0.0):
     return bundle_of(sightings, waves(sightings.times_s, (BREATHING_HZ, HEART_HZ))), sightings.times_s
 
 
-def test_exact_sightings_are_explained_to_a_tenth_of_a_pixel():
+def test_moving_bundle_adjust_explains_exact_sightings():
     bundle, _ = breathing()
     before = float(bundle.off().norm(dim=1).median())
     found, _ = adjust(bundle, 0.004, 12)
     assert float(found.off().norm(dim=1).median()) < min(0.1 / 280, 0.1 * before)
 
 
-def test_without_waves_it_is_the_bundle_of_tissue_at_rest():
+def test_moving_bundle_without_waves_equals_static_bundle():
     """Scales of the losses far above the errors, because the losses differ."""
     sightings, _ = seen_for(5.0, breathes=0.0, rate_hz=4.0)
     start = bundle_of(sightings, waves(sightings.times_s, ()))
@@ -44,7 +44,7 @@ def test_without_waves_it_is_the_bundle_of_tissue_at_rest():
 
 
 @pytest.mark.parametrize("with_prior", [False, True])
-def test_a_step_that_nothing_holds_back_goes_down_the_slope(with_prior):
+def test_moving_bundle_step_decreases_cost(with_prior):
     """Far from the optimum, along the step the cost falls as fast as its slope says: numerically, for cameras, places and swings together."""
     bundle, times_s = breathing(5.0, noise_px=0.5)
     way = learned_from(bundle.poses, times_s, bundle.waves) if with_prior else None
@@ -57,21 +57,21 @@ def test_a_step_that_nothing_holds_back_goes_down_the_slope(with_prior):
     assert end - again < 0.05 * (begin - end)
 
 
-def test_no_step_makes_it_worse():
+def test_moving_bundle_adjust_never_increases_cost():
     bundle, times_s = breathing(5.0, noise_px=1.0)
     way = learned_from(bundle.poses, times_s, bundle.waves)
     costs = [adjust(bundle, 0.004, rounds, way)[1] for rounds in range(5)]
     assert all(after <= before for before, after in pairwise(costs)) and costs[-1] < costs[0]
 
 
-def test_the_first_camera_stays():
+def test_moving_bundle_keeps_first_camera():
     bundle, _ = breathing(5.0)
     found, _ = adjust(bundle, 0.004, 3)
     turn = found.poses[0, :3, :3]
     torch.testing.assert_close(turn, bundle.poses[0, :3, :3])
 
 
-def test_more_waves_start_at_nothing_and_leave_the_others():
+def test_with_waves_adds_zero_amplitudes():
     bundle, times_s = breathing(5.0)
     none = replace(bundle, amplitudes=bundle.amplitudes[:, :, :0])
     one, _ = adjust(with_waves(none, waves(times_s, (BREATHING_HZ,))), 0.004, 1)
@@ -80,7 +80,7 @@ def test_more_waves_start_at_nothing_and_leave_the_others():
     assert not both.amplitudes[:, :, 2:].any()
 
 
-def test_the_cost_is_the_negative_logarithm_of_the_likelihood_and_the_priors():
+def test_moving_bundle_cost_equals_negative_log_likelihood_and_priors():
     """Relief has a standard deviation of 0.3 of the median depth, motion that of its field, a ray 0.002 with the loss of Geman and McClure."""
     bundle, _ = breathing(5.0)
     generator = torch.Generator().manual_seed(0)
@@ -107,7 +107,7 @@ def warped(times_s: torch.Tensor, most: float = 0.4) -> Rhythm:
     return replace(rhythm, phases=rhythm.phases + torch.stack([late, 0 * late], 1))
 
 
-def test_phases_are_estimated_with_everything_else():
+def test_moving_bundle_estimates_phases():
     """From phases of a constant rate that are off by up to 0.4 rad."""
     bundle, times_s = breathing(noise_px=0.2)
     way = learned_from(bundle.poses, times_s, bundle.waves)
@@ -118,7 +118,7 @@ def test_phases_are_estimated_with_everything_else():
     torch.testing.assert_close(found.waves, found.rhythm.waves)
 
 
-def test_a_step_with_phases_goes_down_the_slope():
+def test_moving_bundle_step_with_phases_decreases_cost():
     bundle, times_s = breathing(5.0, noise_px=0.5)
     way = learned_from(bundle.poses, times_s, bundle.waves)
     start = with_rhythm(adjust(bundle, 1.0, 8, way)[0], warped(times_s, 0.05))
@@ -127,7 +127,7 @@ def test_a_step_with_phases_goes_down_the_slope():
     assert end < begin and end - again < 0.1 * (begin - end)
 
 
-def test_the_cost_of_phases_is_that_of_a_random_walk():
+def test_rhythm_cost_is_that_of_random_walk():
     """Breathing deviates from its rate by half, for a sixth of a breath; the phase by 1 rad, in the mean by 0.05 rad."""
     times_s = torch.tensor([0.0, 0.3, 0.5, 1.1], dtype=torch.float64)
     steady = Rhythm.steady(times_s, (0.4,))
@@ -138,7 +138,7 @@ def test_the_cost_of_phases_is_that_of_a_random_walk():
     assert steady.moved(change[:, None]).cost() == pytest.approx(float(expected), rel=1e-9)
 
 
-def test_tissue_that_a_tool_pulls_has_little_influence_on_the_cameras():
+def test_moving_bundle_is_robust_to_pulled_tissue():
     """A third of the points moves by seven times the scale in the same direction, in the middle third of the time."""
     sightings, _ = seen_for(5.0, breathes=0.0, rate_hz=4.0, noise_px=0.0)
     start = bundle_of(sightings, waves(sightings.times_s, ()))

@@ -8,7 +8,7 @@ import torch
 from gsplat_core.geometry.registration import NEIGHBOURS, nearest_others
 
 
-def test_they_are_those_of_all_distances():
+def test_nearest_others_equals_brute_force():
     points = torch.randn(500, 3, generator=torch.Generator().manual_seed(0)) + 1000.0
     found = nearest_others(points)
     apart = torch.cdist(points.double() - 1000, points.double() - 1000).fill_diagonal_(torch.inf)
@@ -18,20 +18,20 @@ def test_they_are_those_of_all_distances():
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 5])
-def test_few_points_have_few_neighbours(count):
+def test_nearest_others_of_few_points(count):
     found = nearest_others(torch.randn(count, 3))
     assert found.dtype == torch.int64 and tuple(found.shape) == (count, min(NEIGHBOURS, max(count - 1, 0)))
     for row, others in enumerate(found.tolist()):
         assert sorted([row, *others]) == list(range(count))
 
 
-def test_nobody_is_his_own_neighbour_where_all_are_at_one_place():
+def test_nearest_others_of_coincident_points_exclude_self():
     found = nearest_others(torch.ones(40, 3))
     assert not (found == torch.arange(40)[:, None]).any()
     assert all(len(set(others)) == NEIGHBOURS for others in found.tolist())
 
 
-def test_what_is_not_finite_is_alone():
+def test_nearest_others_isolate_non_finite_points():
     points = torch.randn(30, 3, generator=torch.Generator().manual_seed(2))
     points[3, 1], points[7, 0] = torch.nan, torch.inf
     found = nearest_others(points)

@@ -43,14 +43,14 @@ def off_share(found: Trajectory, frames: list[Frame]) -> float:
     return errors.similarity_share
 
 
-def test_the_way_of_a_moving_scope_is_found(rigid, found):
+def test_trajectory_of_moving_scope_is_accurate(rigid, found):
     assert off_share(found, list(rigid)) < 0.03
     assert found.error_px < 0.4 < found.still_error_px and found.explained > 0.9
     assert found.lost == () and found.path > 1
     assert np.array_equal(found.poses[0], np.eye(4))
 
 
-def test_the_error_of_a_static_scope_is_the_spread_of_the_tracks(rigid, found):
+def test_still_error_px_is_spread_of_tracks(rigid, found):
     """In pixels, from the tracked points themselves; by the scope's motion it is many times the reprojection error."""
     tracks = ReferenceTracks()
     for frame in rigid:
@@ -62,11 +62,11 @@ def test_the_error_of_a_static_scope_is_the_spread_of_the_tracks(rigid, found):
     assert found.explained == pytest.approx(1 - (found.error_px / found.still_error_px) ** 2)
 
 
-def test_the_first_frames_tissue_is_at_the_stated_distance(found):
+def test_trajectory_scale_is_relative_distance_of_first_frame(found):
     assert np.median(found.points[:, 2]) == pytest.approx(RELATIVE_DISTANCE, rel=0.1)
 
 
-def test_depth_of_the_points_follows_the_true_depth(rigid, found):
+def test_trajectory_points_correlate_with_true_depth(rigid, found):
     first = next(iter(rigid))
     K = rigid.camera.K
     pixels = found.points[:, :2] / found.points[:, 2:] * K[0, 0] + K[:2, 2]
@@ -76,12 +76,12 @@ def test_depth_of_the_points_follows_the_true_depth(rigid, found):
     assert np.corrcoef(true, ours)[0, 1] > 0.8
 
 
-def test_the_same_frames_give_the_same_bytes(rigid, found):
+def test_trajectory_is_deterministic(rigid, found):
     again = trajectory_of(rigid, rigid.camera)
     assert again.poses.tobytes() == found.poses.tobytes() and again.points.tobytes() == found.points.tobytes()
 
 
-def test_a_frame_that_shows_nothing_is_said(rigid):
+def test_trajectory_lists_blank_frame_as_lost(rigid):
     frames = list(rigid)
     blank = np.full_like(frames[6].image, 90)
     frames[6] = frames[6].with_fields(image=blank)
@@ -94,7 +94,7 @@ def test_a_frame_that_shows_nothing_is_said(rigid):
 
 
 @pytest.mark.parametrize("left", [0, 1, 3])
-def test_the_way_goes_on_where_hardly_a_point_is_left(left, monkeypatch):
+def test_trajectory_continues_after_loss_of_points(left, monkeypatch):
     """From frame 6 on other points are seen, and only `left` of the first ones, too few for a pose."""
     K = np.array([[200.0, 0, 128], [0, 200, 96], [0, 0, 1]])
     points = np.random.default_rng(0).uniform([-0.7, -0.5, 0.8], [0.7, 0.5, 1.2], (120, 3))
@@ -116,7 +116,7 @@ def test_the_way_goes_on_where_hardly_a_point_is_left(left, monkeypatch):
         np.testing.assert_allclose(step / true, np.full(len(true), step[0] / true[0]), rtol=0.02)
 
 
-def test_a_point_of_four_frames_may_be_hidden_in_one(rigid):
+def test_trajectory_of_four_frames_with_masked_quarters(rigid):
     """Each frame hides another quarter of the picture, so no point is seen in all of them."""
     frames = list(rigid)[:4]
     for index, frame in enumerate(frames):
@@ -127,7 +127,7 @@ def test_a_point_of_four_frames_may_be_hidden_in_one(rigid):
     assert found.lost == () and len(found.points) >= 24
 
 
-def test_after_another_scene_nothing_is_placed_by_the_old_points(rigid):
+def test_feature_tracks_do_not_continue_into_other_scene(rigid):
     frames = list(rigid)[:4] + [Frame(4 + i, 0, textured(9)[:192, :256].copy()) for i in range(20)]
     tracks = FeatureTracks()
     for frame in frames:
@@ -145,7 +145,7 @@ def test_after_another_scene_nothing_is_placed_by_the_old_points(rigid):
         (8, "fisheye", "this one is fisheye"),
     ],
 )
-def test_what_says_too_little_is_refused(count, model, said):
+def test_trajectory_of_refuses_insufficient_input(count, model, said):
     camera = Camera(np.array([[100.0, 0, 40], [0, 100, 32], [0, 0, 1]]), 80, 64, model=model)
     grey = np.full((64, 80, 3), 128, np.uint8)
     with pytest.raises(InvalidInput, match=said):
@@ -157,7 +157,7 @@ def textured(seed: int = 0) -> np.ndarray:
     return np.kron(random.integers(30, 220, (32, 40, 3)), np.ones((7, 7, 1))).astype(np.uint8)
 
 
-def test_points_follow_a_shifted_picture_and_stay_off_the_tool():
+def test_feature_tracks_follow_shift_and_avoid_tool():
     whole, tracks = textured(), FeatureTracks()
     mask = np.ones((120, 160), np.uint8)
     mask[:, 100:] = 0
@@ -171,7 +171,7 @@ def test_points_follow_a_shifted_picture_and_stay_off_the_tool():
         np.testing.assert_allclose(moved, np.tile([2.0, 0.0], (4, 1)), atol=0.2)
 
 
-def test_observations_are_numbered_without_gaps():
+def test_observations_point_numbers_are_consecutive():
     tracks = FeatureTracks()
     for _ in range(4):
         tracks.follow(textured()[:120, :160].copy(), None)
@@ -197,12 +197,12 @@ def odometry_of(seen: Observations, count: int) -> odometry._Odometry:
 
 
 @pytest.mark.parametrize(("count", "apart"), [(10, 1), (60, 1), (61, 2), (300, 5), (600, 10), (601, 10), (1200, 10)])
-def test_key_frames_are_sixty_or_one_in_ten_and_the_last(count, apart):
+def test_odometry_key_frame_spacing_by_frame_count(count, apart):
     keys = torch.nonzero(odometry_of(exact(2), count)._is_key)[:, 0].tolist()
     assert keys == sorted({*range(0, count, apart), count - 1})
 
 
-def test_bundles_are_adjusted_when_their_key_frames_have_grown_by_a_third(monkeypatch):
+def test_odometry_adjusts_after_a_third_more_key_frames(monkeypatch):
     adjusted = []
     monkeypatch.setattr(odometry._Odometry, "_adjust", lambda self, last, flat_px: adjusted.append((flat_px, last + 1)))
     odometry_of(exact(40), 40).run(False)
@@ -213,7 +213,7 @@ def test_bundles_are_adjusted_when_their_key_frames_have_grown_by_a_third(monkey
 
 
 @pytest.mark.parametrize(("left", "lost"), [(23, (5,)), (24, ())])
-def test_two_dozen_known_points_place_a_frame(monkeypatch, left, lost):
+def test_odometry_places_frame_from_24_points(monkeypatch, left, lost):
     seen = exact(8)
     some = seen.of((seen.frame != 5) | (seen.point < left))
     monkeypatch.setattr(ReferenceTracks, "observations", lambda self, least: some)
@@ -221,7 +221,7 @@ def test_two_dozen_known_points_place_a_frame(monkeypatch, left, lost):
     assert found.lost == lost and found.error_px < 0.01
 
 
-def test_a_new_point_has_the_median_depth_of_the_five_known_ones_nearest_to_it():
+def test_odometry_new_point_depth_is_median_of_five_nearest():
     depths = np.array([3.0, 4.0, 5.0, 1.0, 2.0, *[9.0] * 30])
     rays = np.concatenate([np.linspace(0.01, 0.05, 5), np.linspace(0.3, 0.5, 30)])
     pixels = np.stack([200 * np.append(rays, 0.0) + 128, np.full(36, 96.0)], 1)
@@ -235,7 +235,7 @@ def test_a_new_point_has_the_median_depth_of_the_five_known_ones_nearest_to_it()
 
 
 @pytest.mark.parametrize(("count", "least"), [(3, 3), (4, 3), (5, 4), (9, 4)])
-def test_a_point_must_be_seen_in_four_frames_or_three_of_a_short_recording(monkeypatch, count, least):
+def test_trajectory_of_minimum_observations_per_point(monkeypatch, count, least):
     asked = []
     seen = exact(count)
     monkeypatch.setattr(ReferenceTracks, "observations", lambda self, least: asked.append(least) or seen)
@@ -244,7 +244,7 @@ def test_a_point_must_be_seen_in_four_frames_or_three_of_a_short_recording(monke
 
 
 @pytest.mark.parametrize(("points", "refused"), [(23, True), (24, False)])
-def test_seventy_two_observations_are_enough(monkeypatch, points, refused):
+def test_trajectory_of_requires_72_observations(monkeypatch, points, refused):
     seen = exact(3, points)
     monkeypatch.setattr(ReferenceTracks, "observations", lambda self, least: seen)
     frames = [Frame(index, index, GREY) for index in range(3)]
@@ -255,7 +255,7 @@ def test_seventy_two_observations_are_enough(monkeypatch, points, refused):
         trajectory_of(frames, CAMERA)
 
 
-def test_more_than_three_thousand_frames_are_refused(monkeypatch):
+def test_trajectory_of_refuses_more_than_3000_frames(monkeypatch):
     monkeypatch.setattr(ReferenceTracks, "follow", lambda self, image, mask: None)
     monkeypatch.setattr(odometry, "followed_part", lambda frame: None)
     frame = Frame(0, 0, GREY)
@@ -265,7 +265,7 @@ def test_more_than_three_thousand_frames_are_refused(monkeypatch):
         trajectory_of([frame] * 3000, CAMERA)
 
 
-def test_lengths_and_errors_of_breathing_have_the_units_of_the_trajectory(monkeypatch):
+def test_trajectory_breathing_is_in_trajectory_units(monkeypatch):
     """Breathing is estimated in the first depth as the unit of length, with errors of rays."""
     seen, given = exact(8), []
     monkeypatch.setattr(ReferenceTracks, "observations", lambda self, least: seen)
@@ -296,7 +296,7 @@ def test_lengths_and_errors_of_breathing_have_the_units_of_the_trajectory(monkey
     assert trajectory_of(frames, CAMERA, separate_breathing=False).poses.tobytes() == still.poses.tobytes()
 
 
-def test_tools_highlights_and_the_outside_are_not_followed():
+def test_followed_part_excludes_tools_and_outside():
     picture = np.full((24, 32, 3), 90, np.uint8)
     assert followed_part(Frame(0, 0, picture)) is None
     mask, field = np.ones((24, 32), np.uint8), np.ones((24, 32), np.uint8)
@@ -307,7 +307,7 @@ def test_tools_highlights_and_the_outside_are_not_followed():
     assert np.array_equal(part != 0, expected)
 
 
-def test_frames_between_key_frames_are_placed_again_with_the_final_points(monkeypatch):
+def test_odometry_places_frames_between_key_frames_again_at_end(monkeypatch):
     """Frame 4 is lost at first. All is adjusted with the third key frame, after each 30 % more, and with the last."""
     calls = []
     made = object.__new__(odometry._Odometry)

@@ -64,18 +64,18 @@ def wrong_disparity() -> np.ndarray:
     return (hill() + 0.3 * rough / rough.std()).astype(np.float32)
 
 
-def test_the_pictures_correct_what_matching_got_wrong():
+def test_pair_surface_corrects_smooth_matching_errors():
     frame, camera = frame_of(*pictures(hill()), wrong_disparity())
     assert rms(error_px(frame, camera)) < 0.06
     assert rms(error_px(frame.with_fields(right_image=None), camera)) > 0.15
 
 
-def test_a_brightness_difference_of_the_eyes_has_no_influence():
+def test_pair_surface_is_independent_of_brightness_difference():
     frame, camera = frame_of(*pictures(hill(), offset=20.0), wrong_disparity())
     assert rms(error_px(frame, camera)) < 0.1
 
 
-def test_highlights_that_differ_between_the_eyes_have_no_influence(monkeypatch):
+def test_pair_surface_ignores_highlights(monkeypatch):
     left, right = pictures(hill())
     at = np.random.default_rng(3).integers((8, 30), (HEIGHT - 8, WIDTH - 8), (60, 2))
     for row, column in at:
@@ -87,14 +87,14 @@ def test_highlights_that_differ_between_the_eyes_have_no_influence(monkeypatch):
     assert rms(error_px(frame, camera)) > 0.1
 
 
-def test_rows_of_the_right_eye_are_aligned():
+def test_pair_surface_aligns_rows_of_right_eye():
     left, right = pictures(hill())
     moved = cv2.warpAffine(right, np.array([[1, 0, 0], [0, 1, 0.6]]), (WIDTH, HEIGHT), flags=cv2.INTER_CUBIC)
     frame, camera = frame_of(left, moved, wrong_disparity())
     assert rms(error_px(frame, camera)) < 0.08
 
 
-def test_without_texture_the_disparities_decide():
+def test_pair_surface_without_texture_keeps_disparities():
     """Nothing can be compared, and nothing is found in both pictures: the surface is that of the depth alone."""
     flat = np.full((HEIGHT, WIDTH), 120, np.uint8)
     frame, camera = frame_of(flat, flat, wrong_disparity())
@@ -104,7 +104,7 @@ def test_without_texture_the_disparities_decide():
     np.testing.assert_array_equal(fitted_surface(nothing, hill()), hill())
 
 
-def test_principal_points_that_differ_shift_the_right_picture():
+def test_pair_surface_handles_different_principal_points():
     left, right = pictures(hill() + 3)
     frame, camera = frame_of(left, right, wrong_disparity())
     K = frame.right_camera.K.copy()
@@ -113,7 +113,7 @@ def test_principal_points_that_differ_shift_the_right_picture():
     assert rms(error_px(frame.with_fields(right_camera=other), camera)) < 0.08
 
 
-def test_noise_of_the_pictures_is_not_taken_for_relief():
+def test_pair_surface_does_not_fit_picture_noise():
     random = np.random.default_rng(5)
     left, right = (
         np.clip(each + random.normal(0, 12, each.shape), 0, 255).astype(np.uint8) for each in pictures(hill())
@@ -122,7 +122,7 @@ def test_noise_of_the_pictures_is_not_taken_for_relief():
     assert rms(error_px(frame, camera)) < 0.12
 
 
-def test_pixels_without_tissue_keep_their_depth():
+def test_pair_surface_keeps_depth_without_tissue():
     mask = np.ones((HEIGHT, WIDTH), np.uint8)
     mask[40:80, 60:100] = 0
     frame, camera = frame_of(*pictures(hill()), wrong_disparity(), mask=mask)
@@ -144,7 +144,7 @@ def test_first_planes_keep_edges_and_remove_noise():
     assert np.abs(first_planes(edge + noise, known, variance) - edge)[:, 76:84].max() < 0.5
 
 
-def test_highlights_are_brighter_than_their_surroundings():
+def test_highlights_are_pixels_brighter_than_surroundings():
     picture = np.full((HEIGHT, WIDTH), 100, np.uint8)
     picture[20:22, 30:33], picture[60:62, 30:33], picture[90:92, 30:33] = 125, 140, 255
     found = highlights(picture)
@@ -152,7 +152,7 @@ def test_highlights_are_brighter_than_their_surroundings():
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 40), (40, 1), (7, 5), (33, 300)])
-def test_surfaces_of_any_size_are_fitted(size):
+def test_fitted_surface_of_any_size(size):
     planes = np.full(size, 12.0, np.float32)
     assert np.isfinite(first_planes(planes, np.ones(size, bool), np.full(size, 0.02, np.float32))).all()
     picture = np.full(size, 100, np.uint8)

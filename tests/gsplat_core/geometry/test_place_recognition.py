@@ -21,7 +21,7 @@ AWAY_MM, COUNT = 110.0, 81
 
 
 @pytest.fixture(scope="module")
-def there_and_back() -> RenderedRecording:
+def returning_scope() -> RenderedRecording:
     """A scope goes sideways until it sees none of what it saw at first, and back; the tissue stands still."""
     moving, at_rest = Tissue.points, Tug((0.0, 0.0), (0.0, 0.0, 0.0))
 
@@ -45,12 +45,12 @@ def drift(recording: RenderedRecording) -> tuple[float, LiveOdometry]:
 
 
 @pytest.mark.slow
-def test_what_is_seen_again_takes_most_of_the_drift_away(there_and_back, monkeypatch):
-    with_return, odometry = drift(there_and_back)
+def test_place_recognition_halves_drift(returning_scope, monkeypatch):
+    with_return, odometry = drift(returning_scope)
     assert odometry.returned >= 3 and odometry.begun == 1
     monkeypatch.setattr(live_odometry, "FOLLOWED_KEYS", 0)
     monkeypatch.setattr(live_odometry, "MATCHED_KEYS", 0)
-    without, odometry = drift(there_and_back)
+    without, odometry = drift(returning_scope)
     assert odometry.returned == 0
     assert with_return < 0.5 * without and with_return < 0.02
 
@@ -76,7 +76,7 @@ def small(position: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> SmallPictur
     return SmallPictures(FIRST).of(seen_from(position, depth_of_surface()))
 
 
-def test_a_key_frame_is_found_where_the_pose_says_and_tells_the_pose(kept):
+def test_seen_again_corrects_drifted_pose(kept):
     key, places = kept
     drifted = exp(torch.tensor([0.02, 0.01, 0.0, 0.0, 0.0, 0.02])).numpy().astype(np.float64)
     found = seen_again(key, places, small((0.05, 0.0, 0.0)), drifted)
@@ -84,20 +84,20 @@ def test_a_key_frame_is_found_where_the_pose_says_and_tells_the_pose(kept):
     np.testing.assert_allclose(found.pose[:3, 3], [-0.05, 0.0, 0.0], atol=0.01)
 
 
-def test_points_that_are_followed_already_tell_nothing_new(kept):
+def test_seen_again_is_none_for_already_tracked_points(kept):
     key, places = kept
     assert seen_again(key, places, small(), np.eye(4), key.numbers) is None
 
 
 @pytest.mark.parametrize("position", [(0.05, 0.0, 0.0), (0.1, 0.05, 0.0)])
-def test_a_key_frame_is_recognised_by_its_features(kept, position):
+def test_place_recognition_finds_key_frame_by_features(kept, position):
     found = PlaceRecognition().find(small(position), [kept], 1)
     assert found is not None
     np.testing.assert_allclose(found.pose[:3, 3], [-each for each in position], atol=0.02)
 
 
 @pytest.mark.parametrize("shown", ["mirrored", "grey", "noise"])
-def test_what_shows_something_else_is_not_recognised(kept, shown):
+def test_place_recognition_rejects_other_pictures(kept, shown):
     image = seen_from((0.0, 0.0, 0.0), depth_of_surface()).image
     other = {
         "mirrored": np.ascontiguousarray(image[:, ::-1]),
@@ -109,7 +109,7 @@ def test_what_shows_something_else_is_not_recognised(kept, shown):
     assert seen_again(*kept, picture, np.eye(4)) is None
 
 
-def test_key_frames_take_turns(kept):
+def test_place_recognition_tries_key_frames_in_turn(kept):
     recognition, asked = PlaceRecognition(), []
     recognition._pose_by = lambda key, *_: asked.append(key)
     candidates = [(number, None) for number in range(3)]
@@ -118,7 +118,7 @@ def test_key_frames_take_turns(kept):
     assert asked == [0, 1, 2, 0] and recognition.find(small(), [], 2) is None
 
 
-def test_a_correction_moves_what_came_after_by_its_share_and_nothing_before():
+def test_brought_back_moves_later_key_frames_and_keeps_earlier():
     places, picture = LocalMap(), small()
     pixels = np.zeros((1, 2), np.float32)
     for number in range(5):

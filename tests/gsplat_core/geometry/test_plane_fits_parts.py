@@ -18,7 +18,7 @@ def at(x, y):
     return np.array([[float(x)]]), np.array([[float(y)]])
 
 
-def test_slopes_are_damped_by_the_level_relative_to_the_variance_of_positions():
+def test_at_middles_damps_slopes_relative_to_variance():
     """Four points at ±1 in both directions have a variance of 1 along each; their values rise by 2 and 3."""
     x, y = np.array([-1.0, 1, -1, 1]), np.array([-1.0, -1, 1, 1])
     sums = sums_of(np.ones(4), x, y, 10 + 2 * x + 3 * y)
@@ -28,14 +28,14 @@ def test_slopes_are_damped_by_the_level_relative_to_the_variance_of_positions():
     assert at_middles(sums, *at(1, 1), 0.0, 0.5)[0, 0] == pytest.approx(12.5), "half of the sum of variances is 1"
 
 
-def test_weights_decide_the_mean_and_the_place_of_it():
+def test_at_middles_uses_weighted_mean():
     x, y = np.array([0.0, 4.0]), np.array([1.0, 1.0])
     sums = sums_of(np.array([3.0, 1.0]), x, y, np.array([0.0, 8.0]))
     assert at_middles(sums, *at(1, 1), 1e9)[0, 0] == pytest.approx(2)
     assert at_middles(sums, *at(3, 1), 1e-9)[0, 0] == pytest.approx(6, rel=1e-3)
 
 
-def test_correlated_positions_have_the_slopes_of_least_squares():
+def test_at_middles_equals_weighted_least_squares():
     rng = np.random.default_rng(0)
     x = rng.normal(size=50)
     y, weight, values = 0.8 * x + 0.3 * rng.normal(size=50), rng.uniform(0.5, 2, 50), rng.normal(size=50)
@@ -46,7 +46,7 @@ def test_correlated_positions_have_the_slopes_of_least_squares():
 
 
 @pytest.mark.parametrize("weight", [0.0, 1.0])
-def test_one_point_or_none_has_a_finite_value(weight):
+def test_at_middles_of_one_or_no_point_is_finite(weight):
     sums = sums_of(np.array([weight]), np.array([2.0]), np.array([3.0]), np.array([7.0]))
     assert at_middles(sums, *at(5, 5), 0.0)[0, 0] == pytest.approx(7 * weight)
 
@@ -57,7 +57,7 @@ def plane_points(count=600, size=(61, 80)):
     return pixels, 1 / (0.02 + 1e-4 * pixels[:, 0] - 5e-5 * pixels[:, 1])
 
 
-def test_a_surface_through_points_of_a_plane_is_the_plane():
+def test_surface_through_plane_points_is_plane():
     pixels, depth = plane_points()
     found, error, support = surface_through(pixels, depth, np.full(len(depth), 0.03), (61, 80))
     y, x = np.mgrid[:61, :80] + 0.5
@@ -68,7 +68,7 @@ def test_a_surface_through_points_of_a_plane_is_the_plane():
     np.testing.assert_allclose(support[5:-5, 5:-5], 1)
 
 
-def test_sure_points_outweigh_doubtful_ones_by_the_squares_of_their_errors():
+def test_surface_through_weights_by_inverse_squared_error():
     """The floor of 0.5 % bounds the weight of points without an error."""
     pixels = np.repeat(np.random.default_rng(0).uniform([0, 0], [80, 60], (300, 2)), 2, 0)
     depth, error = np.tile([50.0, 100.0], 300), np.tile([0.01, 0.03], 300)
@@ -79,7 +79,7 @@ def test_sure_points_outweigh_doubtful_ones_by_the_squares_of_their_errors():
     assert mean_error[30, 40] == pytest.approx(weights @ [0.01, 0.03], rel=0.03)
 
 
-def test_support_is_that_of_the_points_within_nine_pixels():
+def test_surface_support_window_is_nine_pixels():
     one = np.array([[40.5, 30.5]])
     found, error, support = surface_through(one, np.array([50.0]), np.array([0.02]), (60, 80))
     np.testing.assert_allclose(found, 50)
@@ -93,18 +93,18 @@ def test_support_is_that_of_the_points_within_nine_pixels():
     ("pixel", "is_inside"),
     [((0.0, 0.0), True), ((-0.1, 5), False), ((5, -0.1), False), ((79.9, 59.9), True), ((80.0, 5), False), ((5, 60.0), False)],
 )  # fmt: skip
-def test_points_outside_of_the_picture_do_not_count(pixel, is_inside):
+def test_surface_through_ignores_points_outside_picture(pixel, is_inside):
     found, error, support = surface_through(np.array([pixel]), np.array([50.0]), np.array([0.02]), (60, 80))
     np.testing.assert_allclose(found, 50)
     assert (support.max() > 0) == is_inside and (error == 1).all() == (not is_inside)
 
 
-def test_without_points_the_depth_is_one_and_nothing_is_supported():
+def test_surface_through_no_points_is_one_without_support():
     found, error, support = surface_through(np.zeros((0, 2)), np.zeros(0), np.zeros(0), (20, 30))
     assert (found == 1).all() and (error == 1).all() and not support.any()
 
 
-def test_a_surface_goes_beyond_its_points_by_one_half_at_most():
+def test_surface_through_extrapolates_at_most_by_half():
     x = np.repeat(np.arange(30.0, 50, 2), 10)
     y = np.tile(np.arange(20.0, 40, 2), 10)
     inverse = 0.01 + 0.002 * (x - 30)
@@ -113,7 +113,7 @@ def test_a_surface_goes_beyond_its_points_by_one_half_at_most():
     assert found.max() == pytest.approx(1.5 / low) and found.min() == pytest.approx(1 / (1.5 * high))
 
 
-def test_only_what_exceeds_noise_is_kept():
+def test_share_beyond_noise():
     """Residuals of twice the noise have four times its variance."""
     rng = np.random.default_rng(0)
     weight, noise = np.ones((80, 120), np.float32), rng.normal(0, 1, (80, 120)).astype(np.float32)
@@ -125,7 +125,7 @@ def test_only_what_exceeds_noise_is_kept():
 
 
 @pytest.mark.parametrize("shape", [(80, 120), (120, 80), (12, 9)])
-def test_windows_of_a_plane_have_the_plane(shape):
+def test_fitted_planes_of_plane(shape):
     y, x = np.mgrid[: shape[0], : shape[1]].astype(np.float32)
     values, weight = 5 + 0.02 * x - 0.03 * y, np.ones(shape, np.float32)
     found = plane_fits.fitted_planes(values, weight, plane_fits.WINDOW)
@@ -136,7 +136,7 @@ def test_windows_of_a_plane_have_the_plane(shape):
     assert np.isfinite(plane_fits.fitted_planes(values, weight, plane_fits.WINDOW)).all()
 
 
-def test_a_plane_through_all_values_is_that_of_least_squares_and_level_where_few_are_known():
+def test_whole_plane_is_least_squares_and_level_for_few_values():
     y, x = np.mgrid[:20, :30].astype(np.float32)
     values, weight = 1 + 0.1 * x - 0.05 * y, np.ones((20, 30), np.float32)
     np.testing.assert_allclose(plane_fits._whole_plane(values, weight), values, rtol=1e-3)
@@ -146,7 +146,7 @@ def test_a_plane_through_all_values_is_that_of_least_squares_and_level_where_few
     assert np.ptp(found) < 0.5 * np.ptp(values) and found[10, 10] == pytest.approx(values[10, 10], rel=0.05)
 
 
-def test_where_points_are_sparse_they_count_by_a_window_of_24_pixels():
+def test_surface_through_sparse_points_uses_24_pixel_window():
     """The mean error at a pixel tells the weights of the two points. Both are too far for the narrow window."""
     pixels, errors = np.array([[25.0, 41.0], [105.0, 41.0]]), np.array([0.01, 0.05])
     _, found, support = surface_through(pixels, np.array([50.0, 60.0]), errors, (82, 130))

@@ -27,12 +27,12 @@ def test_exp_is_the_matrix_exponential(twist):
 
 
 @pytest.mark.parametrize("twist", TWISTS)
-def test_log_leads_back(twist):
+def test_log_inverts_exp(twist):
     twist = torch.tensor(twist, dtype=torch.float64)
     torch.testing.assert_close(log(exp(twist)), twist, rtol=1e-9, atol=1e-11)
 
 
-def test_leading_dimensions_are_kept():
+def test_exp_and_log_keep_leading_dimensions():
     twists = torch.tensor(TWISTS, dtype=torch.float64).reshape(7, 1, 6).expand(7, 3, 6)
     poses = exp(twists)
     assert poses.shape == (7, 3, 4, 4) and log(poses).shape == (7, 3, 6)
@@ -40,19 +40,19 @@ def test_leading_dimensions_are_kept():
 
 
 @pytest.mark.parametrize("twist", [TWISTS[1], TWISTS[3], TWISTS[5]])
-def test_gradients(twist):
+def test_exp_and_log_gradients(twist):
     twist = torch.tensor(twist, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(exp, twist)
     assert torch.autograd.gradcheck(lambda t: log(exp(t)), twist)
 
 
-def test_the_gradient_at_rest_is_finite():
+def test_exp_gradient_at_zero_is_finite():
     twist = torch.zeros(6, dtype=torch.float64, requires_grad=True)
     exp(twist).sum().backward()
     assert twist.grad is not None and torch.isfinite(twist.grad).all()
 
 
-def test_half_of_the_way_twice_is_the_way():
+def test_between_interpolates_poses():
     first, second = exp(torch.tensor(TWISTS[5], dtype=torch.float64)), exp(torch.tensor(TWISTS[3], dtype=torch.float64))
     torch.testing.assert_close(between(first, second, 0.0), first)
     torch.testing.assert_close(between(first, second, 1.0), second)

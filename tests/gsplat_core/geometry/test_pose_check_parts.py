@@ -21,20 +21,20 @@ def sightings(inverse, off_px=0.0):
     return c, d, np.ones((2, len(inverse)), bool)
 
 
-def test_weights_are_those_of_the_sum_of_distances_from_half_a_pixel_on():
+def test_agreement_weights_fall_beyond_half_a_pixel():
     c, d, _ = sightings([0.02] * 4, [0.0, 0.5, 1.0, 5.0])
     found = multiview._agreement(c, d, FOCAL_PX, np.full(4, 0.02))
     np.testing.assert_allclose(found, [[1, 1, 0.5, 0.1]] * 2)
 
 
-def test_one_corner_that_moves_by_itself_hardly_moves_the_plane():
+def test_plane_is_robust_to_one_moving_corner():
     c, d, seen = sightings([0.02] * 9, [0.0] * 8 + [30.0])
     assert multiview._plane(c, d, seen, FOCAL_PX) == pytest.approx(0.02, abs=4e-4)
     seen[:, -1] = False
     assert multiview._plane(c, d, seen, FOCAL_PX) == pytest.approx(0.02)
 
 
-def test_depth_of_a_corner_is_pulled_to_the_plane_by_its_prior():
+def test_relief_is_pulled_to_plane_by_prior():
     """Information 5 * (100 / 0.5)² of both views, against 1 / (0.5 * 0.02)² of the prior."""
     c, d, seen = sightings([0.0215])
     information, prior = 5 * 200.0**2, 1 / 0.01**2
@@ -44,12 +44,12 @@ def test_depth_of_a_corner_is_pulled_to_the_plane_by_its_prior():
 
 
 @pytest.mark.parametrize(("inverse", "bound"), [(10.0, 0.08), (-10.0, 0.005)])
-def test_nothing_is_four_times_nearer_or_farther_than_the_plane(inverse, bound):
+def test_relief_is_limited_to_factor_four_of_plane(inverse, bound):
     c, d, seen = sightings([inverse])
     assert multiview._relief(1000 * c, 1000 * d, seen, FOCAL_PX, 0.02) == pytest.approx([bound])
 
 
-def test_medians_are_of_the_corners_that_were_followed():
+def test_medians_use_only_followed_corners():
     found = multiview._medians(np.array([[1.0, 2, 9], [4, 5, 6]]), np.array([[1, 1, 0], [1, 1, 1]], bool))
     assert found.tolist() == [1.5, 5.0]
 
@@ -62,7 +62,7 @@ def moved_camera():
     return Camera.from_focal(FOCAL_PX, 64, 48).with_pose(pose)
 
 
-def test_where_another_view_sees_a_point_at_an_inverse_depth():
+def test_plane_homography_and_terms_equal_projection():
     first, second = Camera.from_focal(FOCAL_PX, 64, 48), moved_camera()
     point = np.array([4.0, -3.0, 50.0])
     pixel = first.K @ point
@@ -77,21 +77,21 @@ def test_where_another_view_sees_a_point_at_an_inverse_depth():
 
 
 @pytest.mark.parametrize(("gain", "cost"), [(1.0, 0.0), (0.5, 0.0), (-1.0, 1.0)])
-def test_the_cost_does_not_depend_on_brightness_and_an_inverted_picture_costs_most(gain, cost):
+def test_patch_cost_is_independent_of_brightness(gain, cost):
     grey = np.random.default_rng(0).uniform(60, 190, (20, 24)).astype(np.float32)
     mean, variance = multiview._moments(grey)
     found = multiview._cost(grey, mean, variance, (gain * (grey - 125) + 100).astype(np.float32))
     assert found[10, 12] == pytest.approx(cost, abs=0.01)
 
 
-def test_contrast_below_noise_does_not_correlate():
+def test_patch_cost_of_contrast_below_noise():
     """A contrast of 2 grey levels, as the noise has, correlates by one half with itself."""
     pattern = np.where(np.indices((40, 40)).sum(0) % 2, 2.0, -2.0).astype(np.float32) + 100
     mean, variance = multiview._moments(pattern)
     assert multiview._cost(pattern, mean, variance, pattern)[20, 20] == pytest.approx(0.25, abs=0.01)
 
 
-def test_patches_count_where_all_of_seven_pixels_are_tissue():
+def test_whole_patches_require_seven_tissue_pixels():
     tissue = np.ones((20, 20), np.uint8)
     tissue[10, 10] = 0
     whole = multiview._whole_patches(tissue)

@@ -42,7 +42,7 @@ def found(picture):
 
 
 @pytest.mark.parametrize("point", [(0.0, 0.0, 60.0), (15, -12, 70), (-14, 10, 50)])
-def test_a_point_lands_where_the_rectified_cameras_see_it(point):
+def test_rectified_pictures_match_rectified_cameras(point):
     point = np.array([point], np.float64)
     rectification = Rectification(CALIBRATION, *SIZE)
     other = point @ CALIBRATION.rotation.T + CALIBRATION.translation_mm
@@ -55,12 +55,12 @@ def test_a_point_lands_where_the_rectified_cameras_see_it(point):
         assert np.allclose(np.array(found(picture)) + 0.5, expected, atol=0.15)
 
 
-def test_the_distance_between_the_eyes_stays():
+def test_rectification_keeps_baseline():
     away = Rectification(CALIBRATION, *SIZE).right_camera.world_to_camera[:3, 3]
     assert np.allclose(away, [-np.linalg.norm(CALIBRATION.translation_mm), 0, 0])
 
 
-def test_what_neither_pixel_shows_is_marked():
+def test_rectification_inside_marks_unseen_pixels():
     rectification = Rectification(CALIBRATION, *SIZE)
     white = rectification.left(np.full((256, 320, 3), 255, np.uint8))
     assert not rectification.inside.all()
@@ -93,7 +93,7 @@ def test_what_neither_pixel_shows_is_marked():
         ({"left_K": np.array([[300.0, 0, 500], [0, 300, 128], [0, 0, 1]])}, "is outside its picture"),
     ],
 )
-def test_a_calibration_that_cannot_be_is_refused(fields, sentence):
+def test_rectification_refuses_invalid_calibration(fields, sentence):
     with pytest.raises(InvalidInput, match=sentence):
         Rectification(replace(CALIBRATION, **fields), *SIZE)
 
@@ -111,12 +111,12 @@ def test_a_calibration_that_cannot_be_is_refused(fields, sentence):
         {"rotation": (1 + 4e-4) * np.eye(3)},
     ],
 )
-def test_a_calibration_within_the_limits_is_possible(fields):
+def test_stereo_calibration_within_limits_is_accepted(fields):
     assert replace(CALIBRATION, **fields).wrong() is None
 
 
 @pytest.mark.parametrize(("fold", "is_seen"), [(1.8, True), (1.4, False)])
-def test_a_lens_may_not_see_the_corners_but_sees_the_middle_of_each_side(fold, is_seen):
+def test_undistortion_requires_middle_of_sides_in_view(fold, is_seen):
     """The lens moves a radius r to r (1 - r² / (3 fold²)), which is 2/3 fold at most. The sides are at 1, the corners at 1.41."""
     camera, coefficients = Camera.from_focal(100.0, 200, 200), [-1 / (3 * fold**2), 0, 0, 0]
     if is_seen:
@@ -126,7 +126,7 @@ def test_a_lens_may_not_see_the_corners_but_sees_the_middle_of_each_side(fold, i
             Undistortion(camera, coefficients)
 
 
-def test_an_undistorted_picture_ends_where_the_middle_of_each_side_of_the_distorted_one_is():
+def test_undistorted_picture_ends_at_middle_of_distorted_sides():
     """With a barrel distortion the middle of a side is the nearest part of it, so that nothing outside is shown."""
     camera, fold = Camera.from_focal(100.0, 240, 160), 2.5
     found = Undistortion(camera, [-1 / (3 * fold**2), 0, 0, 0]).camera

@@ -28,7 +28,7 @@ def errors_of(tracks: ReferenceTracks, at: list[float]) -> np.ndarray:
     return np.linalg.norm(seen.pixels - expected, axis=1)
 
 
-def test_errors_do_not_accumulate():
+def test_reference_tracks_do_not_drift():
     at = [12 * np.sin(0.37 * step) for step in range(60)]
     tracks = ReferenceTracks()
     for each in at:
@@ -38,7 +38,7 @@ def test_errors_do_not_accumulate():
     assert np.median(errors[late]) < 0.1 and np.median(errors[late]) < 3 * np.median(errors) + 0.02
 
 
-def test_a_changing_exposure_changes_nothing():
+def test_reference_tracks_tolerate_changing_exposure():
     at = [0.7 * step for step in range(15)]
     steady, changing = ReferenceTracks(), ReferenceTracks()
     for step, each in enumerate(at):
@@ -48,7 +48,7 @@ def test_a_changing_exposure_changes_nothing():
     assert len(changing.observations().frame) > 0.8 * len(steady.observations().frame)
 
 
-def test_points_are_found_again_behind_a_tool():
+def test_reference_tracks_find_points_again_after_tool():
     tracks = ReferenceTracks()
     for step in range(9):
         mask = np.ones((HEIGHT, WIDTH), np.uint8)
@@ -64,7 +64,7 @@ def test_points_are_found_again_behind_a_tool():
     assert not ((column > 60) & (column < 130)).any()
 
 
-def test_five_references_each_20_pictures_apart_are_found_at_once():
+def test_reference_tracks_keep_five_references_20_pictures_apart():
     seen = followed_tracks(*[np.ascontiguousarray(view(0)[:70, :80])] * 102)
     first = np.full(seen.point.max() + 1, 999)
     np.minimum.at(first, seen.point, seen.frame)
@@ -74,7 +74,7 @@ def test_five_references_each_20_pictures_apart_are_found_at_once():
     assert seen.frame[first[seen.point] == 0].max() == 100
 
 
-def test_another_scene_gets_new_points():
+def test_reference_tracks_start_new_points_in_other_scene():
     tracks = ReferenceTracks()
     other = np.ascontiguousarray(view(3)[::-1, ::-1])
     for _ in range(4):
@@ -86,14 +86,14 @@ def test_another_scene_gets_new_points():
     assert before and after and not before & after
 
 
-def test_a_picture_without_texture_has_no_points():
+def test_reference_tracks_without_texture_have_no_points():
     tracks = ReferenceTracks()
     for _ in range(3):
         tracks.follow(np.full((HEIGHT, WIDTH, 3), 90, np.uint8), None)
     assert len(tracks.observations(3).frame) == 0
 
 
-def test_unusable_pixels_have_no_contrast_and_influence_no_other():
+def test_local_contrast_ignores_unusable_pixels():
     grey = np.ascontiguousarray(view(0)[:, :, 0])
     usable = np.ones(grey.shape, bool)
     usable[:, 120:] = False
@@ -103,7 +103,7 @@ def test_unusable_pixels_have_no_contrast_and_influence_no_other():
     assert np.array_equal(one, other) and (one[:, 120:] == 128).all() and one[:, :110].std() > 20
 
 
-def test_large_pictures_are_reduced_and_positions_are_not():
+def test_reference_tracks_positions_are_in_full_size_pixels():
     large = ReferenceTracks()
     for step in range(4):
         large.follow(cv2.resize(view(step), (WIDTH * 4, HEIGHT * 4), interpolation=cv2.INTER_CUBIC), None)
@@ -113,7 +113,7 @@ def test_large_pictures_are_reduced_and_positions_are_not():
     np.testing.assert_allclose(np.median(first - last, axis=0), [12.0, 0.0], atol=0.5)
 
 
-def test_points_are_found_while_the_scope_turns_about_its_axis():
+def test_reference_tracks_follow_rotation_about_axis():
     """A turn of 60 degrees moves points in all directions, by more than half of the picture's height."""
     tracks, centre = ReferenceTracks(), np.array([WIDTH / 2, HEIGHT / 2])
     turns = [
@@ -135,7 +135,7 @@ def test_points_are_found_while_the_scope_turns_about_its_axis():
     assert np.median([np.linalg.norm(end[number] - due[number]) for number in found]) < 0.25
 
 
-def test_points_are_found_near_a_thread_but_not_on_it():
+def test_reference_tracks_avoid_masked_threads():
     """From 3 pixels beside a thread of 2 pixels on, so that the tissue between threads is not given up."""
     tracks, mask = ReferenceTracks(), np.ones((HEIGHT, WIDTH), np.uint8)
     threads = np.arange(20, WIDTH - 20, 20)
@@ -166,13 +166,13 @@ def strength(picture: np.ndarray, period_px: float) -> float:
 
 
 @pytest.mark.parametrize(("spread", "share"), [(0.2, 1.0), (0.04, 2 / 5**0.5), (0.02, 0.5**0.5), (0.01, 1 / 5**0.5)])
-def test_contrast_far_above_two_per_cent_has_one_strength_and_weaker_one_less(spread, share):
+def test_local_contrast_strength_by_texture_contrast(spread, share):
     """The squares of contrast and of noise, which is 0.02, add up."""
     contrast = local_contrast(stripes({10: spread}, 150.0), np.ones((60, 300), bool))
     assert strength(contrast, 10) == pytest.approx(40 * share, rel=0.1)
 
 
-def test_dark_pixels_have_less_contrast_than_their_ratio():
+def test_local_contrast_is_reduced_for_dark_pixels():
     """Eight grey levels are added before the logarithm, so 8 and 9 contrast like 16 and 17."""
     grey = np.tile(np.repeat(np.array([8, 9], np.uint8), 5), (60, 30))
     contrast = local_contrast(grey, np.ones(grey.shape, bool)).astype(float)
@@ -181,7 +181,7 @@ def test_dark_pixels_have_less_contrast_than_their_ratio():
 
 
 @pytest.mark.parametrize("upright", [False, True])
-def test_brightness_that_varies_over_more_than_a_thirtieth_of_the_longer_side_is_removed(upright):
+def test_local_contrast_removes_slow_brightness_variation(upright):
     """A Gaussian window of 10 of 300 pixels passes a period p with the factor exp(-2 (10 pi / p)^2)."""
     grey = stripes({60: 0.15, 10: 0.1}, 130.0)
     usable = np.ones(grey.shape, bool)
@@ -202,7 +202,7 @@ def nearest(pixels: np.ndarray) -> float:
     return float((np.linalg.norm(pixels[:, None] - pixels[None], axis=2) + 999 * np.eye(len(pixels))).min())
 
 
-def test_a_reference_has_250_corners_a_fortieth_of_the_longer_side_and_4_pixels_apart():
+def test_reference_corner_count_spacing_and_border():
     wide = followed_tracks(wide_texture(0)).pixels
     assert len(wide) == 250 and 16 <= nearest(wide) < 18
     small = followed_tracks(np.ascontiguousarray(view(0)[:80, :120])).pixels
@@ -211,7 +211,7 @@ def test_a_reference_has_250_corners_a_fortieth_of_the_longer_side_and_4_pixels_
     assert at.min() >= 8 and at[:, 0].max() <= 111 and at[:, 1].max() <= 71
 
 
-def test_a_picture_of_1280_pixels_is_halved_and_one_of_640_is_not():
+def test_reference_tracks_halve_pictures_of_1280_pixels():
     """Corners are at the centres of pixels of the reduced picture."""
     picture = wide_texture(1)
     twice = cv2.resize(picture, (1280, 1024), interpolation=cv2.INTER_NEAREST)
@@ -220,7 +220,7 @@ def test_a_picture_of_1280_pixels_is_halved_and_one_of_640_is_not():
 
 
 @pytest.mark.parametrize(("pictures", "found"), [(15, True), (16, False)])
-def test_a_reference_is_given_up_after_it_was_missed_in_more_than_15_pictures(pictures, found):
+def test_reference_is_dropped_after_more_than_15_misses(pictures, found):
     blank = np.full((HEIGHT, WIDTH, 3), 90, np.uint8)
     seen = followed_tracks(view(0), *[blank] * pictures, view(0))
     first, last = seen.point[seen.frame == 0], seen.point[seen.frame == pictures + 1]
@@ -229,7 +229,7 @@ def test_a_reference_is_given_up_after_it_was_missed_in_more_than_15_pictures(pi
 
 
 @pytest.mark.parametrize(("share", "new"), [(0.5, False), (0.3, True)])
-def test_a_reference_of_which_less_than_four_tenths_are_found_is_renewed(share, new):
+def test_reference_is_renewed_below_40_percent_of_points(share, new):
     picture = view(0)
     count = followed_tracks(picture).point.max() + 1
     mask = np.ones((HEIGHT, WIDTH), np.uint8)
@@ -240,7 +240,7 @@ def test_a_reference_of_which_less_than_four_tenths_are_found_is_renewed(share, 
 
 
 @pytest.mark.parametrize(("side_px", "found"), [(40, False), (50, True)])
-def test_two_dozen_corners_are_enough_for_a_reference(side_px, found):
+def test_reference_requires_24_corners(side_px, found):
     mask = np.zeros((HEIGHT, WIDTH), np.uint8)
     mask[20 : 20 + side_px, 40 : 40 + side_px] = 1
     count = len(followed_tracks(view(0), masks=[mask]).point)
@@ -248,7 +248,7 @@ def test_two_dozen_corners_are_enough_for_a_reference(side_px, found):
 
 
 @pytest.mark.parametrize(("side_px", "found"), [(50, False), (60, True)])
-def test_two_dozen_corners_are_enough_to_find_a_reference(side_px, found):
+def test_reference_is_found_from_24_corners(side_px, found):
     mask = np.zeros((HEIGHT, WIDTH), np.uint8)
     mask[20 : 20 + side_px, 40 : 40 + side_px] = 1
     seen = followed_tracks(view(0), view(0), masks=[None, mask])
@@ -264,7 +264,7 @@ def bulged(most_px: float) -> tuple[np.ndarray, np.ndarray]:
     return cv2.remap(view(0), x - motion, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT), motion
 
 
-def test_points_are_found_where_the_tissue_moves_in_one_place():
+def test_reference_tracks_follow_local_motion():
     seen = followed_tracks(*(bulged(each)[0] for each in (0, 2, 4, 6)))
     first, last = (seen.of(seen.frame == frame) for frame in (0, 3))
     last = last.of(last.point < len(first.point))
@@ -276,7 +276,7 @@ def test_points_are_found_where_the_tissue_moves_in_one_place():
 
 
 @pytest.mark.parametrize(("move_px", "found"), [(0.5, True), (3.0, False)])
-def test_a_place_that_jumps_aside_has_no_points(move_px, found):
+def test_reference_tracks_drop_points_of_jumping_patch(move_px, found):
     """A tool that is not in the mask moves alone, by more than a pixel off the smooth motion of the tissue."""
     jumped = view(0).copy()
     jumped[50:100, 75:125] = view(-move_px)[50:100, 75:125]
@@ -302,7 +302,7 @@ def reference() -> _Reference:
         lambda x, y: (8 * y * y, 12 * y - 20 * x * x),
     ],
 )
-def test_a_quadratic_map_is_found_from_some_of_the_corners(moved):
+def test_reference_smooth_recovers_quadratic_map(moved):
     """Coordinates are shares of the longer side from its middle; the map is found within a tenth of a pixel."""
     one = reference()
     kept = np.arange(len(one.corners)) % 3 != 0
@@ -316,7 +316,7 @@ def test_a_quadratic_map_is_found_from_some_of_the_corners(moved):
     assert np.abs(found - expected)[middle, middle].max() < 0.1
 
 
-def test_corners_are_four_pixels_apart_or_a_fortieth_of_the_side():
+def test_reference_corner_spacing_by_picture_size():
     for scale, apart in ((1, 5), (2, 10)):
         grey = cv2.resize(np.ascontiguousarray(view(0)[:, :, 0]), None, fx=scale, fy=scale)
         at = _Reference(grey, np.ones(grey.shape, np.uint8), 0).corners

@@ -43,7 +43,7 @@ def rigid(degrees: tuple[float, float, float], shift: tuple[float, float, float]
     return pose
 
 
-def test_closest_points_are_those_of_a_loop(rng):
+def test_closest_points_equal_brute_force(rng):
     corners = rng.normal(size=(30, 3, 3))
     points = 2 * rng.normal(size=(200, 3))
     found = ClosestPoints(corners.reshape(-1, 3), np.arange(90).reshape(-1, 3)).closest(points)
@@ -57,7 +57,7 @@ def test_closest_points_are_those_of_a_loop(rng):
     assert np.allclose(np.linalg.norm(found.normals, axis=1), 1)
 
 
-def test_the_closest_point_of_a_triangle_is_inside_on_an_edge_or_a_corner():
+def test_closest_on_triangles_inside_edge_and_corner():
     triangle = np.array([[0.0, 0, 0], [4, 0, 0], [0, 4, 0]])
     cases = [
         ((1, 1, 5), (1, 1, 0)),
@@ -71,7 +71,7 @@ def test_the_closest_point_of_a_triangle_is_inside_on_an_edge_or_a_corner():
 
 
 @pytest.mark.parametrize("columns", [slice(None), slice(10, 50)], ids=["whole", "part"])
-def test_a_moved_surface_is_brought_back(columns):
+def test_register_recovers_rigid_motion(columns):
     surface = ClosestPoints(*tissue())
     points = tissue(columns)[0]
     true = rigid((3.0, -2.0, 4.0), (1.0, -0.8, 1.5))
@@ -80,7 +80,7 @@ def test_a_moved_surface_is_brought_back(columns):
     assert np.linalg.norm(off, axis=1).max() < 0.02 and found.rmse < 0.01 and found.scale == pytest.approx(1)
 
 
-def test_what_the_other_surface_does_not_have_is_trimmed(rng):
+def test_register_trims_points_without_counterpart(rng):
     surface = ClosestPoints(*tissue())
     points = tissue()[0]
     spoilt = points.copy()
@@ -96,7 +96,7 @@ def test_what_the_other_surface_does_not_have_is_trimmed(rng):
     assert summary.inlier_share == pytest.approx(1 - tool.mean(), abs=0.02)
 
 
-def test_distances_have_the_side_of_the_normals():
+def test_distances_are_signed_by_normals():
     vertices, triangles = tissue()
     surface = ClosestPoints(vertices, triangles)
     signed, summary = distances(vertices + [0, 0, -0.5], surface, 1.0)  # towards the camera, which normals point to
@@ -106,7 +106,7 @@ def test_distances_have_the_side_of_the_normals():
 
 
 @pytest.mark.parametrize("with_scale", [False, True])
-def test_pairs_give_the_transform(rng, with_scale):
+def test_from_pairs_recovers_transform(rng, with_scale):
     true = rigid((40.0, -70.0, 100.0), (5.0, -3.0, 8.0))
     if with_scale:
         true[:3, :3] *= 2.5
@@ -116,7 +116,7 @@ def test_pairs_give_the_transform(rng, with_scale):
     assert np.linalg.det(mirrored[:3, :3]) == pytest.approx(1), "never a reflection"
 
 
-def test_what_decides_nothing_is_refused(rng):
+def test_registration_refuses_degenerate_input(rng):
     line = np.outer(np.arange(4.0), [1, 2, 3])
     for moved, fixed in ((line, line), (line[:2], line[:2]), (rng.normal(size=(4, 3)), line)):
         with pytest.raises(InvalidSetting, match=r"line|three or more"):
@@ -132,7 +132,7 @@ def test_what_decides_nothing_is_refused(rng):
     assert math.isfinite(ClosestPoints(*tissue()).extent)
 
 
-def test_triangles_of_almost_no_area_are_left_out():
+def test_closest_points_ignore_sliver_triangles():
     """Their normals are noise. The sliver is nearer to the query point than the sound triangle."""
     vertices = np.array([[0.0, 0, 0], [4, 0, 0], [0, 4, 0], [0, 0, 1], [4, 0, 1], [2, 1e-13, 1]])
     surface = ClosestPoints(vertices, np.array([[0, 1, 2], [3, 4, 5]]))
@@ -142,7 +142,7 @@ def test_triangles_of_almost_no_area_are_left_out():
 
 
 @pytest.mark.parametrize("size", [1e-7, 1e10])
-def test_meshes_of_an_implausible_size_are_refused(size):
+def test_closest_points_refuse_implausible_mesh_size(size):
     vertices = size * np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
     with pytest.raises(InvalidSetting, match="supported range is 1e-06 to 1e"):
         ClosestPoints(vertices, np.array([[0, 1, 2]]))
@@ -150,7 +150,7 @@ def test_meshes_of_an_implausible_size_are_refused(size):
 
 
 @pytest.mark.parametrize("count", [1, 2, 5])
-def test_the_closest_points_of_few_large_triangles_are_exact(rng, count):
+def test_closest_points_of_few_large_triangles_are_exact(rng, count):
     """Against the projection onto the plane, the edges and the corners of each triangle."""
     corners = rng.normal(size=(count, 3, 3)) * [10, 10, 1]
     points = 8 * rng.normal(size=(100, 3))
@@ -167,7 +167,7 @@ def test_the_closest_points_of_few_large_triangles_are_exact(rng, count):
     np.testing.assert_allclose(found.distances, exact, rtol=1e-9)
 
 
-def test_the_statistics_of_distances_are_those_of_their_values():
+def test_distance_summary_statistics():
     """Heights above a large flat triangle, one of them below it."""
     surface = ClosestPoints(np.array([[-50.0, -50, 0], [150, -50, 0], [-50, 150, 0]]), np.array([[0, 1, 2]]))
     heights = np.array([1.0, 2.0, 3.0, 4.0, -10.0, 0.0])
@@ -182,12 +182,12 @@ def test_the_statistics_of_distances_are_those_of_their_values():
 
 
 @pytest.mark.parametrize("trim", [0.05, 1.5, float("nan")])
-def test_a_trim_out_of_range_is_refused(trim):
+def test_register_refuses_trim_out_of_range(trim):
     with pytest.raises(InvalidSetting, match=r"it must be from 0\.1 to 1"):
         register(np.zeros((20, 3)), ClosestPoints(*tissue()), trim=trim)
 
 
-def test_a_registration_starts_from_the_guess_and_keeps_its_scale():
+def test_register_starts_from_initial_and_keeps_scale():
     surface = ClosestPoints(*tissue())
     points = tissue()[0]
     true = rigid((2.0, -1.0, 1.5), (0.5, -0.4, 0.6))
@@ -202,7 +202,7 @@ def test_a_registration_starts_from_the_guess_and_keeps_its_scale():
     assert 1 < found.rounds < 60
 
 
-def test_twelve_points_are_enough():
+def test_register_requires_twelve_points():
     surface = ClosestPoints(*tissue())
     points = tissue()[0][::250][:12]
     assert register(points + [0.1, 0, 0], surface).rounds >= 1
@@ -210,7 +210,7 @@ def test_twelve_points_are_enough():
         register(points[:11], surface)
 
 
-def test_points_nearly_on_a_line_decide_no_rotation():
+def test_from_pairs_refuses_nearly_collinear_points():
     line = np.outer(np.arange(6.0), [1.0, 2.0, 3.0])
     bent = line.copy()
     bent[2] += [0.03, 0.0, 0.0]
@@ -221,7 +221,7 @@ def test_points_nearly_on_a_line_decide_no_rotation():
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 7])
-def test_samples_of_a_triangle_are_the_centroids_of_its_equal_parts(n):
+def test_middles_are_centroids_of_equal_triangle_parts(n):
     """Coordinates in units of the parts are thirds; their whole numbers name the part."""
     found = _middles(n) * n
     assert found.shape == (n * n, 3)
@@ -233,7 +233,7 @@ def test_samples_of_a_triangle_are_the_centroids_of_its_equal_parts(n):
     np.testing.assert_allclose(found - whole, np.where(upright, 1 / 3, 2 / 3)[:, None].repeat(3, 1), atol=1e-9)
 
 
-def test_a_step_of_points_at_one_place_is_refused():
+def test_registration_step_refuses_coincident_points():
     """The size of the points is 0, by which their lever arms are divided."""
     normals = np.eye(3).repeat(4, 0)
     with pytest.raises(InvalidSetting, match="slide on each other"):
@@ -241,7 +241,7 @@ def test_a_step_of_points_at_one_place_is_refused():
 
 
 @pytest.mark.parametrize(("size", "is_refused"), [(1e-4, True), (1e-2, False)])
-def test_a_step_is_refused_if_one_motion_is_a_thousandth_as_certain_as_another(size, is_refused):
+def test_registration_step_refuses_badly_conditioned_motion(size, is_refused):
     """Normals that differ from one direction by `size`: two shifts are known by `size` relative to the third."""
     points = np.random.default_rng(0).normal(size=(60, 3))
     normals = np.tile([0.0, 0, 1], (60, 1))
@@ -254,7 +254,7 @@ def test_a_step_is_refused_if_one_motion_is_a_thousandth_as_certain_as_another(s
         np.testing.assert_allclose(_step(points, normals, gaps)[:3, 3], [-0.1, 0.2, -0.3], atol=1e-6)
 
 
-def test_the_closest_point_of_a_triangle_without_an_area_is_on_its_edges():
+def test_closest_on_degenerate_triangles_is_on_edges():
     """Three equal corners, and three corners on a line."""
     corners = np.array([[[1.0, 2, 3]] * 3, [[0, 0, 0], [2, 0, 0], [1, 0, 0]]])
     found = closest_on_triangles(np.array([[1.0, 2, 5], [1.5, 1, 0]]), corners)
@@ -262,7 +262,7 @@ def test_the_closest_point_of_a_triangle_without_an_area_is_on_its_edges():
 
 
 @pytest.mark.parametrize(("more", "is_refused"), [(0, False), (1, True)])
-def test_a_mesh_may_have_as_many_triangles_as_are_supported(monkeypatch, more, is_refused):
+def test_closest_points_limit_number_of_triangles(monkeypatch, more, is_refused):
     vertices, triangles = tissue()
     monkeypatch.setattr(registration, "MOST_TRIANGLES", len(triangles) - more)
     if is_refused:
@@ -273,7 +273,7 @@ def test_a_mesh_may_have_as_many_triangles_as_are_supported(monkeypatch, more, i
 
 
 @pytest.mark.parametrize("count", [2, 3])
-def test_three_pairs_are_enough(count):
+def test_from_pairs_requires_three_pairs(count):
     moved = np.array([[0.0, 0, 0], [10, 0, 0], [0, 10, 0]])[:count]
     if count == 2:
         with pytest.raises(InvalidSetting, match="three or more pairs"):

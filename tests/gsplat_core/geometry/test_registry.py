@@ -29,20 +29,20 @@ def origins(finder: DepthFinder, frames: list[Frame]) -> set[DepthOrigin | None]
 
 
 @pytest.mark.slow
-def test_parallax_is_looked_for_by_itself_only_where_there_is_time(stream):
+def test_auto_depth_uses_parallax_only_with_time(stream):
     """A camera that has to be kept up with gets none."""
     assert origins(DepthFinder("auto", FIRST, has_time=True), stream) == {None, DEPTH_ORIGINS["parallax"]}
     assert origins(DepthFinder("auto", FIRST), stream) == {None}
     assert origins(DepthFinder("parallax", FIRST), stream) == {None, DEPTH_ORIGINS["parallax"]}
 
 
-def test_nothing_is_learned_from_frames_that_are_only_shown(stream):
+def test_depth_finder_ignores_frames_only_shown(stream):
     finder = DepthFinder("auto", FIRST, has_time=True)
     assert all(finder.find(frame, shown_only=True) is None for frame in stream[:-1])
     assert finder.find(stream[-1]) is None, "no key frame came before"
 
 
-def test_depth_that_a_frame_came_with_is_taken_first(stream):
+def test_depth_finder_prefers_recorded_depth(stream):
     measured = np.full((HEIGHT, WIDTH), 3.0, np.float32)
     given = [frame.with_fields(depth=measured, depth_origin=DEPTH_ORIGINS["measured"]) for frame in stream]
     finder = DepthFinder("auto", FIRST, has_time=True)
@@ -50,7 +50,7 @@ def test_depth_that_a_frame_came_with_is_taken_first(stream):
     assert finder.with_depth(given[0], shown_only=True) is given[0]
 
 
-def test_a_stream_that_changes_its_size_keeps_its_camera(stream, monkeypatch):
+def test_depth_finder_resizes_camera_to_frame(stream, monkeypatch):
     asked = []
 
     class Watched:
@@ -65,12 +65,12 @@ def test_a_stream_that_changes_its_size_keeps_its_camera(stream, monkeypatch):
     assert asked == [(at := FIRST.with_pose(stream[1].pose)), at.resized(WIDTH // 2, HEIGHT // 2)]
 
 
-def test_another_name_is_refused():
+def test_depth_finder_refuses_unknown_estimator():
     with pytest.raises(InvalidSetting, match="depth is 'sonar'; choose auto, recorded"):
         DepthFinder("sonar", FIRST)
 
 
-def test_a_sentence_is_kept_once_whatever_its_numbers():
+def test_sentences_are_counted_regardless_of_numbers():
     said = Sentences()
     for sentence in ("rows are off: 2.1 px", None, "rows are off: 1.4 px", "too little texture"):
         said.add(sentence)

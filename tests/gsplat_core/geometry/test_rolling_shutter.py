@@ -23,13 +23,13 @@ def matrices_of(vectors: torch.Tensor) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-5, 0.3, 1.5, 2.0, 3.0])
-def test_a_rotation_vector_is_that_of_its_matrix(angle: float) -> None:
+def test_rotation_vector_inverts_rotation_matrix(angle: float) -> None:
     vectors = turns(angle)
     torch.testing.assert_close(rotation_vector(matrices_of(vectors)), vectors, rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-5, 0.3, 1.5, 3.0, 6.0])
-def test_vectors_are_rotated_as_by_the_matrix(angle: float) -> None:
+def test_rotated_equals_rotation_matrix(angle: float) -> None:
     vectors, points = turns(angle), torch.randn(20, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     expected = torch.einsum("nij,nj->ni", matrices_of(vectors), points)
     torch.testing.assert_close(rotated(vectors, points), expected, rtol=1e-7, atol=1e-9)
@@ -53,7 +53,7 @@ def test_rotations_and_rotation_vectors_are_differentiable_at_the_identity() -> 
         (KINDS.ROLLING_RIGHT_TO_LEFT, (39.5, 7.5), (0.5, 7.5), (20.0, 3.0)),
     ],
 )
-def test_rows_or_columns_are_read_from_the_first_to_the_last(kind, first, last, middle) -> None:
+def test_shutter_times_by_read_out_direction(kind, first, last, middle) -> None:
     pose = torch.eye(4)[None]
     poses = Shutter.of(pose, pose, kind)
     assert poses.times(torch.tensor([first, last, middle]), 40, 30).tolist() == pytest.approx([0, 1, 0.5])
@@ -68,7 +68,7 @@ def two_poses() -> tuple[torch.Tensor, torch.Tensor, Shutter]:
     return first, second, Shutter.of(first, second, KINDS.ROLLING_TOP_TO_BOTTOM)
 
 
-def test_the_pose_goes_from_the_first_to_the_second() -> None:
+def test_shutter_matrices_interpolate_between_poses() -> None:
     first, second, poses = two_poses()
     torch.testing.assert_close(poses.matrices(0.0), first)
     torch.testing.assert_close(poses.matrices(1.0), second)
@@ -78,7 +78,7 @@ def test_the_pose_goes_from_the_first_to_the_second() -> None:
     torch.testing.assert_close(2 * half, rotation_vector(second[:, :3, :3] @ first[:, :3, :3].transpose(1, 2)))
 
 
-def test_points_and_rays_at_a_time_are_those_of_the_pose_at_that_time() -> None:
+def test_shutter_points_and_rays_use_pose_at_time() -> None:
     _, _, poses = two_poses()
     generator = torch.Generator().manual_seed(4)
     points = torch.randn(1, 5, 3, generator=generator, dtype=torch.float64)

@@ -48,7 +48,7 @@ def off_by(found, disparity):
     return np.sqrt(np.mean((found.depth - depth)[seen] ** 2)) / np.median(depth), seen.mean()
 
 
-def test_a_known_surface_comes_out_in_millimetres(left, right):
+def test_stereo_depth_of_known_surface_is_in_millimetres(left, right):
     found = estimate(frame(left, right))
     error, believed = off_by(found, bowl())
     assert error < 0.005 and believed > 0.8
@@ -58,7 +58,7 @@ def test_a_known_surface_comes_out_in_millimetres(left, right):
 
 @pytest.mark.cuda
 @pytest.mark.parametrize("times", [1, 3])
-def test_on_a_gpu_it_is_as_on_the_cpu(left, right, gpu, times):
+def test_stereo_depth_on_cuda_equals_cpu(left, right, gpu, times):
     """Cover full-size matching and matching of reduced pictures."""
     size = WIDTH * times, HEIGHT * times
     wide = replace(camera(), K=camera().K * np.array([[times], [times], [1]]), width_px=size[0], height_px=size[1])
@@ -73,20 +73,20 @@ def test_on_a_gpu_it_is_as_on_the_cpu(left, right, gpu, times):
         assert np.abs(here.depth - there.depth)[both].max() < 1e-2 * np.median(here.depth[both])
 
 
-def test_the_range_is_found_wherever_it_is(left):
+def test_stereo_depth_finds_disparity_range(left):
     for low, high in ((3, 8), (60, 75)):
         disparity = bowl(low, high)
         error, believed = off_by(estimate(frame(left, right_of(left, disparity))), disparity)
         assert error < 0.02 and believed > 0.5, (low, high)
 
 
-def test_without_a_calibration_depth_is_in_units_of_the_eyes_distance(left, right):
+def test_stereo_depth_without_calibration_is_in_baselines(left, right):
     found = estimate(frame(left, right, calibrated=False))
     assert not found.metric
     assert off_by(replace(found, depth=found.depth * np.float32(BASELINE_MM)), bowl())[0] < 0.005
 
 
-def test_principal_points_may_differ_between_the_eyes(left, right):
+def test_stereo_depth_handles_different_principal_points(left, right):
     shifted = np.roll(right, -30, axis=1)
     given = frame(left, shifted)
     K = given.right_camera.K.copy()
@@ -95,7 +95,7 @@ def test_principal_points_may_differ_between_the_eyes(left, right):
     assert off_by(found, bowl())[0] < 0.01
 
 
-def test_the_same_frames_give_the_same_bytes_with_any_number_of_threads(left, right):
+def test_stereo_depth_is_deterministic_for_any_thread_count(left, right):
     threads = cv2.getNumThreads(), torch.get_num_threads()
     results = []
     try:
@@ -113,7 +113,7 @@ def test_the_same_frames_give_the_same_bytes_with_any_number_of_threads(left, ri
 
 
 @pytest.mark.parametrize("off_px", [-0.5, 0.7, 3.0])
-def test_rows_that_are_off_by_one_offset_are_moved_and_remarked_on(left, off_px):
+def test_stereo_depth_corrects_row_offset_with_remark(left, off_px):
     found = estimate(frame(left, right_of(left, bowl(), lower_px=off_px)))
     assert off_by(found, bowl())[0] < 0.01
     if abs(off_px) < 1:
@@ -142,18 +142,18 @@ def rotated(picture, degrees, scale=1.0):
         (lambda left, right: (left + 250, right + 250), "overexposed"),
     ],
 )
-def test_a_pair_that_is_none_is_doubted_and_nothing_of_it_believed(left, right, spoil, sentence):
+def test_stereo_depth_doubts_invalid_pair(left, right, spoil, sentence):
     found = estimate(frame(*spoil(left, right)))
     assert sentence in found.doubt
     assert not found.confidence.any() and not found.believed.any()
 
 
-def test_noise_of_a_dark_picture_is_no_texture(rng):
+def test_stereo_depth_doubts_dark_noise(rng):
     left, right = rng.integers(0, 4, (2, 240, 320)).astype(np.float32)
     assert "too little texture" in estimate(frame(left, right)).doubt
 
 
-def test_swapped_eyes_are_seen_without_a_calibration_too(left, right):
+def test_stereo_depth_detects_swapped_eyes_without_calibration(left, right):
     assert "the eyes are swapped" in estimate(frame(right, left, calibrated=False)).doubt
 
 
@@ -183,12 +183,12 @@ def wrong_camera(kind):
         ("columns", "some of the tissue would be behind the scope"),
     ],
 )
-def test_a_wrong_calibration_is_doubted(left, right, kind, sentence):
+def test_stereo_depth_doubts_wrong_calibration(left, right, kind, sentence):
     found = estimate(frame(left, right).with_fields(right_camera=wrong_camera(kind)))
     assert sentence in found.doubt and not found.confidence.any()
 
 
-def test_what_is_overexposed_is_not_believed(left, right):
+def test_stereo_depth_has_no_confidence_in_overexposed_pixels(left, right):
     left, right = left.copy(), right.copy()
     left[60:180, 100:220] = 255
     right[60:180, 75:195] = 255
@@ -198,13 +198,13 @@ def test_what_is_overexposed_is_not_believed(left, right):
     assert off_by(found, bowl())[1] > 0.4
 
 
-def test_a_doubtful_frame_does_not_spoil_the_next_one(left, right):
+def test_stereo_depth_recovers_after_doubtful_frame(left, right):
     estimator = StereoDepth()
     assert "too little texture" in estimator.estimate(frame(left * 0, right * 0), camera()).doubt
     assert off_by(estimator.estimate(frame(left, right, seq=1), camera()), bowl())[0] < 0.005
 
 
-def test_another_scene_is_looked_at_anew(left, right):
+def test_stereo_depth_searches_range_again_at_cut(left, right):
     estimator = StereoDepth()
     estimator.estimate(frame(left, right), camera())
     near = bowl(70, 90)
@@ -212,7 +212,7 @@ def test_another_scene_is_looked_at_anew(left, right):
     assert off_by(found, near)[0] < 0.02
 
 
-def test_a_pair_with_too_many_distances_is_doubted(left, right, monkeypatch):
+def test_stereo_depth_doubts_too_large_disparity_range(left, right, monkeypatch):
     monkeypatch.setattr("gsplat_core.depth.stereo.MARGIN_PX", 200)
     assert "range of distances is too large: 432 disparities" in estimate(frame(left, right)).doubt
     monkeypatch.setattr("gsplat_core.depth.stereo.MARGIN_PX", 4)
@@ -229,7 +229,7 @@ def test_a_pair_with_too_many_distances_is_doubted(left, right, monkeypatch):
     assert f"{most} disparities would have to be searched" in estimate(frame(left, right)).doubt
 
 
-def test_a_frame_with_one_eye_has_nothing_to_match(left, right):
+def test_stereo_depth_is_none_for_monocular_frame(left, right):
     assert estimate(frame(left, right).with_fields(right_image=None, right_camera=None)) is None
 
 
@@ -239,7 +239,7 @@ def surrounded(grey, rng):
     return np.where(np.abs(x) < 0.45, grey, 20 + rng.normal(0, 3, grey.shape)).astype(np.float32)
 
 
-def test_a_still_pair_has_the_same_depth_in_every_frame(left, right, rng):
+def test_stereo_depth_of_still_pair_is_identical_in_every_frame(left, right, rng):
     """Wrong matches must not widen the search range of the next frame, since that would change its depth."""
     eyes = surrounded(left, rng), surrounded(right, rng)
     estimator = StereoDepth()
@@ -250,7 +250,7 @@ def test_a_still_pair_has_the_same_depth_in_every_frame(left, right, rng):
     assert off_by(found[0], bowl())[1] > 0.2
 
 
-def test_tissue_that_comes_nearer_is_followed_between_two_looks(left):
+def test_stereo_depth_follows_approaching_tissue(left):
     estimator = StereoDepth()
     for seq, nearer in enumerate(np.linspace(1.0, 1.5, 20)):
         disparity = bowl() * np.float32(nearer)
@@ -259,17 +259,17 @@ def test_tissue_that_comes_nearer_is_followed_between_two_looks(left):
         assert error < 0.01 and believed > 0.7, f"frame {seq}"
 
 
-def test_the_span_has_a_fifth_and_four_pixels_of_margin():
+def test_widened_span_has_a_fifth_and_four_pixels_of_margin():
     assert stereo._widened((10.0, 30.0)) == pytest.approx((2.0, 38.0))
 
 
 @pytest.mark.parametrize(("width", "factor"), [(100, 1), (800, 1), (801, 2), (1600, 2), (1601, 3)])
-def test_pictures_wider_than_800_pixels_are_matched_smaller(width, factor):
+def test_shrink_of_pictures_wider_than_800_pixels(width, factor):
     assert stereo.shrink_of(width) == factor
 
 
 @pytest.mark.parametrize(("confidence", "width", "variance"), [(0.5, 640, 0.25), (0.2, 640, 1.0), (0.5, 1280, 1.0), (1.0, 640, 0.0)])  # fmt: skip
-def test_variance_of_a_disparity_is_that_of_half_a_pixel_at_half_a_confidence(confidence, width, variance):
+def test_stereo_variance_px2_by_confidence_and_width(confidence, width, variance):
     found = stereo.variance_px2(np.full((1, 1), confidence, np.float32), width, 0.0)
     assert found[0, 0] == pytest.approx(variance)
     beside = stereo.variance_px2(np.full((1, 1), confidence, np.float32), width, 2.0)
@@ -296,12 +296,12 @@ def right_camera(turn=0.0, up=0.0, focal=1.0, row=0.0, baseline=BASELINE_MM):
         ({"row": -1.01}, "principal points"), ({"row": 0.99}, None), ({"baseline": -4.0}, "swapped"),
     ],
 )  # fmt: skip
-def test_limits_of_a_rectified_pair(given, said):
+def test_why_not_rectified_at_limits(given, said):
     found = stereo._why_not_rectified(camera(), right_camera(**given))
     assert found is None if said is None else said in found
 
 
-def test_depth_times_disparity_is_the_focal_length_times_the_baseline(left, right):
+def test_reach_of_is_focal_length_times_baseline(left, right):
     given = frame(left, right)
     assert stereo.reach_of(given, camera()) == pytest.approx(FOCAL_PX * BASELINE_MM)
     assert stereo.reach_of(replace(given, right_camera=None), camera()) == pytest.approx(FOCAL_PX)
@@ -310,21 +310,21 @@ def test_depth_times_disparity_is_the_focal_length_times_the_baseline(left, righ
 @pytest.mark.parametrize(
     ("behind", "said"), [(0.0, None), (0.02, None), (0.03, "behind the scope"), (0.5, "behind the scope"), (0.51, "swapped")]
 )  # fmt: skip
-def test_stereo_is_doubted_by_the_share_of_points_behind_the_scope(behind, said):
+def test_why_implausible_by_share_of_points_behind_scope(behind, said):
     count = round(100 * behind)
     look = SimpleNamespace(disparities=np.array([-20.0] * count + [20.0] * (100 - count)) + 7)
     found = stereo._why_implausible(look, 7.0, calibrated=True)
     assert found is None if said is None else said in found
 
 
-def test_rows_that_are_off_make_disparities_uncertain_towards_the_border():
+def test_off_along_rows_grows_towards_border():
     off = stereo._off_along_rows(np.array([3.0, 0.4, 0.6]), 3, 5, torch.device("cpu"))
     assert off[1, 2] == 0
     assert off[2, 2] == pytest.approx(0.4 * 3 / 5) and off[1, 4] == pytest.approx(0.6 * 5 / 3)
     assert off[0, 0] == pytest.approx(np.hypot(0.24, 1.0))
 
 
-def test_depth_that_contradicts_followed_points_is_doubted(left, right, monkeypatch):
+def test_stereo_depth_doubts_contradiction_with_tracked_points(left, right, monkeypatch):
     found = stereo.find_disparity
 
     def wrong(here, there, span):
@@ -337,7 +337,7 @@ def test_depth_that_contradicts_followed_points_is_doubted(left, right, monkeypa
     assert "two ways of matching the eyes contradict each other" in estimate(frame(left, right)).doubt
 
 
-def test_a_round_field_of_view_is_left_out(left, right):
+def test_stereo_depth_ignores_outside_of_round_field_of_view(left, right):
     rows, columns = np.indices(left.shape[:2]) + 0.5
     inside = np.hypot(columns - left.shape[1] / 2, rows - left.shape[0] / 2) < 0.45 * left.shape[0]
     seen = [
@@ -350,7 +350,7 @@ def test_a_round_field_of_view_is_left_out(left, right):
     assert error < 0.005 and believed > 0.2
 
 
-def test_the_interval_contains_the_depth_and_grows_with_the_row_error(left, right):
+def test_standard_error_covers_depth_and_grows_with_row_error(left, right):
     estimator, pair = StereoDepth(), frame(left, right)
     found = estimator.estimate(pair, camera())
     error = estimator.standard_error(found, pair, camera())
@@ -367,7 +367,7 @@ def test_the_interval_contains_the_depth_and_grows_with_the_row_error(left, righ
         assert each.error == pytest.approx(np.median(errors[sure] / each.depth[sure]), rel=0.05)
 
 
-def test_an_error_of_disparity_is_one_of_depth_by_its_square():
+def test_depth_error_grows_with_squared_depth():
     """A focal length of 100 pixels and a baseline of 4: 400 at 20 pixels is 20 away, and at 20.1 pixels 0.0995 nearer."""
     pose = np.eye(4)
     pose[0, 3] = -4
@@ -380,7 +380,7 @@ def test_an_error_of_disparity_is_one_of_depth_by_its_square():
     np.testing.assert_allclose(stereo._depth_error(variance, depth, frame, camera), [[0.4, 3.2]], rtol=1e-6)
 
 
-def test_points_of_both_eyes_keep_three_pixels_from_overexposed_ones():
+def test_points_in_both_keep_three_columns_from_overexposed():
     left = np.random.default_rng(0).uniform(40, 200, (60, 80)).astype(np.float32)
     left = np.clip(cv2.resize(left, (240, 180), interpolation=cv2.INTER_CUBIC), 0, 240).astype(np.uint8)
     for column in range(20, 230, 16):
@@ -393,7 +393,7 @@ def test_points_of_both_eyes_keep_three_pixels_from_overexposed_ones():
     np.testing.assert_allclose(np.median(here - there, axis=0), [6, 0], atol=0.1)
 
 
-def test_points_of_both_eyes_keep_three_pixels_from_overexposed_rows():
+def test_points_in_both_keep_three_rows_from_overexposed():
     left = np.random.default_rng(0).uniform(40, 200, (60, 80)).astype(np.float32)
     left = np.clip(cv2.resize(left, (240, 180), interpolation=cv2.INTER_CUBIC), 0, 240).astype(np.uint8)
     bright = np.array([row for start in range(20, 170, 16) for row in (start, start + 1)])
@@ -405,7 +405,7 @@ def test_points_of_both_eyes_keep_three_pixels_from_overexposed_rows():
 
 
 @pytest.mark.parametrize("calibrated", [True, False])
-def test_a_pair_with_a_right_camera_is_judged_as_a_calibrated_one(monkeypatch, calibrated):
+def test_pair_with_right_camera_is_checked_as_calibrated(monkeypatch, calibrated):
     asked = []
     look = stereo.PairCheck(np.arange(10.0), np.zeros(3), np.zeros((10, 2), np.float32), 0.1)
     monkeypatch.setattr(stereo, "check_pair", lambda left, right, mask: look)
@@ -419,7 +419,7 @@ def test_a_pair_with_a_right_camera_is_judged_as_a_calibrated_one(monkeypatch, c
     assert asked == [calibrated] and found.doubt == "it is"
 
 
-def test_windows_are_inside_of_the_field_of_view_of_both_eyes():
+def test_inside_both_requires_window_in_both_fields_of_view():
     """A disparity of 20 pixels shows a pixel 20 to the left in the other eye, which needs a column there, too."""
     usable = np.zeros((60, 100), np.uint8)
     usable[:, :80] = 1

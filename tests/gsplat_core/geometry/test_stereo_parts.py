@@ -22,14 +22,14 @@ def texture(seed: int = 0, width: int = WIDTH, height: int = HEIGHT) -> np.ndarr
     return cv2.resize(small, (width, height), interpolation=cv2.INTER_CUBIC).clip(0, 255).astype(np.uint8)
 
 
-def test_positions_are_shares_of_the_picture_from_its_middle() -> None:
+def test_basis_normalises_positions_to_picture() -> None:
     at = np.array([[0.0, 0.0], [320.0, 200.0], [160.0, 50.0]])
     assert _basis(at, 320, 200).tolist() == [[1, -1, -1], [1, 1, 1], [1, 0, -0.5]]
 
 
 @pytest.mark.parametrize("rows", [(0.0, 0.0, 0.0), (2.5, 0.0, 0.0), (-1.0, 0.4, -0.3), (6.0, -0.8, 0.5)])
 @pytest.mark.parametrize("wrong", [0, 60])
-def test_rows_are_fitted_by_a_linear_function_although_points_are_wrong(rows: tuple[float, ...], wrong: int) -> None:
+def test_fitted_rows_are_robust_to_outliers(rows: tuple[float, ...], wrong: int) -> None:
     rng = np.random.default_rng(0)
     here = rng.uniform([0, 0], [WIDTH, HEIGHT], (200, 2)).astype(np.float32)
     lower = _basis(here, WIDTH, HEIGHT) @ np.array(rows) + rng.normal(0, 0.05, 200)
@@ -40,21 +40,21 @@ def test_rows_are_fitted_by_a_linear_function_although_points_are_wrong(rows: tu
 
 
 @pytest.mark.parametrize(("off", "is_inlier"), [(0.9, True), (1.1, False), (-0.9, True), (-1.1, False)])
-def test_a_point_is_an_inlier_within_the_error_of_rows(off: float, is_inlier: bool) -> None:
+def test_fitted_rows_inlier_threshold(off: float, is_inlier: bool) -> None:
     here = np.random.default_rng(1).uniform([0, 0], [WIDTH, HEIGHT], (400, 2)).astype(np.float32)
     lower = np.zeros(400)
     lower[0] = off * ROW_ERROR_PX
     assert _fitted_rows(here, lower, WIDTH, HEIGHT)[1][0] == is_inlier
 
 
-def test_points_on_one_row_have_a_slope_only_along_it() -> None:
+def test_fitted_rows_of_single_row_have_no_vertical_slope() -> None:
     """Slopes that the points do not tell are 0."""
     here = np.stack([np.linspace(0, WIDTH, 50), np.full(50, HEIGHT / 2)], 1).astype(np.float32)
     found, _ = _fitted_rows(here, _basis(here, WIDTH, HEIGHT) @ np.array([1.0, 0.2, 0.0]), WIDTH, HEIGHT)
     np.testing.assert_allclose(found, [1.0, 0.2, 0.0], atol=1e-3)
 
 
-def test_a_disparity_is_known_where_both_pictures_show_the_pixel() -> None:
+def test_within_both_marks_pixels_in_both_pictures() -> None:
     found = np.array([[0, 1.0, 3.0, -1.0, 0.5], [-4.0, 1.0, -2.0, 0.0, -0.5]], np.float32)
     kept, known = _within_both(found, np.array([[True] * 5, [True, False, True, True, True]]))
     assert kept is found
@@ -63,7 +63,7 @@ def test_a_disparity_is_known_where_both_pictures_show_the_pixel() -> None:
 
 @pytest.mark.parametrize("size", [(320, 200), (640, 400), (200, 320)])
 @pytest.mark.parametrize("share", [0.0, 0.06, -0.03])
-def test_coarse_disparities_are_those_of_the_full_picture(size: tuple[int, int], share: float) -> None:
+def test_coarse_disparity_is_in_full_picture_pixels(size: tuple[int, int], share: float) -> None:
     width, height = size
     shift = round(share * width)
     wide = texture(3, 2 * width, height)
@@ -74,9 +74,7 @@ def test_coarse_disparities_are_those_of_the_full_picture(size: tuple[int, int],
 
 
 @pytest.mark.parametrize("is_even", [False, True])
-def test_points_have_the_typical_disparity_where_none_is_found_and_none_in_an_even_picture(
-    monkeypatch: pytest.MonkeyPatch, is_even: bool
-) -> None:
+def test_coarse_disparity_falls_back_to_typical_value(monkeypatch: pytest.MonkeyPatch, is_even: bool) -> None:
     at = np.array([[10.0, 10], [100, 50], [310, 190]], np.float32)
 
     def match(left: np.ndarray, right: np.ndarray, span: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -127,7 +125,7 @@ def test_implausible_disparities_are_rejected_with_a_reason(
 
 
 @pytest.mark.parametrize(("off", "is_said"), [(0.0, False), (0.9, False), (1.0, True), (-1.5, True)])
-def test_rows_that_were_moved_by_a_pixel_are_remarked_on(off: float, is_said: bool) -> None:
+def test_remark_for_rows_moved_by_a_pixel(off: float, is_said: bool) -> None:
     depth = StereoDepth()
     depth._rows = [np.array([off, 0, 0]), np.array([off + 5, 0, 0]), np.array([off - 7, 0, 0])]
     said = depth._remark(50.0, 400.0)
@@ -157,7 +155,7 @@ def estimate(given: np.ndarray, metric: bool = True) -> tuple[StereoDepth, Any]:
 
 
 @pytest.mark.parametrize(("share", "is_doubted"), [(0.049, True), (0.051, False)])
-def test_a_twentieth_of_the_picture_must_be_matched(share: float, is_doubted: bool) -> None:
+def test_stereo_depth_requires_a_twentieth_of_pixels_matched(share: float, is_doubted: bool) -> None:
     depth, found = estimate(planes(share))
     assert (found.doubt is not None) == is_doubted
     assert depth._frames_to_check == (0 if is_doubted else 7), "the next frame is looked at again"
@@ -167,14 +165,14 @@ def test_a_twentieth_of_the_picture_must_be_matched(share: float, is_doubted: bo
     ("middle", "metric", "is_doubted"),
     [(1.9, True, True), (2.1, True, False), (990.0, True, False), (1010.0, True, True), (1010.0, False, False)],
 )
-def test_distances_within_a_body_are_plausible(middle: float, metric: bool, is_doubted: bool) -> None:
+def test_stereo_depth_doubts_implausible_metric_distance(middle: float, metric: bool, is_doubted: bool) -> None:
     _, found = estimate(planes(0.5, 0.99 * middle, 1.01 * middle), metric)
     assert (found.doubt is not None) == is_doubted
     if not is_doubted:
         assert found.metric == metric
 
 
-def test_the_range_that_was_seen_is_that_of_believed_depth_and_is_widened() -> None:
+def test_seen_range_is_of_believed_depth_and_widens_span() -> None:
     depth, _ = estimate(planes(0.5))
     assert depth._seen == pytest.approx((200 * 4 / 60 + 3, 200 * 4 / 40 + 3), rel=0.01)
     assert depth._span is not None and depth._seen is not None
@@ -202,14 +200,14 @@ def seen_pair(monkeypatch: pytest.MonkeyPatch, corners: int, found: int, rows: A
         (121, 24, "different content"), (400, 79, "different content"), (400, 80, None),
     ],
 )  # fmt: skip
-def test_a_fifth_of_the_corners_and_two_dozen_are_found(
+def test_check_pair_requires_24_and_a_fifth_of_corners_found(
     monkeypatch: pytest.MonkeyPatch, corners: int, found: int, said: str | None
 ) -> None:
     doubt = seen_pair(monkeypatch, corners, found).doubt
     assert doubt is None if said is None else said in doubt
 
 
-def test_a_picture_of_saturated_pixels_is_overexposed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_check_pair_reports_overexposed_picture(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "is overexposed" in seen_pair(monkeypatch, 3, 3, bright=True).doubt
 
 
@@ -226,14 +224,12 @@ def slanted(offset: float, right: float, down: float) -> Any:
         (lambda here: np.linspace(-40, 40, len(here)), "not in common rows"),
     ],
 )  # fmt: skip
-def test_rows_of_a_rectified_pair_differ_by_little_and_uniformly(
-    monkeypatch: pytest.MonkeyPatch, rows: Any, said: str | None
-) -> None:
+def test_check_pair_limits_of_row_differences(monkeypatch: pytest.MonkeyPatch, rows: Any, said: str | None) -> None:
     doubt = seen_pair(monkeypatch, 300, 300, rows).doubt
     assert doubt is None if said is None else said in doubt
 
 
-def test_the_error_of_disparities_is_that_of_the_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_check_pair_error_px_is_row_noise(monkeypatch: pytest.MonkeyPatch) -> None:
     noise = np.random.default_rng(1).normal(0, 0.2, 300)
     found = seen_pair(monkeypatch, 300, 300, lambda here: 1.0 + noise)
     assert found.error_px == pytest.approx(0.2, rel=0.15)
@@ -248,7 +244,7 @@ def test_the_error_of_disparities_is_that_of_the_rows(monkeypatch: pytest.Monkey
         ((10.0, 20.0), (10.0, 20.0)),
     ],
 )  # fmt: skip
-def test_a_range_only_grows_and_by_one_margin_at_most(seen: tuple[float, float], span: tuple[float, float]) -> None:
+def test_widen_to_grows_span_by_one_margin_at_most(seen: tuple[float, float], span: tuple[float, float]) -> None:
     """A look from 14 to 16 px may be widened by a margin of 4.4 px."""
     depth = StereoDepth()
     depth._checked, depth._span = (14.0, 16.0), (14.0, 18.0)

@@ -12,7 +12,7 @@ from gsplat_core.scene.frames import Frame
 
 
 @pytest.mark.recordings
-def test_scared_pair_against_its_disparity(recordings_dir):
+def test_stereo_depth_of_scared_pair_matches_true_disparity(recordings_dir):
     folder = recordings_dir / "scared_pair"
     left, right = (cv2.imread(str(folder / f"{eye}.png"))[..., ::-1].copy() for eye in ("left", "right"))
     truth = cv2.imread(str(folder / "disparity.tiff"), cv2.IMREAD_UNCHANGED)

@@ -37,7 +37,7 @@ def begun(pictures: SmallPictures, **fields) -> StreamTracks:
     return tracks
 
 
-def test_points_follow_a_shifted_picture_and_keep_their_numbers():
+def test_stream_tracks_follow_shift_and_keep_numbers():
     pictures = SmallPictures(CAMERA)
     tracks = begun(pictures)
     start, numbers = tracks.pixels.copy(), tracks.numbers.copy()
@@ -51,7 +51,7 @@ def test_points_follow_a_shifted_picture_and_keep_their_numbers():
     np.testing.assert_array_equal(tracks.first, start[kept])
 
 
-def test_nothing_is_followed_on_a_tool_or_a_highlight():
+def test_stream_tracks_exclude_tools_and_highlights():
     mask = np.ones((120, 160), np.uint8)
     mask[:, 100:] = 0
     tracks = begun(SmallPictures(CAMERA), mask=mask)
@@ -63,7 +63,7 @@ def test_nothing_is_followed_on_a_tool_or_a_highlight():
     assert not usable[60:66, 40:46].any() and usable[30:50, 30:60].all()
 
 
-def test_large_pictures_are_followed_small_and_rays_stay():
+def test_small_pictures_keep_rays():
     camera = Camera.from_focal(600.0, 640, 480)
     picture = SmallPictures(camera).of(Frame(0, 0, np.zeros((480, 640, 3), np.uint8)))
     assert picture.grey.shape == (240, SIDE_PX)
@@ -74,14 +74,14 @@ def test_large_pictures_are_followed_small_and_rays_stay():
     np.testing.assert_allclose(picture.rays(picture.pixels(local)), local[:, :2] / 2, atol=1e-5)
 
 
-def test_a_picture_of_another_size_shows_none_of_the_points():
+def test_stream_tracks_follow_nothing_in_picture_of_other_size():
     pictures = SmallPictures(CAMERA)
     tracks = begun(pictures)
     numbers, pixels = tracks.follow(pictures.of(Frame(1, 1, textured()[:100, :100].copy())), tracks.pixels)
     assert len(numbers) == len(pixels) == 0 < len(tracks.numbers)
 
 
-def test_points_that_are_known_again_take_the_place_of_those_that_are_there():
+def test_stream_tracks_adopt_replaces_points_in_place():
     tracks = begun(SmallPictures(CAMERA))
     count = len(tracks.numbers)
     later = tracks.numbers[5:].copy()
@@ -102,7 +102,7 @@ def wide(seed: int = 0) -> Frame:
 WIDE = Camera.from_focal(300.0, 320, 256)
 
 
-def test_at_most_220_points_three_per_cent_of_the_longer_side_apart_and_off_the_border():
+def test_stream_tracks_point_count_spacing_and_border():
     tracks = StreamTracks()
     tracks.begin(SmallPictures(WIDE).of(wide()))
     assert len(tracks.take_up()) == len(tracks.numbers) == 220
@@ -111,7 +111,7 @@ def test_at_most_220_points_three_per_cent_of_the_longer_side_apart_and_off_the_
     assert tracks.pixels.min() >= 6 and tracks.pixels.max(0).tolist() <= [313, 249]
 
 
-def test_missing_points_are_replaced_from_a_tenth():
+def test_stream_tracks_replace_points_if_a_tenth_is_missing():
     tracks = StreamTracks()
     tracks.begin(SmallPictures(WIDE).of(wide()))
     tracks.take_up()
@@ -123,12 +123,12 @@ def test_missing_points_are_replaced_from_a_tenth():
     assert np.array_equal(tracks.numbers, np.sort(tracks.numbers))
 
 
-def test_nothing_is_taken_up_before_the_first_picture():
+def test_stream_tracks_take_up_nothing_before_first_picture():
     tracks = StreamTracks()
     assert len(tracks.take_up()) == 0 and tracks.picture is None
 
 
-def test_a_position_is_shown_where_its_nearest_pixel_is_usable():
+def test_small_picture_shows_by_nearest_usable_pixel():
     usable = np.zeros((20, 30), np.uint8)
     usable[0, 0] = usable[19, 29] = usable[7, 11] = 255
     picture = SmallPicture(np.zeros((20, 30), np.uint8), usable, WIDE.resized(30, 20))
@@ -139,7 +139,7 @@ def test_a_position_is_shown_where_its_nearest_pixel_is_usable():
     assert shown.tolist() == [True, True, False, True, False, False, True, False, False]
 
 
-def test_points_behind_the_camera_project_far_outside_and_the_centre_to_the_principal_point():
+def test_small_picture_pixels_of_points_behind_camera_are_far_outside():
     picture = SmallPictures(WIDE).of(wide())
     pixels = picture.pixels(np.array([[0.0, 0.0, 5.0], [1.0, -1.0, -2.0], [0.1, 0.2, 2.0]]))
     np.testing.assert_allclose(pixels[0], [159.5, 127.5])
@@ -147,7 +147,7 @@ def test_points_behind_the_camera_project_far_outside_and_the_centre_to_the_prin
     np.testing.assert_allclose(pixels[2], [159.5 + 15, 127.5 + 30])
 
 
-def test_tools_keep_half_a_patch_away_and_small_pictures_their_size():
+def test_small_picture_usable_margin_from_tools():
     mask = np.ones((256, 320), np.uint8)
     mask[:, 200:] = 0
     picture = SmallPictures(WIDE).of(wide().with_fields(mask=mask))
@@ -158,7 +158,7 @@ def test_tools_keep_half_a_patch_away_and_small_pictures_their_size():
     assert (rows.min(), rows.max()) == (6, 249)
 
 
-def test_points_that_come_back_within_half_a_pixel_are_found_again():
+def test_found_again_trusts_points_returning_within_half_a_pixel():
     pictures = SmallPictures(WIDE)
     first = pictures.of(wide(1))
     moved = np.roll(wide(1).image, (3, 4), (0, 1))
@@ -170,7 +170,7 @@ def test_points_that_come_back_within_half_a_pixel_are_found_again():
     np.testing.assert_allclose(there[:2], points[:2] + [4, 3], atol=0.05)
 
 
-def test_an_adopted_point_replaces_those_within_three_pixels():
+def test_stream_tracks_adopt_replaces_points_within_three_pixels():
     tracks = StreamTracks()
     tracks.begin(SmallPictures(WIDE).of(wide()))
     tracks.take_up()
@@ -181,7 +181,7 @@ def test_an_adopted_point_replaces_those_within_three_pixels():
     np.testing.assert_allclose(tracks.first[:2], at + [[2.5, 0], [0, 3.5]])
 
 
-def test_a_new_scene_begins_without_points():
+def test_stream_tracks_begin_clears_points():
     tracks = begun(SmallPictures(CAMERA))
     last = tracks.numbers.max()
     tracks.begin(SmallPictures(CAMERA).of(frame(seed=1)))
@@ -190,7 +190,7 @@ def test_a_new_scene_begins_without_points():
 
 
 @pytest.mark.parametrize(("misses_px", "is_trusted"), [(0.49, True), (0.51, False), (np.inf, False)])
-def test_a_way_back_that_misses_by_half_a_pixel_is_not_trusted(monkeypatch, misses_px, is_trusted):
+def test_found_again_threshold_is_half_a_pixel(monkeypatch, misses_px, is_trusted):
     picture = SmallPictures(WIDE).of(wide(1))
     points = np.array([[60, 60]], np.float32)
     monkeypatch.setattr(tracks, "followed", lambda *_, **__: (points + 1, np.array([misses_px])))

@@ -30,7 +30,7 @@ def plane(camera: Camera, normal: np.ndarray, distance: float) -> np.ndarray:
 
 @pytest.mark.parametrize("camera", CAMERAS, ids=lambda camera: camera.model)
 @pytest.mark.parametrize("tilt", [(0.0, 0.0), (0.3, -0.2), (-0.5, 0.4)])
-def test_a_plane_has_one_normal_and_its_points_lie_on_it(camera, tilt):
+def test_points_and_normals_of_plane(camera, tilt):
     normal = np.array([*tilt, -1.0]) / math.hypot(*tilt, 1.0)
     depth = plane(camera, normal, 60.0)
     assert np.abs((points_of(depth, camera) - [0, 0, 60.0]) @ normal).max() < 1e-9
@@ -38,7 +38,7 @@ def test_a_plane_has_one_normal_and_its_points_lie_on_it(camera, tilt):
     assert off.max() < 0.1
 
 
-def test_points_come_back_to_their_pixels_in_the_world():
+def test_points_in_world_reproject_to_pixels():
     angle = 0.3
     pose = np.eye(4)
     pose[:3, :3] = [[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]]
@@ -50,7 +50,7 @@ def test_points_come_back_to_their_pixels_in_the_world():
     assert np.allclose(local[..., 2], 30.0) and np.allclose(pixels[7, 9], [9.5, 7.5])
 
 
-def test_a_surface_is_torn_where_another_one_begins():
+def test_joined_is_false_at_depth_step():
     depth = np.full((36, 44), 60.0, np.float32)
     depth[:, 20:] = 40.0
     across = joined(depth, CAMERA, 1)
@@ -59,7 +59,7 @@ def test_a_surface_is_torn_where_another_one_begins():
     assert np.allclose(normals, [0, 0, -1], atol=1e-6)  # from the neighbours on either side's own surface
 
 
-def test_what_is_unknown_has_no_normal():
+def test_normals_of_unknown_depth_are_zero():
     depth = np.full((36, 44), 60.0, np.float32)
     depth[:, ::2] = [[0.0]]
     depth[3, 3], depth[5, 5], depth[7, 7] = np.nan, np.inf, -4.0
@@ -71,7 +71,7 @@ def test_what_is_unknown_has_no_normal():
         normals_of(depth[1:], CAMERA)
 
 
-def test_normals_of_tissue_are_those_of_the_sheet():
+def test_normals_of_synthetic_tissue_are_exact():
     scene = SyntheticScene.from_seed(3, 160, 128, 2.0, moving=True)
     camera = scene.camera_at(1.0)
     rays = pixel_rays(camera)
@@ -85,7 +85,7 @@ def test_normals_of_tissue_are_those_of_the_sheet():
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.01, 0.5, 1.2, 1.45])
-def test_fisheye_rays_have_the_angle_of_an_equidistant_lens(angle):
+def test_fisheye_rays_equal_equidistant_lens(angle):
     """A ray at an angle to the axis is seen at the focal length times the angle from the centre."""
     along = np.array([0.6, -0.8])
     camera = Camera(np.array([[50.0, 0, 21], [0, 45.0, 17], [0, 0, 1]]), 44, 36, model="fisheye")
@@ -94,7 +94,7 @@ def test_fisheye_rays_have_the_angle_of_an_equidistant_lens(angle):
     assert not start.any()
 
 
-def test_fisheye_rays_beyond_86_degrees_are_those_of_86_degrees():
+def test_fisheye_rays_are_limited_to_86_degrees():
     camera = Camera(np.array([[5.0, 0, 21], [0, 5.0, 17], [0, 0, 1]]), 44, 36, model="fisheye")
     _, step = rays_of(camera, np.array([[21.0 + 5 * 1.5, 17.0], [43.5, 17.0], [21.0, 0.5]]))
     np.testing.assert_allclose(step, [[14.1014, 0, 1], [14.1014, 0, 1], [0, -14.1014, 1]], rtol=1e-5)
@@ -102,7 +102,7 @@ def test_fisheye_rays_beyond_86_degrees_are_those_of_86_degrees():
 
 @pytest.mark.parametrize("axis", [0, 1])
 @pytest.mark.parametrize("camera", CAMERAS[:2], ids=lambda camera: camera.model)
-def test_a_surface_is_torn_from_eighty_degrees_against_the_line_of_sight(camera, axis):
+def test_joined_tears_surface_tilted_over_80_degrees(camera, axis):
     """The step in depth of a surface tilted by 80 degrees is 5.67 times the width of a pixel there."""
     middle = 60.0
     width = 1 / (camera.K[1 - axis, 1 - axis]) * (1.0 if camera.model == "ortho" else middle)
@@ -114,7 +114,7 @@ def test_a_surface_is_torn_from_eighty_degrees_against_the_line_of_sight(camera,
         assert np.take(joined(depth, camera, axis), 8, axis).all()
 
 
-def test_normals_at_an_edge_are_those_of_the_neighbour_that_is_connected():
+def test_normals_at_edge_use_connected_neighbour():
     """A roof with a tear beside its ridge: each side keeps its own slope."""
     x = (np.arange(44) + 0.5 - 21) / 50
     depth = np.tile(np.where(np.arange(44) < 22, 60 / (1 - 0.5 * x), 90 / (1 + 0.25 * x)), (36, 1))

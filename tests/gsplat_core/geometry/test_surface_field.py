@@ -13,7 +13,7 @@ def sheet(count: int = 400) -> torch.Tensor:
     return torch.cat([across, 1 + 0.1 * torch.sin(9 * across[:, :1])], 1)
 
 
-def test_nodes_have_their_own_vectors_and_points_those_around_them():
+def test_surface_field_influence_at_nodes_and_points():
     points = sheet()
     field = SurfaceField.over(points)
     own = field.influence(field.nodes)
@@ -21,7 +21,7 @@ def test_nodes_have_their_own_vectors_and_points_those_around_them():
     torch.testing.assert_close(field.influence(points).sum(1), torch.ones(len(points)).double(), atol=0.01, rtol=0)
 
 
-def test_rigid_motions_and_slow_waves_are_kept():
+def test_surface_field_reproduces_rigid_motion_and_slow_waves():
     points = sheet()
     field = SurfaceField.over(points)
     for motion in (
@@ -34,13 +34,13 @@ def test_rigid_motions_and_slow_waves_are_kept():
         assert float(off.max()) < 0.15 and float(off.median()) < 0.01  # the largest are at the border of the sheet
 
 
-def test_what_bends_more_is_less_likely():
+def test_surface_field_stiffness_grows_with_bending():
     field = SurfaceField.over(sheet())
     unlikely = [float(v @ field.stiffness @ v) for v in (torch.sin(bends * field.nodes[:, 0]) for bends in (1, 6, 20))]
     assert unlikely[0] < unlikely[1] < unlikely[2]
 
 
-def test_nodes_are_few_and_apart_however_many_points_there_are():
+def test_surface_field_nodes_are_limited_and_spaced():
     points = torch.cat([sheet(), sheet() + 1e-9])
     field = SurfaceField.over(points, most=25)
     assert len(field.nodes) == 25

@@ -17,7 +17,7 @@ def plane_at(pixels: np.ndarray) -> np.ndarray:
     return 1 / (0.02 + 1e-5 * pixels[..., 0] - 2e-5 * pixels[..., 1])
 
 
-def test_a_plane_is_found_at_each_pixel_also_beyond_the_points() -> None:
+def test_surface_through_plane_points_extrapolates_plane() -> None:
     pixels = points(500)
     pixels = pixels[pixels[:, 0] < 90]
     depth, error, support = surface_through(pixels, plane_at(pixels), np.full(len(pixels), 0.01), SIZE)
@@ -29,7 +29,7 @@ def test_a_plane_is_found_at_each_pixel_also_beyond_the_points() -> None:
     assert (support[:, -5:] < 0.2).all()
 
 
-def test_what_is_less_certain_counts_less() -> None:
+def test_surface_through_downweights_uncertain_points() -> None:
     pixels = np.tile(points(800), (2, 1))
     depth, error = np.repeat([50.0, 60.0], 800), np.repeat([0.005, 0.2], 800)
     found, of_found, _ = surface_through(pixels, depth, error, SIZE)
@@ -37,7 +37,7 @@ def test_what_is_less_certain_counts_less() -> None:
     assert of_found.max() < 0.02
 
 
-def test_few_points_and_none_are_no_error() -> None:
+def test_surface_through_few_or_no_points_is_finite() -> None:
     for count in (0, 1, 2):
         pixels = points(count)
         depth, _, support = surface_through(pixels, np.full(count, 30.0), np.full(count, 0.01), SIZE)

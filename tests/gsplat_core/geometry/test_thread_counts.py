@@ -42,7 +42,7 @@ def breathing():
 # 6 unknowns a camera: LAPACK shares a system of more than about 128 unknowns among threads, and BLAS even short products.
 @pytest.mark.parametrize(("cameras", "points"), [(3, 400), (8, 60), (26, 200), (40, 400)])
 @pytest.mark.parametrize("points_move", [True, False])
-def test_bundle_adjustment(cameras, points, points_move):
+def test_bundle_adjustment_is_identical_for_any_thread_count(cameras, points, points_move):
     start = disturbed(known_scene(cameras, points))
 
     def adjusted():
@@ -56,7 +56,7 @@ def test_bundle_adjustment(cameras, points, points_move):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("with_prior", [False, True])
-def test_bundle_adjustment_of_moving_tissue(breathing, with_prior):
+def test_moving_bundle_adjustment_is_identical_for_any_thread_count(breathing, with_prior):
     start, sightings = breathing
 
     def adjusted():
@@ -67,7 +67,7 @@ def test_bundle_adjustment_of_moving_tissue(breathing, with_prior):
     check(adjusted)
 
 
-def test_priors_and_fields(breathing):
+def test_priors_and_fields_are_identical_for_any_thread_count(breathing):
     start, sightings = breathing
 
     def learned():
@@ -85,7 +85,7 @@ def test_priors_and_fields(breathing):
 
 
 @pytest.mark.slow
-def test_the_trajectory_before_breathing_tissue(breathing, monkeypatch):
+def test_breathing_trajectory_is_identical_for_any_thread_count(breathing, monkeypatch):
     monkeypatch.setattr("gsplat_core.poses.breathing.STAGES", ((0.007, 2),))
     _, sightings = breathing
 

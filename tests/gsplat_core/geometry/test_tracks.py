@@ -21,7 +21,7 @@ def last(tracks):
     return tracks._seen[-1]
 
 
-def test_corners_keep_8_pixels_from_the_border_10_from_a_tool_and_a_fortieth_of_the_side_apart():
+def test_feature_tracks_corner_margins_and_spacing():
     mask = np.ones((HEIGHT, WIDTH), np.uint8)
     mask[:, 64:] = 0
     tracks = FeatureTracks()
@@ -34,7 +34,7 @@ def test_corners_keep_8_pixels_from_the_border_10_from_a_tool_and_a_fortieth_of_
     assert 4 <= apart.min() < 6
 
 
-def test_points_keep_their_numbers_and_are_where_the_picture_moved():
+def test_feature_tracks_follow_shift_and_keep_numbers():
     tracks, picture = FeatureTracks(), texture(1)
     tracks.follow(picture, None)
     moved = cv2.warpAffine(picture, np.float32([[1, 0, 3], [0, 1, -2]]), (WIDTH, HEIGHT), borderMode=cv2.BORDER_REFLECT)
@@ -52,7 +52,7 @@ def test_points_keep_their_numbers_and_are_where_the_picture_moved():
     assert len(tracks.observations().point) >= 3 * 0.9 * len(both)
 
 
-def test_fifteen_pictures_of_something_else_are_left_out_and_the_next_is_another_scene():
+def test_feature_tracks_skip_15_foreign_pictures_then_restart():
     tracks = FeatureTracks()
     tracks.follow(texture(2), None)
     first = last(tracks)[0]
@@ -72,7 +72,7 @@ def wide_texture(seed: int, cell_px: int = 8) -> np.ndarray:
     return np.clip(cv2.resize(small, (640, 512), interpolation=cv2.INTER_CUBIC), 0, 255).astype(np.uint8)
 
 
-def test_at_most_seven_hundred_points_a_fortieth_of_the_longer_side_apart():
+def test_feature_tracks_at_most_700_points():
     tracks = FeatureTracks()
     tracks.follow(wide_texture(0), None)
     pixels = tracks.observations(1).pixels
@@ -81,7 +81,7 @@ def test_at_most_seven_hundred_points_a_fortieth_of_the_longer_side_apart():
     assert 16 <= apart.min() < 18
 
 
-def test_no_point_is_replaced_before_a_tenth_is_missing():
+def test_feature_tracks_replace_points_if_a_tenth_is_missing():
     """Covering a stripe of tissue that holds 700 points loses few points at first and then many."""
     tracks, picture = FeatureTracks(), wide_texture(0)
     tracks.follow(picture, None)
@@ -102,7 +102,7 @@ def test_no_point_is_replaced_before_a_tenth_is_missing():
     assert np.linalg.norm(new[:, None] - old[None], axis=2).min() > 15
 
 
-def test_flat_corners_beside_strong_ones_are_not_points():
+def test_feature_tracks_ignore_weak_corners_beside_strong():
     """A corner must have half a per cent of the quality of the best one, which grows with the square of its contrast."""
     image = np.full((96, 128, 3), 100, np.uint8)
     image[20:32, 20:32] = 228
@@ -114,7 +114,7 @@ def test_flat_corners_beside_strong_ones_are_not_points():
     assert ((x > 55) & (x < 78)).any() and not (x > 85).any()
 
 
-def test_a_picture_that_shows_less_than_a_fifth_of_the_points_is_left_out():
+def test_feature_tracks_skip_picture_below_a_fifth_of_points():
     picture = wide_texture(3)
     for share, left_out in ((0.12, True), (0.4, False)):
         tracks = FeatureTracks()
@@ -126,7 +126,7 @@ def test_a_picture_that_shows_less_than_a_fifth_of_the_points_is_left_out():
         assert (len(seen.of(seen.frame == 1).point) == 0) == left_out
 
 
-def test_a_point_whose_way_back_misses_is_lost():
+def test_followed_misses_of_unmatched_point():
     """A patch visible in only one picture has no match; a shifted patch is tracked back to its start."""
     first = cv2.cvtColor(wide_texture(5), cv2.COLOR_RGB2GRAY)
     second = np.roll(first, (2, 3), (0, 1))
@@ -150,7 +150,7 @@ def found_at(monkeypatch, places, misses=None):
     return tracks._moved(grey, grey, np.full(grey.shape, 255, np.uint8))[1].tolist()
 
 
-def test_points_are_kept_up_to_half_a_pixel_outside_of_the_centres_of_the_border(monkeypatch):
+def test_feature_tracks_keep_points_within_half_a_pixel_of_border(monkeypatch):
     places = [
         [-0.4, 50], [-0.6, 50], [50, -0.4], [50, -0.6], [WIDTH - 0.6, 50], [WIDTH - 0.4, 50], [50, HEIGHT - 0.6],
         [50, HEIGHT - 0.4], [np.nan, 50],
@@ -159,7 +159,7 @@ def test_points_are_kept_up_to_half_a_pixel_outside_of_the_centres_of_the_border
 
 
 @pytest.mark.parametrize(("more", "left_out"), [(0, False), (-1, True)])
-def test_a_picture_in_which_just_enough_points_survive_counts(monkeypatch, more, left_out):
+def test_feature_tracks_survivor_threshold(monkeypatch, more, left_out):
     count = 100
     kept = int(SURVIVORS * count) + more
     tracks = FeatureTracks()
@@ -171,12 +171,12 @@ def test_a_picture_in_which_just_enough_points_survive_counts(monkeypatch, more,
 
 
 @pytest.mark.parametrize(("miss_px", "kept"), [(0.69, [0]), (0.71, [])])
-def test_a_point_whose_way_back_misses_by_seven_tenths_of_a_pixel_is_lost(monkeypatch, miss_px, kept):
+def test_feature_tracks_drop_points_returning_off_by_0_7_px(monkeypatch, miss_px, kept):
     assert found_at(monkeypatch, [[50, 50]], [miss_px]) == kept
 
 
 @pytest.mark.parametrize("there", [[np.nan, 50.0], [50.0, np.inf], [np.nan, np.nan]])
-def test_a_point_without_a_finite_place_is_lost(monkeypatch, there):
+def test_followed_misses_non_finite_point(monkeypatch, there):
     """OpenCV may report such places as found."""
     calls = []
 

@@ -43,33 +43,33 @@ def sways(fastest_hz: float) -> list[tuple[float, float, int]]:
     return [(fastest_hz, 0.1, 0), (0.19, 0.06, 1), (0.15, 0.08, 2)]
 
 
-def test_breathing_that_is_faster_than_the_way_is_told():
+def test_separability_of_breathing_faster_than_scope():
     way, breathing = sways(0.22), (0.33, 0.03, 0)
     separable, mistaken = separability(both := poses(*way, breathing), refined(both, (0.33,)), TIMES_S, phases(0.33))
     assert separable and mistaken < 0.01
 
 
 @pytest.mark.parametrize("gap_hz", [0.027, -0.027])
-def test_a_scope_that_sways_nearly_as_fast_is_not_told_from_breathing(gap_hz):
+def test_separability_fails_for_scope_swaying_nearly_as_fast(gap_hz):
     way, breathing = sways(0.25 + gap_hz), (0.25, 0.01, 0)
     separable, mistaken = separability(both := poses(*way, breathing), refined(both, (0.25,)), TIMES_S, phases(0.25))
     assert not separable and mistaken > 0.01
 
 
-def test_much_breathing_is_taken_away_even_there():
+def test_separability_of_strong_breathing_near_scope_frequency():
     """Poses that keep it would be off by more."""
     way, breathing = sways(0.22), (0.25, 0.4, 0)
     separable, mistaken = separability(both := poses(*way, breathing), refined(both, (0.25,)), TIMES_S, phases(0.25))
     assert separable and mistaken > 0.005
 
 
-def test_other_frequencies_stay_where_they_are():
+def test_separability_of_breathing_with_heart_frequency():
     way, lines = sways(0.22), [(0.33, 0.03, 0), (1.1, 0.02, 1)]
     separable, _ = separability(both := poses(*way, *lines), refined(both, (0.33, 1.1)), TIMES_S, phases(0.33, 1.1))
     assert separable
 
 
-def test_a_way_that_swings_nearly_as_fast_shows_on_both_sides():
+def test_separability_of_breathing_slightly_faster_than_scope():
     """Slow scope motion raises only the side below the breathing frequency, so breathing is still separable."""
     way, breathing = sways(0.27), (0.33, 0.03, 0)
     separable, mistaken = separability(both := poses(*way, breathing), refined(both, (0.33,)), TIMES_S, phases(0.33))

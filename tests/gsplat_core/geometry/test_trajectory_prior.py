@@ -21,7 +21,7 @@ def way(length_s: float, line: float = 0.0):
     return exp(twist) @ poses, times_s
 
 
-def test_coordinates_change_by_twists_as_they_say():
+def test_coordinates_derivatives_equal_finite_differences():
     poses, _ = way(8.0)
     _, by_twist = coordinates(poses)
     for axis in range(6):
@@ -32,7 +32,7 @@ def test_coordinates_change_by_twists_as_they_say():
             torch.testing.assert_close(found[camera], by_twist[camera, :, axis], atol=2e-5, rtol=1e-4)
 
 
-def test_cost_and_terms_agree():
+def test_trajectory_prior_cost_and_terms_agree():
     poses, times_s = way(8.0)
     prior = learned_from(poses, times_s, waves(times_s, (0.31,)))
     matrix, slope = prior.terms(poses)
@@ -42,14 +42,14 @@ def test_cost_and_terms_agree():
     assert found == pytest.approx(expected, rel=0.02)
 
 
-def test_a_way_with_a_line_is_less_likely_though_the_prior_was_learned_from_it():
+def test_trajectory_prior_penalises_periodic_line():
     poses, times_s = way(20.0)
     lined, _ = way(20.0, 0.1)
     prior = learned_from(lined, times_s, waves(times_s, (0.31,)))
     assert prior.cost(poses) < 0.5 * prior.cost(lined)
 
 
-def test_where_the_way_begins_does_not_matter():
+def test_trajectory_prior_cost_is_independent_of_origin():
     poses, times_s = way(12.0)
     prior = learned_from(poses, times_s, waves(times_s, (0.31,)))
     away = poses.clone()
@@ -57,7 +57,7 @@ def test_where_the_way_begins_does_not_matter():
     assert prior.cost(away) == pytest.approx(prior.cost(poses), rel=1e-3)
 
 
-def test_a_longer_recording_tells_more():
+def test_trajectory_prior_uncertainty_falls_with_length():
     uncertain = []
     for length_s in (8.0, 16.0, 32.0):
         poses, times_s = way(length_s)
@@ -65,7 +65,7 @@ def test_a_longer_recording_tells_more():
     assert uncertain[0] > uncertain[1] > uncertain[2] > 0
 
 
-def test_a_scope_at_rest_has_a_prior():
+def test_trajectory_prior_of_scope_at_rest_is_finite():
     poses = torch.eye(4, dtype=torch.float64).repeat(30, 1, 1)
     times_s = torch.arange(30, dtype=torch.float64)
     prior = learned_from(poses, times_s, waves(times_s, (0.31,)))

@@ -11,7 +11,7 @@ from gsplat_core.io import files
 from gsplat_core.io.files import PartialFile, PartialFolder, remove_unfinished, write_durably
 
 
-def test_a_file_appears_when_it_is_complete(tmp_path):
+def test_partial_file_appears_when_complete(tmp_path):
     with PartialFile(tmp_path / "film.mp4") as partial:
         partial.file.write(b"whole")
         assert partial.path.suffix == ".mp4" and not (tmp_path / "film.mp4").exists()
@@ -19,7 +19,7 @@ def test_a_file_appears_when_it_is_complete(tmp_path):
     assert (tmp_path / "film.mp4").read_bytes() == b"whole"
 
 
-def test_an_error_leaves_the_earlier_file_alone(tmp_path):
+def test_partial_file_error_keeps_earlier_file(tmp_path):
     (tmp_path / "film.mp4").write_bytes(b"earlier")
     with pytest.raises(RuntimeError), PartialFile(tmp_path / "film.mp4") as partial:
         partial.file.write(b"half")
@@ -29,7 +29,7 @@ def test_an_error_leaves_the_earlier_file_alone(tmp_path):
 
 
 @pytest.mark.parametrize("links", [True, False])
-def test_a_file_that_came_meanwhile_is_not_overwritten(tmp_path, monkeypatch, links):
+def test_partial_file_without_overwrite_keeps_file_created_meanwhile(tmp_path, monkeypatch, links):
     if not links:
 
         def refuse(*_, **__):
@@ -46,7 +46,7 @@ def test_a_file_that_came_meanwhile_is_not_overwritten(tmp_path, monkeypatch, li
     assert (tmp_path / "new.mp4").read_bytes() == b"new" and len(list(tmp_path.iterdir())) == 2
 
 
-def test_a_planted_link_is_replaced_and_never_written_through(tmp_path):
+def test_partial_file_replaces_planted_symlink(tmp_path):
     (tmp_path / "diary").write_bytes(b"mine")
     for name in ("a", "b"):
         (tmp_path / name).symlink_to(tmp_path / "diary")
@@ -57,7 +57,7 @@ def test_a_planted_link_is_replaced_and_never_written_through(tmp_path):
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes() == b"ours"
 
 
-def test_a_name_that_was_guessed_is_an_error_and_not_overwritten(tmp_path, monkeypatch):
+def test_partial_file_refuses_existing_temporary_name(tmp_path, monkeypatch):
     monkeypatch.setattr(files.secrets, "token_hex", lambda count: "guessed")
     (tmp_path / "diary").write_bytes(b"mine")
     (tmp_path / ".intrasplat-guessed.part.mp4").symlink_to(tmp_path / "diary")
@@ -66,7 +66,7 @@ def test_a_name_that_was_guessed_is_an_error_and_not_overwritten(tmp_path, monke
     assert (tmp_path / "diary").read_bytes() == b"mine"
 
 
-def test_names_of_the_greatest_length_and_the_umask(tmp_path):
+def test_partial_file_with_longest_name_respects_umask(tmp_path):
     name = "f" * 251 + ".mp4"
     before = os.umask(0o027)
     try:
@@ -78,7 +78,7 @@ def test_names_of_the_greatest_length_and_the_umask(tmp_path):
 
 
 @pytest.mark.parametrize("exchange", [True, False])
-def test_a_folder_takes_the_place_of_an_earlier_one(tmp_path, monkeypatch, exchange):
+def test_partial_folder_replaces_earlier_folder(tmp_path, monkeypatch, exchange):
     if not exchange:
         monkeypatch.setattr(files, "_exchanged", lambda first, second: False)
     target = tmp_path / "take"
@@ -92,14 +92,14 @@ def test_a_folder_takes_the_place_of_an_earlier_one(tmp_path, monkeypatch, excha
     assert len(list(tmp_path.iterdir())) == 2
 
 
-def test_a_folder_that_is_not_finished_is_removed(tmp_path):
+def test_unfinished_partial_folder_is_removed(tmp_path):
     with pytest.raises(RuntimeError), PartialFolder(tmp_path / "take") as partial:
         (partial.path / "half").touch()
         raise RuntimeError
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_program_that_ends_at_once_leaves_nothing_half_done(tmp_path):
+def test_remove_unfinished_deletes_partial_files_and_folders(tmp_path):
     partial = PartialFile(tmp_path / "film.mp4")
     folder = PartialFolder(tmp_path / "take")
     (folder.path / "half").touch()

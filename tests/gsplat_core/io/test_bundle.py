@@ -31,7 +31,7 @@ def make_model(gaussians, kind="basis", version=3):
 
 @pytest.mark.parametrize("kind", ["basis", "hexplane", None])
 @pytest.mark.parametrize("count", [0, 1, 40])
-def test_the_round_trip_is_exact(kind, count, make_gaussians, tmp_path):
+def test_bundle_round_trip_is_bit_exact(kind, count, make_gaussians, tmp_path):
     model = make_model(make_gaussians(count, sh_degree=2), kind)
     save_bundle(model, tmp_path / "deep" / "model")
     loaded = load_bundle(tmp_path / "deep" / "model")
@@ -44,7 +44,7 @@ def test_the_round_trip_is_exact(kind, count, make_gaussians, tmp_path):
     assert torch.equal(loaded.at(1.0).means, model.at(1.0).means)
 
 
-def test_colours_of_the_right_eye_are_kept_and_part_of_the_digest(make_gaussians, tmp_path):
+def test_bundle_keeps_right_eye_colours_and_digest_includes_them(make_gaussians, tmp_path):
     left = make_gaussians(4, sh_degree=1)
     model = make_model(replace(left, right_sh=torch.randn_like(left.sh)))
     save_bundle(model, tmp_path)
@@ -59,7 +59,7 @@ def test_colours_of_the_right_eye_are_kept_and_part_of_the_digest(make_gaussians
             load_bundle(tmp_path)
 
 
-def test_extra_tensors_are_kept_and_part_of_the_digest(make_gaussians, tmp_path):
+def test_bundle_keeps_extra_tensors_and_digest_includes_them(make_gaussians, tmp_path):
     plain = make_gaussians(4)
     model = make_model(replace(plain, extra={"semantics": torch.randn(4, 3), "weight": torch.randn(4)}))
     save_bundle(model, tmp_path)
@@ -92,7 +92,7 @@ def test_extra_tensors_are_kept_and_part_of_the_digest(make_gaussians, tmp_path)
         DepthSource(DEPTH_ORIGINS["stereo"], False, (DepthError(0.25, 0.01), DepthError(0.5, 0.02))),
     ],
 )
-def test_where_depth_comes_from_is_kept_and_part_of_the_digest(source, make_gaussians, tmp_path):
+def test_bundle_keeps_depth_source_and_digest_includes_it(source, make_gaussians, tmp_path):
     model = replace(make_model(make_gaussians(4)), depth_source=source)
     save_bundle(model, tmp_path)
     loaded = load_bundle(tmp_path)
@@ -117,7 +117,7 @@ def test_where_depth_comes_from_is_kept_and_part_of_the_digest(source, make_gaus
         ({"origin": "stereo", "metric": True, "errors": [[0, "0.1"]]}, "relative"),
     ],
 )
-def test_claims_about_depth_that_cannot_be_true_are_refused(depth, said, make_gaussians, tmp_path):
+def test_bundle_with_invalid_depth_source_is_refused(depth, said, make_gaussians, tmp_path):
     save_bundle(make_model(make_gaussians(4)), tmp_path)
     manifest = json.loads((tmp_path / "manifest.json").read_text())
     (tmp_path / "manifest.json").write_text(json.dumps({**manifest, "depth": depth}))
@@ -125,7 +125,7 @@ def test_claims_about_depth_that_cannot_be_true_are_refused(depth, said, make_ga
         load_bundle(tmp_path)
 
 
-def test_an_extended_and_trimmed_field_survives(make_gaussians, tmp_path):
+def test_bundle_keeps_extended_and_trimmed_field(make_gaussians, tmp_path):
     gaussians = make_gaussians(5)
     field = new_field("basis", gaussians, (0.0, 1.0), spacing_s=0.1)
     field.extend((7.3, 9.1))
@@ -136,7 +136,7 @@ def test_an_extended_and_trimmed_field_survives(make_gaussians, tmp_path):
     assert torch.equal(load_bundle(tmp_path).at(8.8).means, model.at(8.8).means)
 
 
-def test_the_folder_holds_two_files_and_the_manifest_says_what_is_in_them(make_gaussians, tmp_path):
+def test_bundle_folder_has_manifest_and_tensors(make_gaussians, tmp_path):
     save_bundle(make_model(make_gaussians(6)), tmp_path)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["manifest.json", "model.safetensors"]
     manifest = json.loads((tmp_path / "manifest.json").read_text())
@@ -147,13 +147,13 @@ def test_the_folder_holds_two_files_and_the_manifest_says_what_is_in_them(make_g
     assert manifest["tensors"]["bytes"] == (tmp_path / "model.safetensors").stat().st_size
 
 
-def test_the_folder_of_a_run_is_answered_by_that_of_its_model(make_gaussians, tmp_path):
+def test_load_bundle_of_run_folder_names_model_folder(make_gaussians, tmp_path):
     save_bundle(make_model(make_gaussians(6)), tmp_path / "model")
     with pytest.raises(BundleError, match=r"is the folder of a run, whose model is .*model; give that folder"):
         load_bundle(tmp_path)
 
 
-def test_saving_again_replaces_the_model(make_gaussians, tmp_path):
+def test_save_bundle_replaces_earlier_model(make_gaussians, tmp_path):
     save_bundle(make_model(make_gaussians(6), version=1), tmp_path)
     save_bundle(make_model(make_gaussians(9), version=2), tmp_path)
     loaded = load_bundle(tmp_path)
@@ -161,7 +161,7 @@ def test_saving_again_replaces_the_model(make_gaussians, tmp_path):
 
 
 @pytest.mark.parametrize("fails_at", ["model.next.safetensors", "manifest.next.json"])
-def test_a_full_disk_leaves_the_previous_bundle(fails_at, make_gaussians, tmp_path, monkeypatch):
+def test_save_bundle_on_full_disk_keeps_previous_bundle(fails_at, make_gaussians, tmp_path, monkeypatch):
     before = make_model(make_gaussians(6))
     save_bundle(before, tmp_path)
     real_fsync = os.fsync
@@ -181,7 +181,7 @@ def test_a_full_disk_leaves_the_previous_bundle(fails_at, make_gaussians, tmp_pa
 
 
 @pytest.mark.parametrize("renames", [0, 1])
-def test_a_crash_between_the_renames_leaves_a_whole_bundle(renames, make_gaussians, tmp_path, monkeypatch):
+def test_crash_between_renames_leaves_complete_bundle(renames, make_gaussians, tmp_path, monkeypatch):
     """Without a rename the old model loads. With only the tensors renamed, the new one loads."""
     old, new = make_model(make_gaussians(6)), make_model(make_gaussians(6, seed=4))
     save_bundle(old, tmp_path)
@@ -202,20 +202,20 @@ def test_a_crash_between_the_renames_leaves_a_whole_bundle(renames, make_gaussia
     assert load_bundle(tmp_path).sha256() == old.sha256()
 
 
-def test_a_first_save_that_crashed_between_the_renames_loads(make_gaussians, tmp_path):
+def test_first_save_crashed_between_renames_loads(make_gaussians, tmp_path):
     model = make_model(make_gaussians(3))
     save_bundle(model, tmp_path)
     (tmp_path / "manifest.json").rename(tmp_path / "manifest.next.json")
     assert load_bundle(tmp_path).sha256() == model.sha256()
 
 
-def test_a_place_that_cannot_be_written_is_named(make_gaussians, tmp_path):
+def test_save_bundle_error_names_unwritable_path(make_gaussians, tmp_path):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(BundleError, match=r"file/model"):
         save_bundle(make_model(make_gaussians(1)), tmp_path / "file" / "model")
 
 
-def test_a_model_that_is_not_finite_is_not_saved(make_gaussians, tmp_path):
+def test_save_bundle_refuses_non_finite_model(make_gaussians, tmp_path):
     good = make_model(make_gaussians(6))
     save_bundle(good, tmp_path)
     bad = make_model(make_gaussians(6))
@@ -225,7 +225,7 @@ def test_a_model_that_is_not_finite_is_not_saved(make_gaussians, tmp_path):
     assert load_bundle(tmp_path).sha256() == good.sha256()
 
 
-def test_large_finite_values_are_not_taken_for_infinite(make_gaussians, tmp_path):
+def test_save_bundle_accepts_large_finite_values(make_gaussians, tmp_path):
     gaussians = make_gaussians(6)
     gaussians.means[:] = 3e38
     model = make_model(gaussians, None)
@@ -233,6 +233,6 @@ def test_large_finite_values_are_not_taken_for_infinite(make_gaussians, tmp_path
     assert load_bundle(tmp_path).sha256() == model.sha256()
 
 
-def test_only_float32_is_saved(make_gaussians, tmp_path):
+def test_save_bundle_refuses_float64(make_gaussians, tmp_path):
     with pytest.raises(InvalidInput, match="float64"):
         save_bundle(make_model(make_gaussians(2).to(dtype=torch.float64), None), tmp_path)

@@ -23,7 +23,7 @@ def turned(degrees: float, place=(0.0, 0.0, 0.0)) -> np.ndarray:
     return pose
 
 
-def test_it_turns_at_even_speed_and_goes_straight():
+def test_camera_path_interpolates_rotation_and_position():
     path = CameraPath([Waypoint(1.0, turned(-20)), Waypoint(3.0, turned(60, (8.0, 0, 4.0)))])
     assert path.window_s == (1.0, 3.0)
     for time_s, degrees, place in [(1, -20, (0, 0, 0)), (1.5, 0, (2, 0, 1)), (2, 20, (4, 0, 2)), (3, 60, (8, 0, 4))]:
@@ -34,14 +34,14 @@ def test_it_turns_at_even_speed_and_goes_straight():
         assert np.allclose(path.camera(CAMERA, outside).position, path.camera(CAMERA, inside).position)
 
 
-def test_half_a_turn_is_a_rotation_all_the_way():
+def test_camera_path_half_turn_interpolates_valid_rotations():
     path = CameraPath([Waypoint(0.0, turned(0)), Waypoint(1.0, turned(180))])
     for time_s in np.linspace(0, 1, 11):
         rotation = path.camera(CAMERA, time_s).world_to_camera[:3, :3]
         assert np.allclose(rotation @ rotation.T, np.eye(3)) and np.linalg.det(rotation) == pytest.approx(1)
 
 
-def test_one_camera_stays_and_intrinsics_are_interpolated():
+def test_camera_path_of_one_camera_is_constant_and_intrinsics_interpolate():
     still = CameraPath([Waypoint(2.0, turned(10))])
     assert still.window_s == (2.0, 2.0) and np.allclose(still.camera(CAMERA, 7).world_to_camera @ turned(10), np.eye(4))
     zoom = CameraPath([Waypoint(0, turned(0), (40, 40, 16, 12)), Waypoint(1, turned(0), (80, 60, 14, 12))])
@@ -58,7 +58,7 @@ def camera(time_s=0.0, pose=None, **more):
     return {"time_s": time_s, "camera_to_world": (np.eye(4) if pose is None else pose).tolist(), **more}
 
 
-def test_a_file_is_read(tmp_path):
+def test_read_camera_path_of_json_file(tmp_path):
     intrinsics = {"fx": 30, "fy": 31.5, "cx": 15, "cy": 11}
     path = read_camera_path(write(tmp_path, [camera(0.5, intrinsics=intrinsics), camera(2, intrinsics=intrinsics)]))
     assert path.window_s == (0.5, 2.0) and path.camera(CAMERA, 1).K[1, 1] == pytest.approx(31.5)
@@ -82,12 +82,12 @@ def test_a_file_is_read(tmp_path):
         ([camera(intrinsics={"fx": 0, "fy": 1, "cx": 0, "cy": 0})], "fx must be"),
     ],
 )
-def test_what_is_wrong_is_said(tmp_path, cameras, said):
+def test_read_camera_path_refuses_invalid_content(tmp_path, cameras, said):
     with pytest.raises(InvalidSetting, match=said):
         read_camera_path(write(tmp_path, cameras))
 
 
-def test_no_file_and_no_camera(tmp_path):
+def test_camera_path_refuses_missing_file_and_no_cameras(tmp_path):
     with pytest.raises(InvalidSetting, match=r"cannot read the camera path .*No such file"):
         read_camera_path(tmp_path / "none.json")
     with pytest.raises(InvalidInput, match="at least one"):
@@ -100,7 +100,7 @@ def inria(k, pose, **changed):
     return {**entry, "position": pose[:3, 3].tolist(), "rotation": pose[:3, :3].tolist(), **changed}
 
 
-def test_the_cameras_of_the_inria_trainer_follow_each_other_by_one_second(tmp_path):
+def test_inria_cameras_are_one_second_apart(tmp_path):
     poses = [turned(10.0 * k, (k, 2.0, 3.0)) for k in range(3)]
     path = read_camera_path(write(tmp_path, json.dumps([inria(k, pose) for k, pose in enumerate(poses)])))
     assert path.window_s == (0.0, 2.0)
@@ -120,12 +120,12 @@ def test_the_cameras_of_the_inria_trainer_follow_each_other_by_one_second(tmp_pa
         ("camera", "JSON object"),
     ],
 )
-def test_a_wrong_camera_of_the_inria_trainer_is_named(tmp_path, entry, reason):
+def test_invalid_inria_camera_is_refused(tmp_path, entry, reason):
     with pytest.raises(InvalidSetting, match=reason):
         read_camera_path(write(tmp_path, json.dumps([inria(0, turned(0)), entry])))
 
 
 @pytest.mark.parametrize("text", ["[1", '[{}], "cameras": []'])
-def test_a_broken_list_of_cameras_is_refused(tmp_path, text):
+def test_read_camera_path_refuses_broken_json_list(tmp_path, text):
     with pytest.raises(InvalidSetting):
         read_camera_path(write(tmp_path, text))

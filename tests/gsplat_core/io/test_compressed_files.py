@@ -53,7 +53,7 @@ LOW_HIGH = [-1, -2, -3, 1, 2, 3, -5, -5, -5, -1, -1, -1, 0, 0, 0, 1, 0.5, 1]
 ONE_ROW = struct.pack("<4I", 2047 << 21 | 0 << 11 | 2047, 3 << 30 | 512 << 20, 0, 255 << 24 | 255 << 16 | 0 << 8 | 51)
 
 
-def test_a_compressed_ply_laid_out_by_hand_is_read(tmp_path):
+def test_compressed_ply_of_handwritten_bytes_is_read(tmp_path):
     sh = bytes([0, 255, 128, 0, 0, 0, 0, 0, 0])
     (tmp_path / "a.ply").write_bytes(compressed_header(1, 1, rest=9) + struct.pack("<18f", *LOW_HIGH) + ONE_ROW + sh)
     seen = load_ply(tmp_path / "a.ply")
@@ -70,7 +70,7 @@ def test_a_compressed_ply_laid_out_by_hand_is_read(tmp_path):
     assert seen.sh[0, 1:, 1:].unique().tolist() == [-4.0]
 
 
-def test_a_compressed_ply_without_colour_bounds_has_colours_from_0_to_1(tmp_path):
+def test_compressed_ply_without_colour_bounds_uses_0_to_1(tmp_path):
     header = compressed_header(1, 1, BOUNDS[:12])
     (tmp_path / "a.ply").write_bytes(header + struct.pack("<12f", *LOW_HIGH[:12]) + ONE_ROW)
     assert torch.allclose(load_ply(tmp_path / "a.ply").sh[0, 0] * SH_C0 + 0.5, torch.tensor([1.0, 1.0, 0.0]))
@@ -78,7 +78,7 @@ def test_a_compressed_ply_without_colour_bounds_has_colours_from_0_to_1(tmp_path
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("count", [1, 256, 700])
-def test_a_compressed_ply_keeps_the_gaussians_within_its_steps(tmp_path, count, degree):
+def test_compressed_ply_round_trip_errs_at_most_one_step(tmp_path, count, degree):
     wanted = cloud(count, degree)
     (tmp_path / "a.ply").write_bytes(b"".join(compressed_ply_pieces(wanted)))
     seen = load_ply(tmp_path / "a.ply")
@@ -129,7 +129,7 @@ def spz_4(version_3: bytes, version=4, extension=b"", streams=None, plain=None) 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
 @pytest.mark.parametrize("extension", [b"", b"\1\0\0\0\4\0\0\0abcd"])
-def test_version_4_holds_the_arrays_of_version_3(tmp_path, degree, extension):
+def test_spz_version_4_equals_version_3_content(tmp_path, degree, extension):
     version_3 = b"".join(spz_pieces(cloud(500, degree)))
     (tmp_path / "3.spz").write_bytes(version_3)
     (tmp_path / "4.spz").write_bytes(spz_4(version_3, extension=extension))
@@ -156,7 +156,7 @@ def four(**changes) -> bytes:
         (lambda: four(streams=[b""] * 6), "cut short"),
     ],
 )  # fmt: skip
-def test_a_malformed_version_4_is_refused_with_its_reason(tmp_path, make, reason):
+def test_malformed_spz_version_4_is_refused(tmp_path, make, reason):
     path = tmp_path / "a.spz"
     path.write_bytes(make())
     with pytest.raises(BundleCorrupt, match=reason) as raised:
@@ -164,7 +164,7 @@ def test_a_malformed_version_4_is_refused_with_its_reason(tmp_path, make, reason
     assert str(path) in str(raised.value)
 
 
-def test_version_4_without_the_library_names_its_package(tmp_path, monkeypatch):
+def test_spz_version_4_without_zstd_names_package(tmp_path, monkeypatch):
     (tmp_path / "a.spz").write_bytes(four())
     monkeypatch.setattr(spz, "NAMES", ("libnothing.so.1",))
     spz.library.cache_clear()
@@ -173,7 +173,7 @@ def test_version_4_without_the_library_names_its_package(tmp_path, monkeypatch):
     spz.library.cache_clear()
 
 
-def test_an_spz_laid_out_by_hand_is_read(tmp_path):
+def test_spz_of_handwritten_bytes_is_read(tmp_path):
     position = (4096).to_bytes(3, "little") + (-8192).to_bytes(3, "little", signed=True) + bytes(3)
     # Version 3: the largest of x, y, z, w is w (3). x is -255 of 511, y and z are 0.
     rotation = struct.pack("<I", 3 << 30 | (512 | 255) << 20)
@@ -191,7 +191,7 @@ def test_an_spz_laid_out_by_hand_is_read(tmp_path):
     assert torch.allclose(seen.sh[0, 1:], torch.tensor([[-0.5, 0, 0], [0, 1.0, 0], [0, 0, 127 / 128]]))
 
 
-def test_the_rotations_of_version_2_are_three_bytes(tmp_path):
+def test_spz_version_2_rotations_have_three_bytes(tmp_path):
     body = bytes(9) + bytes([128, 128, 128, 128]) + bytes([160] * 3) + bytes([255, 128, 127])
     (tmp_path / "a.spz").write_bytes(spz_file(version=2, body=body))
     assert torch.allclose(load_spz(tmp_path / "a.spz").quats, torch.tensor([[0.0, 1.0, 0.0, 0.0]]), atol=0.01)
@@ -199,7 +199,7 @@ def test_the_rotations_of_version_2_are_three_bytes(tmp_path):
 
 @pytest.mark.parametrize("version", [2, 3])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_an_spz_keeps_the_gaussians_within_its_steps(tmp_path, degree, version):
+def test_spz_round_trip_errs_at_most_one_step(tmp_path, degree, version):
     wanted = cloud(500, degree)
     (tmp_path / "a.spz").write_bytes(b"".join(spz_pieces(wanted, version)))
     assert zlib.decompress((tmp_path / "a.spz").read_bytes(), 31)[:4] == b"NGSP"
@@ -216,7 +216,7 @@ def test_an_spz_keeps_the_gaussians_within_its_steps(tmp_path, degree, version):
 
 
 @pytest.mark.parametrize("degree", [1, 2, 3, 4])
-def test_the_axes_of_spz_are_turned_with_their_harmonics(degree):
+def test_spz_axis_change_turns_spherical_harmonics(degree):
     """A Gaussian seen along d has the colour of the turned Gaussian along the turned d."""
     generator = torch.Generator().manual_seed(1)
     directions = torch.nn.functional.normalize(torch.randn(50, 3, generator=generator, dtype=torch.float64), dim=1)
@@ -226,7 +226,7 @@ def test_the_axes_of_spz_are_turned_with_their_harmonics(degree):
     assert torch.allclose(of_turned[:, 1:], basis[:, 1:] * signs, atol=1e-12)
 
 
-def test_positions_of_spz_use_the_bits_that_the_farthest_one_leaves(tmp_path):
+def test_spz_position_precision_depends_on_farthest_gaussian(tmp_path):
     far = cloud(20)
     far.means[0, 1] = 300_000.0
     (tmp_path / "a.spz").write_bytes(b"".join(spz_pieces(far)))
@@ -237,7 +237,7 @@ def test_positions_of_spz_use_the_bits_that_the_farthest_one_leaves(tmp_path):
 
 
 @pytest.mark.parametrize("pieces", [spz_pieces, compressed_ply_pieces])
-def test_harmonics_of_degree_4_are_refused(pieces):
+def test_compressed_formats_refuse_sh_degree_4(pieces):
     with pytest.raises(ExportError, match="degree 4"):
         b"".join(pieces(cloud(3, 4)))
 
@@ -260,7 +260,7 @@ GOOD_PLY = compressed_header(1, 1) + struct.pack("<18f", *LOW_HIGH) + ONE_ROW
         (lambda b: b.replace(b"end_header", b"element sh 1\nproperty uchar f_rest_0\nend_header") + b"\0", "1 properties"),
     ],
 )  # fmt: skip
-def test_a_malformed_compressed_ply_is_refused_with_its_reason(change, reason, tmp_path):
+def test_malformed_compressed_ply_is_refused(change, reason, tmp_path):
     path = tmp_path / "a.ply"
     path.write_bytes(change(GOOD_PLY))
     with pytest.raises(BundleCorrupt, match=reason) as raised:
@@ -293,7 +293,7 @@ def _flipped(data):
         (_flipped(spz_file(count=500)), "damaged"),
     ],
 )
-def test_a_malformed_spz_is_refused_with_its_reason(data, reason, tmp_path):
+def test_malformed_spz_is_refused(data, reason, tmp_path):
     path = tmp_path / "a.spz"
     path.write_bytes(data)
     with pytest.raises(BundleCorrupt, match=reason) as raised:
@@ -301,7 +301,7 @@ def test_a_malformed_spz_is_refused_with_its_reason(data, reason, tmp_path):
     assert str(path) in str(raised.value)
 
 
-def test_a_gzip_bomb_is_not_inflated(tmp_path, monkeypatch):
+def test_spz_gzip_bomb_is_refused(tmp_path, monkeypatch):
     """Three million Gaussians of zeros take 60 kB, and more memory than there is."""
     path = tmp_path / "a.spz"
     path.write_bytes(spz_file(count=3_000_000))
@@ -312,7 +312,7 @@ def test_a_gzip_bomb_is_not_inflated(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["a.ply", "a.spz"])
-def test_damaged_bytes_give_gaussians_or_an_error_of_the_file(name, tmp_path):
+def test_damaged_ply_or_spz_raises_only_bundle_error(name, tmp_path):
     pieces = compressed_ply_pieces(cloud(40, 1)) if name == "a.ply" else spz_pieces(cloud(40, 1))
     good, path = b"".join(pieces), tmp_path / name
     load = load_ply if name == "a.ply" else load_spz

@@ -29,7 +29,7 @@ def head(magic=b"ISPF", version=1, bits=0, width=3, height=2, seq=7, pts_ns=8):
 
 
 @pytest.mark.parametrize("left_out", [(), ("pose",), ("right_image", "mask"), ("right_image", "depth", "mask", "pose")])
-def test_a_message_comes_back(left_out):
+def test_encode_message_round_trip(left_out):
     given = {name: array for name, array in arrays().items() if name not in left_out}
     frame = decode_message(memoryview(encode_message(2**62 - 1, 1 - 2**62, given)), arrived_ns=5)
     assert (frame.seq, frame.pts_ns, frame.arrived_ns) == (2**62 - 1, 1 - 2**62, 5)
@@ -42,7 +42,7 @@ def copies(frame):
 
 
 @pytest.mark.parametrize("seq", range(6))
-def test_a_frame_comes_back_with_all_that_it_has(seq):
+def test_encode_frame_round_trip_of_all_fields(seq):
     frame = new_frame(seq, status=list(FrameStatus)[seq % 4], damage="torn" if seq % 2 else None)
     back = decode(copies(frame))
     assert same_frame(frame, back) and (frame.arrived_ns, frame.status) == (back.arrived_ns, back.status)
@@ -50,14 +50,14 @@ def test_a_frame_comes_back_with_all_that_it_has(seq):
     assert same_frame(plain, decode(copies(plain)))
 
 
-def test_arrays_without_gaps_are_not_copied():
+def test_encode_does_not_copy_contiguous_arrays():
     frame = Frame(0, 0, IMAGE)
     assert np.shares_memory(np.frombuffer(encode(frame)[1], np.uint8), IMAGE)
     turned = Frame(0, 0, IMAGE[:, ::-1])
     np.testing.assert_array_equal(decode(copies(turned)).image, IMAGE[:, ::-1])
 
 
-def test_the_header_is_as_documented():
+def test_message_header_layout():
     data = encode_message(0x0102, -2, arrays() | {"pose": np.eye(4)})
     assert data[:16] == b"ISPF\x01\x00\x0f\x00\x03\x00\x00\x00\x02\x00\x00\x00"
     assert data[16:32] == b"\x02\x01" + bytes(6) + b"\xfe" + b"\xff" * 7
@@ -86,7 +86,7 @@ def test_the_header_is_as_documented():
         (head() + bytes(19), "it has 51 bytes; its header says 50"),
     ],
 )
-def test_a_message_that_is_no_frame_is_refused(data, said):
+def test_decode_message_refuses_invalid_bytes(data, said):
     with pytest.raises(InvalidMessage, match=said):
         decode_message(memoryview(data))
 
@@ -112,7 +112,7 @@ FIELDS = 0x8000
         ([head(bits=FIELDS), bytes(18), b"[]"], "not those of a frame"),
     ],
 )
-def test_pieces_that_are_no_frame_are_refused(pieces, said):
+def test_decode_refuses_invalid_pieces(pieces, said):
     with pytest.raises(InvalidMessage, match=said):
         decode([memoryview(piece) for piece in pieces])
 
@@ -125,23 +125,23 @@ def test_pieces_that_are_no_frame_are_refused(pieces, said):
         '{"withheld":"' + 1001 * "x" + '"}', '{"new_scene":[]}',
     ],
 )  # fmt: skip
-def test_fields_that_no_frame_has_are_refused(fields):
+def test_decode_refuses_invalid_fields(fields):
     with pytest.raises(InvalidMessage, match="not those of a frame"):
         decode([memoryview(piece) for piece in (head(bits=FIELDS), bytes(18), fields.encode())])
 
 
-def test_a_right_camera_of_another_size_is_refused():
+def test_decode_refuses_right_camera_of_other_size():
     pieces = copies(Frame(0, 0, IMAGE, right_camera=Camera.from_focal(30.0, 3, 2)))
     wider = bytes(pieces[-1]).replace(b'"width_px":3', b'"width_px":4')
     with pytest.raises(InvalidMessage, match="right camera is 4x2"):
         decode([*pieces[:-1], memoryview(wider)])
 
 
-def test_long_texts_are_cut():
+def test_decode_truncates_long_texts():
     assert decode(copies(Frame(0, 0, IMAGE, damage="x" * 5000))).damage == "x" * 1000
 
 
-def test_arrays_that_do_not_fit_the_image_are_not_sent():
+def test_encode_message_refuses_arrays_of_wrong_size():
     with pytest.raises(ValueError, match=r"mask is \[3, 2\]; with this image it must be \[2, 3\]"):
         encode_message(0, 0, {"image": IMAGE, "mask": np.ones((3, 2), np.uint8)})
     with pytest.raises(ValueError, match="0x2 px is not sent"):

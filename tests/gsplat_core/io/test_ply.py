@@ -46,26 +46,26 @@ def assert_same(seen, wanted):
         assert torch.equal(getattr(seen, name), tensor), name
 
 
-def test_the_file_is_laid_out_as_the_inria_trainer_does(tmp_path):
+def test_save_ply_writes_inria_layout(tmp_path):
     save_ply(two_gaussians(), tmp_path / "a.ply")
     assert (tmp_path / "a.ply").read_bytes() == header(DEGREE_1) + two_rows()
     assert [p.name for p in tmp_path.iterdir()] == ["a.ply"]
 
 
-def test_a_file_laid_out_by_hand_is_read(tmp_path):
+def test_load_ply_of_handwritten_bytes(tmp_path):
     (tmp_path / "a.ply").write_bytes(header(DEGREE_1) + two_rows())
     assert_same(load_ply(tmp_path / "a.ply"), two_gaussians())
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
 @pytest.mark.parametrize("count", [0, 1, 33])
-def test_the_round_trip_is_exact(degree, count, make_gaussians, tmp_path):
+def test_ply_round_trip_is_exact(degree, count, make_gaussians, tmp_path):
     gaussians = make_gaussians(count, sh_degree=degree)
     save_ply(gaussians, tmp_path / "a.ply")
     assert_same(load_ply(tmp_path / "a.ply"), gaussians)
 
 
-def test_other_properties_types_orders_and_elements_are_skipped(tmp_path):
+def test_load_ply_ignores_other_properties_and_elements(tmp_path):
     names = ["opacity", "x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "scale_0", "scale_1", "scale_2"]
     names += ["rot_0", "rot_1", "rot_2", "rot_3"]
     start = (
@@ -105,7 +105,7 @@ def test_other_properties_types_orders_and_elements_are_skipped(tmp_path):
         (lambda b: b[:-4] + struct.pack("<f", float("nan")), "rot_3 holds 1 of 2"),
     ],
 )
-def test_a_malformed_file_is_refused_with_its_reason(change, reason, tmp_path):
+def test_malformed_ply_is_refused(change, reason, tmp_path):
     path = tmp_path / "a.ply"
     path.write_bytes(change(header(DEGREE_1) + two_rows()))
     with pytest.raises(BundleCorrupt, match=reason) as raised:
@@ -113,7 +113,7 @@ def test_a_malformed_file_is_refused_with_its_reason(change, reason, tmp_path):
     assert str(path) in str(raised.value)
 
 
-def test_a_failed_save_leaves_the_old_file(make_gaussians, tmp_path, monkeypatch):
+def test_failed_save_ply_keeps_old_file(make_gaussians, tmp_path, monkeypatch):
     from gsplat_core.io import files
 
     path = tmp_path / "a.ply"

@@ -31,7 +31,7 @@ def ordered(values: dict[str, torch.Tensor], like: torch.Tensor) -> dict[str, to
 
 @pytest.mark.parametrize("use_sort", [False, True])
 @pytest.mark.parametrize("bases", [1, 4])
-def test_a_round_trip_errs_by_half_a_step_at_most(tmp_path, use_sort: bool, bases: int):
+def test_png_compression_round_trip_errs_at_most_half_a_step(tmp_path, use_sort: bool, bases: int):
     given = splats(bases=bases)
     before = {name: tensor.clone() for name, tensor in given.items()}
     codec = PngCompression(use_sort=use_sort)
@@ -52,7 +52,7 @@ def test_a_round_trip_errs_by_half_a_step_at_most(tmp_path, use_sort: bool, base
         assert (found[name] - tensor).abs().max() <= 0.51 * (tensor.max() - tensor.min()) / steps
 
 
-def test_the_most_transparent_splats_are_left_out_of_a_number_that_is_no_square(tmp_path, caplog):
+def test_png_compression_drops_most_transparent_splats_to_square_count(tmp_path, caplog):
     given = splats(28)
     with caplog.at_level(logging.WARNING):
         PngCompression().compress(str(tmp_path), given)
@@ -64,7 +64,7 @@ def test_the_most_transparent_splats_are_left_out_of_a_number_that_is_no_square(
     assert given["opacities"][left].max() < given["opacities"][~left].min()
 
 
-def test_files_have_gsplats_names_and_meta(tmp_path):
+def test_png_compression_file_names_and_meta_equal_gsplat(tmp_path):
     PngCompression().compress(str(tmp_path), splats())
     pictures = {f"{name}.png" for name in ("means_l", "means_u", "scales", "quats", "opacities", "sh0")}
     assert {path.name for path in tmp_path.iterdir()} == {*pictures, "shN.npz", "features.npz", "meta.json"}
@@ -72,7 +72,7 @@ def test_files_have_gsplats_names_and_meta(tmp_path):
     assert meta["scales"]["shape"] == [25, 3] and len(meta["scales"]["mins"]) == 3 and meta["shN"]["quantization"] == 6
 
 
-def test_clusters_are_nearest_and_at_their_rows_mean():
+def test_clustered_centroids_are_means_of_clusters():
     generator = torch.Generator().manual_seed(0)
     middles = 10 * torch.randn(6, 5, generator=generator)
     rows = (middles[:, None] + 0.01 * torch.randn(6, 20, 5, generator=generator)).reshape(-1, 5)
@@ -82,7 +82,7 @@ def test_clusters_are_nearest_and_at_their_rows_mean():
     assert torch.equal(again, centroids)
 
 
-def test_clusters_in_two_levels_keep_close_rows_together(monkeypatch):
+def test_clustered_in_two_levels_keeps_close_rows_together(monkeypatch):
     monkeypatch.setattr(png_compression, "COARSE", 4)
     generator = torch.Generator().manual_seed(0)
     middles = 10 * torch.randn(12, 5, generator=generator)
@@ -93,7 +93,7 @@ def test_clusters_in_two_levels_keep_close_rows_together(monkeypatch):
     assert (centroids[labels] - rows).norm(dim=1).max() < 0.1
 
 
-def test_wrong_input_is_refused(tmp_path):
+def test_png_compress_refuses_invalid_splats(tmp_path):
     given = splats()
     with pytest.raises(InvalidInput, match="lack shN"):
         PngCompression().compress(str(tmp_path), {name: given[name] for name in given if name != "shN"})
@@ -104,7 +104,7 @@ def test_wrong_input_is_refused(tmp_path):
         PngCompression().compress(str(tmp_path), given)
 
 
-def test_a_damaged_folder_is_refused(tmp_path):
+def test_png_decompress_refuses_damaged_folder(tmp_path):
     with pytest.raises(BundleCorrupt, match=r"meta\.json"):
         PngCompression().decompress(str(tmp_path))
     PngCompression().compress(str(tmp_path), splats())
@@ -118,7 +118,7 @@ def arguments(values: dict[str, torch.Tensor]) -> list[torch.Tensor]:
 
 
 @pytest.mark.parametrize("format", ["ply", "ply_compressed"])
-def test_exported_splats_are_read_back(tmp_path, format: str):
+def test_export_splats_ply_round_trip(tmp_path, format: str):
     given, path = splats(), tmp_path / "splats.ply"
     given["means"][4, 0] = torch.inf
     given["opacities"][5] = -9
@@ -136,7 +136,7 @@ def test_exported_splats_are_read_back(tmp_path, format: str):
         assert nearest.max() < 0.02
 
 
-def test_a_splat_file_has_32_bytes_a_splat():
+def test_export_splats_splat_format_has_32_bytes_per_splat():
     data = export_splats(*arguments(splats()), format="splat")
     assert len(data) == 32 * 25
     assert np.frombuffer(data, "<f4").reshape(25, 8)[:, 3:6].min() > 0

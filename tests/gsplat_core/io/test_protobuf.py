@@ -12,7 +12,7 @@ NESTED = b"\x0a\x02hi" + b"\x12\x04" + b"\x08\x07\x08\x08" + b"\x12\x02" + b"\x0
 """Text in field 1, and two messages in field 2 with the numbers 7, 8 and 9 in their field 1."""
 
 
-def test_a_number_has_ten_bytes_at_most():
+def test_varint_has_at_most_ten_bytes():
     """Seven bits each, the lowest first. A length of eleven would be read from foreign bytes."""
     assert varint(memoryview(b"\x07"), 0) == (7, 1)
     assert varint(memoryview(b"x\x96\x01y"), 1) == (150, 3)
@@ -23,7 +23,7 @@ def test_a_number_has_ten_bytes_at_most():
         varint(memoryview(b"\x80"), 0)
 
 
-def test_each_wire_type_has_its_type_of_value():
+def test_protobuf_wire_types_give_value_types():
     number, half, whole = b"\x08\x96\x01", b"\x15" + struct.pack("<f", 0.5), b"\x19" + struct.pack("<d", 0.25)
     read = list(fields(memoryview(number + half + whole + b"\x22\x02hi")))
     assert [field for field, _ in read] == [1, 2, 3, 4]
@@ -33,7 +33,7 @@ def test_each_wire_type_has_its_type_of_value():
     assert read[3][1] == b"hi" and type(read[3][1]) is memoryview
 
 
-def test_values_are_found_by_their_path():
+def test_protobuf_values_by_path():
     message = memoryview(NESTED)
     assert values(message, 1) == [b"hi"]
     assert values(message, 2, 1) == [7, 8, 9]
@@ -43,11 +43,11 @@ def test_values_are_found_by_their_path():
 @pytest.mark.parametrize(
     "data", [b"\x09" + bytes(7), b"\x0d" + bytes(3), b"\x0a\x03ab", b"\x00\x01\x02\x80", b"\x02\x01a"]
 )
-def test_messages_that_end_within_a_field_are_refused(data):
+def test_truncated_protobuf_message_is_refused(data):
     with pytest.raises(ValueError, match="ends too early"):
         list(fields(memoryview(data)))
 
 
-def test_groups_are_refused():
+def test_protobuf_groups_are_refused():
     with pytest.raises(ValueError, match="wire type 3"):
         list(fields(memoryview(b"\x0b")))

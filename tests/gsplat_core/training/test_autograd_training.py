@@ -23,7 +23,7 @@ class Drift(torch.nn.Module):
         return replace(gaussians, means=moved, logit_opacities=gaussians.logit_opacities.detach())
 
 
-def test_gradients_at_the_deformed_gaussians_reach_the_field_and_the_canonical_ones():
+def test_autograd_training_passes_gradients_to_field_and_canonical_gaussians():
     field = Drift()
     training = AutogradTraining(field, SimpleNamespace(rate_of=lambda name: f"rate of {name}"))
     scene = Gaussians(torch.ones(4, 3), torch.eye(4), torch.zeros(4, 3), torch.zeros(4), torch.zeros(4, 1, 3))

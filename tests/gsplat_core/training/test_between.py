@@ -47,7 +47,7 @@ def moved(request):
 
 
 @pytest.mark.parametrize("value", ["means", "sh"])
-def test_between_frames_the_scene_is_between_its_states_at_the_frames(moved, value):
+def test_model_between_frames_interpolates_frame_states(moved, value):
     fps, model = moved
     at = lambda number: getattr(model.at(number / fps), value).flatten(1)
     changed = (at(11) - at(0)).norm(dim=1).median()
@@ -56,13 +56,13 @@ def test_between_frames_the_scene_is_between_its_states_at_the_frames(moved, val
         assert off < 0.1 * changed
 
 
-def test_before_the_first_and_after_the_last_frame_the_scene_holds(moved):
+def test_model_outside_time_window_holds_end_states(moved):
     fps, model = moved
     assert torch.equal(model.at(-5.0).means, model.at(0.0).means)
     assert torch.equal(model.at(60.0).means, model.at(11 / fps).means)
 
 
-def test_motion_is_resolved_no_finer_than_the_frames(moved):
+def test_offline_motion_spacing_is_not_finer_than_frames(moved):
     fps, model = moved
     finest_s = ReconstructorConfig.offline().motion_spacing_s
     # Columns are placed so that a whole number of them covers the recording.
@@ -88,7 +88,7 @@ def irregular_frames(seed: int) -> list[Frame]:
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1, 2])
 @pytest.mark.parametrize(("field", "is_offline"), [("basis", True), ("basis", False), ("hexplane", True)])
-def test_at_no_time_is_the_scene_far_from_its_states_at_irregular_frames(field, is_offline, seed):
+def test_model_stays_near_frame_states_for_irregular_frames(field, is_offline, seed):
     frames = irregular_frames(seed)
     if is_offline:
         config = replace(ReconstructorConfig.offline(field), gaussians=300, max_gaussians=400)

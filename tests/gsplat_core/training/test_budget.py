@@ -57,7 +57,7 @@ def step_takes(monkeypatch, clock):
 
 
 @pytest.mark.parametrize("step_s", [1.0, 0.125, 3e-4])
-def test_a_deadline_of_so_many_steps_gives_the_model_of_that_number(tissue_video, camera, clock, step_takes, step_s):
+def test_deadline_budget_equals_step_budget_of_same_number(tissue_video, camera, clock, step_takes, step_s):
     counted, timed = Reconstructor(CONFIG, camera), Reconstructor(CONFIG, camera)
     trained = step_takes(step_s)
     for frame, steps in zip(tissue_video(6), (6, 5, 8, 1, 12, 7), strict=True):
@@ -72,7 +72,7 @@ def test_a_deadline_of_so_many_steps_gives_the_model_of_that_number(tissue_video
         assert timed.snapshot().sha256() == counted.snapshot().sha256()
 
 
-def test_the_configured_number_of_steps_is_the_default_budget(tissue_video, camera):
+def test_default_budget_is_configured_number_of_steps(tissue_video, camera):
     frames = tissue_video(3)
     plain, counted = Reconstructor(CONFIG, camera), Reconstructor(CONFIG, camera)
     for frame, steps in zip(frames, (6, 8, 8), strict=True):
@@ -81,7 +81,7 @@ def test_the_configured_number_of_steps_is_the_default_budget(tissue_video, came
     assert plain.snapshot().sha256() == counted.snapshot().sha256()
 
 
-def test_a_stop_ends_the_frame_after_the_step_in_progress(tissue_video, camera, clock, step_takes):
+def test_stop_request_ends_frame_after_current_step(tissue_video, camera, clock, step_takes):
     frames = tissue_video(2)
     stopped, counted = Reconstructor(CONFIG, camera), Reconstructor(CONFIG, camera)
     step_takes(1.0)
@@ -94,7 +94,7 @@ def test_a_stop_ends_the_frame_after_the_step_in_progress(tissue_video, camera, 
     assert (late.steps, late.ending) == (1, "stopped"), "a displayed frame was trained on"
 
 
-def test_a_stop_ends_the_further_steps_on_a_jump(tissue_video, camera, clock, step_takes):
+def test_stop_request_ends_additional_steps_after_jump(tissue_video, camera, clock, step_takes):
     first, second, *_ = tissue_video(2)
     jump = second.with_fields(image=255 - second.image)
     step_takes(1.0)
@@ -108,7 +108,7 @@ def test_a_stop_ends_the_further_steps_on_a_jump(tissue_video, camera, clock, st
     assert stopped.observe(jump, stop_requested=lambda: clock() >= end_s).steps == CONFIG.steps_per_frame + 2
 
 
-def test_a_step_that_would_end_after_the_deadline_is_not_made(tissue_video, camera, clock, step_takes):
+def test_no_step_starts_that_would_end_after_deadline(tissue_video, camera, clock, step_takes):
     learning = Reconstructor(CONFIG, camera)
     step_takes(1.0)
     for frame, left_s, steps in zip(tissue_video(4), (4.9, 4.9, 0.5, 2.0), (4, 4, 1, 2), strict=True):
@@ -117,7 +117,7 @@ def test_a_step_that_would_end_after_the_deadline_is_not_made(tissue_video, came
         assert report.steps == steps == clock() - start_s
 
 
-def test_steps_that_become_slow_end_the_frame_in_time(tissue_video, camera, clock, step_takes):
+def test_deadline_holds_if_steps_become_slower(tissue_video, camera, clock, step_takes):
     learning = Reconstructor(CONFIG, camera)
     frames = tissue_video(8)
     step_takes(1.0)
@@ -132,7 +132,7 @@ def test_steps_that_become_slow_end_the_frame_in_time(tissue_video, camera, cloc
     assert max(late_s) <= 0
 
 
-def test_bounds_hold_whatever_the_time(tissue_video, camera, clock, step_takes):
+def test_budget_at_least_and_at_most_override_deadline(tissue_video, camera, clock, step_takes):
     learning = Reconstructor(CONFIG, camera)
     frames = tissue_video(3)
     step_takes(1.0)
@@ -144,7 +144,7 @@ def test_bounds_hold_whatever_the_time(tissue_video, camera, clock, step_takes):
     assert (none.steps, none.loss, none.ending) == (0, None, "deadline")
 
 
-def test_with_a_deadline_the_newest_frame_has_its_share_and_the_last_step(tissue_video, camera, clock, step_takes):
+def test_deadline_budget_gives_newest_frame_its_share_and_last_step(tissue_video, camera, clock, step_takes):
     learning = Reconstructor(CONFIG, camera)
     trained = step_takes(1.0)
     for frame in tissue_video(6):
@@ -155,9 +155,7 @@ def test_with_a_deadline_the_newest_frame_has_its_share_and_the_last_step(tissue
     assert seen[5] == 1 + round(0.7 * 20)
 
 
-def test_after_a_jump_all_the_time_that_is_left_goes_to_the_new_frame(
-    tissue_video, make_frame, camera, clock, step_takes
-):
+def test_after_jump_all_steps_train_on_new_frame(tissue_video, make_frame, camera, clock, step_takes):
     learning = Reconstructor(CONFIG, camera)
     frames = tissue_video(4)
     trained = step_takes(1.0)
@@ -171,7 +169,7 @@ def test_after_a_jump_all_the_time_that_is_left_goes_to_the_new_frame(
     assert (report.steps, trained) == (12, [4] * 12)
 
 
-def test_queued_steps_count_against_the_deadline(clock):
+def test_steps_in_flight_count_against_deadline(clock):
     spending = Spending(Budget.until(clock() + 10, clock=clock), step_s=1.0)
     made = 0
     while spending.allows_step():
@@ -181,7 +179,7 @@ def test_queued_steps_count_against_the_deadline(clock):
     assert spending.ending == "deadline"
 
 
-def test_the_time_of_a_step_is_that_of_the_finished_ones(clock):
+def test_step_time_is_measured_on_finished_steps(clock):
     spending = Spending(Budget.until(clock() + 100, clock=clock))
     assert spending.planned() == 1  # nothing is known yet
     clock.now_s += 4
@@ -190,7 +188,7 @@ def test_the_time_of_a_step_is_that_of_the_finished_ones(clock):
     assert spending.planned() == (100 - 4) // 4
 
 
-def test_what_the_first_queued_step_waited_for_is_not_its_length(clock):
+def test_step_time_excludes_wait_of_first_queued_step(clock):
     spending = Spending(Budget.until(clock() + 100, clock=clock), step_s=3.0)
     spending.step_made(in_flight=1)
     spending.step_made(in_flight=2)
@@ -226,7 +224,7 @@ class Event:
             earlier.over = True
 
 
-def test_no_more_than_a_few_steps_are_in_flight(monkeypatch):
+def test_steps_in_flight_are_limited(monkeypatch):
     monkeypatch.setattr(torch.cuda, "Event", Event)
     monkeypatch.setattr(torch.cuda, "current_stream", lambda device: None)
     Event.made = []
@@ -239,9 +237,7 @@ def test_no_more_than_a_few_steps_are_in_flight(monkeypatch):
 
 
 @pytest.mark.cuda
-def test_on_a_gpu_a_deadline_of_so_many_steps_gives_the_model_of_that_number(
-    gpu, tissue_video, camera, clock, step_takes
-):
+def test_deadline_budget_equals_step_budget_on_cuda(gpu, tissue_video, camera, clock, step_takes):
     counted, timed = (Reconstructor(CONFIG, camera, device=gpu) for _ in range(2))
     step_takes(1.0)
     for frame, steps in zip(tissue_video(6), (6, 5, 8, 1, 12, 7), strict=True):
@@ -253,7 +249,7 @@ def test_on_a_gpu_a_deadline_of_so_many_steps_gives_the_model_of_that_number(
     assert timed.snapshot().sha256() == counted.snapshot().sha256()
 
 
-def test_on_the_cpu_nothing_is_in_flight():
+def test_no_steps_are_in_flight_on_cpu():
     assert StepsInFlight(torch.device("cpu")).queued() == 0
 
 
@@ -267,17 +263,17 @@ def test_on_the_cpu_nothing_is_in_flight():
         (lambda: Budget.until(1.0, at_least=5, at_most=4), "at_least is 5 and at_most 4"),
     ],
 )
-def test_a_budget_that_makes_no_sense_is_refused(make, message):
+def test_budget_refuses_invalid_values(make, message):
     with pytest.raises(InvalidInput, match=message):
         make()
 
 
-def test_two_budgets_at_once_are_refused(make_frame, camera):
+def test_observe_refuses_budget_together_with_steps(make_frame, camera):
     with pytest.raises(InvalidInput, match="budget and steps are both given"):
         Reconstructor(CONFIG, camera).observe(make_frame(), budget=Budget.of_steps(3), steps=3)
 
 
-def turns(budget, clock, step_s, slow_from=99):
+def eye_turns(budget, clock, step_s, slow_from=99):
     """Return the turn of each step. Steps take `step_s`, and three times as long from step `slow_from` on."""
     spending, taken = Spending(budget, step_s), []
     while spending.allows_step(by_turns=True):
@@ -288,38 +284,38 @@ def turns(budget, clock, step_s, slow_from=99):
 
 
 @pytest.mark.parametrize("steps", [0, 1, 2, 3, 6, 8])
-def test_of_a_number_of_steps_the_first_and_the_last_are_the_first_eyes(clock, steps):
+def test_step_budget_gives_first_and_last_steps_to_first_eye(clock, steps):
     expected = {3: [0, 0, 0], 6: [0, 0, 1, 0, 0, 0], 8: [0, 0, 1, 0, 0, 0, 1, 0]}
-    assert turns(Budget.of_steps(steps), clock, 1.0) == expected.get(steps, [0] * steps)
+    assert eye_turns(Budget.of_steps(steps), clock, 1.0) == expected.get(steps, [0] * steps)
 
 
 @pytest.mark.parametrize(
     ("room", "expected"), [(0.5, [0]), (2.9, [0, 0]), (3.1, [0, 0, 0]), (4.1, [0, 0, 1, 0]), (5.1, [0, 0, 1, 0, 0])]
 )
-def test_before_a_deadline_the_second_eye_begins_where_there_is_time_for_both(clock, room, expected):
-    taken = turns(Budget.until(clock.now_s + room, clock=clock), clock, 1.0)
+def test_deadline_budget_gives_second_eye_a_step_if_time_for_both(clock, room, expected):
+    taken = eye_turns(Budget.until(clock.now_s + room, clock=clock), clock, 1.0)
     assert taken == expected
-    again = turns(Budget.of_steps(len(taken)), clock, 1.0)
+    again = eye_turns(Budget.of_steps(len(taken)), clock, 1.0)
     assert again == taken, "a recorded session makes the same steps by their number"
 
 
-def test_the_first_eye_has_its_turn_though_the_second_ones_step_took_longer(clock):
-    assert turns(Budget.until(clock.now_s + 4.5, clock=clock), clock, 1.0, slow_from=2) == [0, 0, 1, 0]
+def test_first_eye_has_last_step_even_if_second_eye_step_is_slow(clock):
+    assert eye_turns(Budget.until(clock.now_s + 4.5, clock=clock), clock, 1.0, slow_from=2) == [0, 0, 1, 0]
 
 
 @pytest.mark.parametrize(
     ("at_least", "at_most", "expected"),
     [(4, 9, [0, 0, 1, 0]), (3, 9, [0, 0, 0]), (1, 4, [0, 0, 1, 0]), (1, 3, [0, 0, 0]), (3, 3, [0, 0, 0])],
 )
-def test_bounds_end_with_the_first_eye_too(clock, at_least, at_most, expected):
+def test_budget_bounds_end_with_step_of_first_eye(clock, at_least, at_most, expected):
     deadline_s = clock.now_s if at_least > 1 else clock.now_s + 100
     budget = Budget.until(deadline_s, at_least=at_least, at_most=at_most, clock=clock)
-    assert turns(budget, clock, 1.0) == expected
+    assert eye_turns(budget, clock, 1.0) == expected
 
 
 @pytest.mark.parametrize(
     ("left_s", "step_s", "planned"), [(0.3, 0.1, 3), (0.29, 0.1, 2), (0.7, 0.1, 7), (0.05, 0.1, 1)]
 )
-def test_steps_that_just_fit_before_a_deadline_are_planned(left_s, step_s, planned):
+def test_planned_steps_include_step_ending_exactly_at_deadline(left_s, step_s, planned):
     """0.3 / 0.1 is less than 3 in floating point."""
     assert Spending(Budget(None, left_s, clock=lambda: 0.0), step_s).planned() == planned

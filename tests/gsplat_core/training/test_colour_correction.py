@@ -52,7 +52,9 @@ def by_autograd(gaussians, seen, relaxation):
 @pytest.mark.parametrize("sh_degree", [0, 2])
 @pytest.mark.parametrize("depth_weight", [0.0, 0.5])
 @pytest.mark.parametrize(("width", "height", "tissue"), [(37, 29, 0.7), (1, 1, 1.0), (17, 3, 1.0), (33, 32, 0.01)])
-def test_equals_plain_torch(make_gaussians, assert_near, sh_degree, depth_weight, width, height, tissue):
+def test_colour_change_equals_float64_torch(
+    make_gaussians, assert_near, sh_degree, depth_weight, width, height, tissue
+):
     gaussians, seen = make_gaussians(60, sh_degree), observation(width, height, tissue=tissue)
     weights = LossWeights(depth=depth_weight, squared=True)
     compared = loss_and_gradients(gaussians, seen, weights, 1.5)
@@ -61,9 +63,7 @@ def test_equals_plain_torch(make_gaussians, assert_near, sh_degree, depth_weight
 
 @pytest.mark.parametrize("sh_degree", [0, 2])
 @pytest.mark.parametrize("weights", [SQUARED, LossWeights(0.1, 0.5)])
-def test_corrections_before_equal_the_same_number_of_separate_corrections(
-    make_gaussians, assert_near, sh_degree, weights
-):
+def test_corrections_before_equals_separate_corrections(make_gaussians, assert_near, sh_degree, weights):
     gaussians, seen = make_gaussians(60, sh_degree), observation()
     together = loss_and_gradients(gaussians, seen, weights, 1.5, corrections_before=3)
     corrected = gaussians
@@ -81,7 +81,7 @@ def test_corrections_before_equal_the_same_number_of_separate_corrections(
 
 
 @pytest.mark.parametrize("sh_degree", [0, 2])
-def test_the_other_gradients_do_not_see_it(make_gaussians, sh_degree):
+def test_colour_correction_does_not_change_other_gradients(make_gaussians, sh_degree):
     gaussians, seen = make_gaussians(60, sh_degree), observation()
     plain = loss_and_gradients(gaussians, seen, SQUARED)
     corrected = loss_and_gradients(gaussians, seen, SQUARED, 1.0)
@@ -95,7 +95,7 @@ def test_the_other_gradients_do_not_see_it(make_gaussians, sh_degree):
 
 
 @pytest.mark.parametrize("relaxation", [0.5, 1.0, 1.99])
-def test_the_squared_error_never_grows(relaxation):
+def test_colour_correction_never_increases_squared_error(relaxation):
     random = torch.Generator().manual_seed(1)
     blending = torch.rand(200, 30, generator=random) * (torch.rand(200, 30, generator=random) < 0.2)
     blending /= blending.sum(1, keepdim=True).clamp(min=1)
@@ -108,7 +108,7 @@ def test_the_squared_error_never_grows(relaxation):
     assert errors[-1] < 0.9 * errors[0]
 
 
-def test_what_is_hardly_seen_takes_little_and_what_is_not_seen_nothing():
+def test_colour_correction_is_small_for_barely_visible_gaussians():
     weights = torch.tensor([0.0, 1e-6, LEAST_WEIGHT_PX, 100.0])
     colours = torch.tensor([[0.5], [0.5], [0.5], [-0.2]]).expand(4, 3)
     change = colour_correction(colours, 0.2 * weights[:, None].expand(4, 3), weights, 1.0)
@@ -116,13 +116,13 @@ def test_what_is_hardly_seen_takes_little_and_what_is_not_seen_nothing():
     assert not change[0].any()
 
 
-def test_a_colour_does_not_sink_below_what_can_be_shown():
+def test_colour_correction_keeps_colours_nonnegative():
     colours = torch.tensor([[0.5, 0.1, -0.2]])
     change = colour_correction(colours, torch.full((1, 3), -30.0), torch.tensor([100.0]), 1.0)
     assert change[0].tolist() == pytest.approx([-0.3, -0.1, 0.0], abs=1e-2)
 
 
-def test_without_tissue_or_gaussians_there_is_no_change(make_gaussians):
+def test_colour_change_is_zero_without_tissue_or_gaussians(make_gaussians):
     nothing = loss_and_gradients(make_gaussians(20), observation(tissue=0.0), SQUARED, 1.0).colour_change
     assert nothing.shape == (20, 3)
     assert not nothing.any()
@@ -132,9 +132,7 @@ def test_without_tissue_or_gaussians_there_is_no_change(make_gaussians):
 @pytest.mark.parametrize(
     "weights", [LossWeights(), LossWeights(0.1), LossWeights(0.1, 0.5), LossWeights(0.1, squared=True)]
 )
-def test_every_loss_has_the_correction_of_the_squared_error_and_keeps_its_own_gradients(
-    make_gaussians, assert_near, weights
-):
+def test_every_loss_has_same_colour_correction_and_own_gradients(make_gaussians, assert_near, weights):
     gaussians, seen = make_gaussians(60), observation()
     compared, plain = (loss_and_gradients(gaussians, seen, weights, relaxation) for relaxation in (1.5, 0.0))
     assert_near(compared.colour_change, by_autograd(gaussians, seen, 1.5), of_largest=1e-4)
@@ -143,7 +141,7 @@ def test_every_loss_has_the_correction_of_the_squared_error_and_keeps_its_own_gr
     assert plain.gradients["sh"][:, 0].any() and not compared.gradients["sh"][:, 0].any()
 
 
-def test_the_residual_target_is_the_tissue_of_the_observation_minus_the_picture():
+def test_residual_target_is_masked_difference_to_picture():
     seen, shown = observation(5, 4), torch.rand(4, 5, 4, generator=torch.Generator().manual_seed(3))
     target = ResidualTarget(seen.image)
     target.take(seen.image.flip(0), 1 - seen.mask)

@@ -40,7 +40,7 @@ def picture_of(gaussians: Gaussians) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("degree", [0, 2])
-def test_the_scene_comes_to_look_like_the_picture(device: str, degree: int) -> None:
+def test_colour_change_reduces_picture_error(device: str, degree: int) -> None:
     gaussians = scene(device=device, degree=degree)
     wanted = picture_of(with_change(gaussians, torch.full_like(gaussians.means, 0.3)))
     counts = torch.ones(wanted.shape[:2], device=device)
@@ -55,7 +55,7 @@ def test_the_scene_comes_to_look_like_the_picture(device: str, degree: int) -> N
     assert errors[0] > 10 * errors[1] > 100 * errors[2]
 
 
-def test_a_first_step_is_the_weighted_mean_of_what_pixels_lack() -> None:
+def test_first_colour_step_is_weighted_mean_of_residuals() -> None:
     """Compare with the blending weights, computed one Gaussian at a time."""
     gaussians = scene(12)
     change = torch.rand(32, 48, 3, generator=torch.Generator().manual_seed(1))
@@ -69,12 +69,12 @@ def test_a_first_step_is_the_weighted_mean_of_what_pixels_lack() -> None:
         torch.testing.assert_close(found[index], expected, rtol=1e-3, atol=1e-4)
 
 
-def test_pixels_that_do_not_count_change_nothing() -> None:
+def test_colour_change_is_zero_for_uncounted_pixels() -> None:
     gaussians, counts = scene(), torch.zeros(32, 48)
     assert not colour_change(gaussians, CAMERA, torch.ones(32, 48, 3), counts, 3).any()
 
 
-def test_gaussians_that_nobody_sees_stay_as_they_are() -> None:
+def test_colour_change_is_zero_for_invisible_gaussians() -> None:
     gaussians = scene()
     behind = gaussians.means.clone()
     behind[:5, 2] = -50.0

@@ -33,7 +33,7 @@ from gsplat_core.training.config import (
         ("default_depth_mm", -60.0),
     ],
 )
-def test_a_wrong_setting_is_named_with_its_value(name, value):
+def test_reconstructor_config_error_names_setting_and_value(name, value):
     with pytest.raises(InvalidSetting, match=name) as refused:
         ReconstructorConfig(**{name: value})
     assert str(value) in str(refused.value)
@@ -43,35 +43,35 @@ def test_a_wrong_setting_is_named_with_its_value(name, value):
 @pytest.mark.parametrize(
     ("kind", "name"), [(LearningRates, "quats"), (BasisLearningRates, "timing"), (HexPlaneLearningRates, "parameters")]
 )
-def test_a_wrong_rate_is_named_with_its_value(kind, name, rate):
+def test_learning_rates_error_names_rate_and_value(kind, name, rate):
     with pytest.raises(InvalidSetting, match=f"{name} is {rate}"):
         kind(**{name: rate})
 
 
-def test_an_unknown_field_is_the_users_to_change_and_the_names_are_told():
+def test_unknown_field_error_lists_known_fields():
     with pytest.raises(UserError, match=r"unknown deformation field 'voxels'; known are auto, basis, hexplane"):
         ReconstructorConfig(field="voxels")
 
 
-def test_the_rates_of_another_field_are_refused():
+def test_config_refuses_learning_rates_of_other_field():
     rates = LearningRates(field=HexPlaneLearningRates())
     with pytest.raises(InvalidSetting, match="HexPlaneLearningRates; a basis field has BasisLearningRates"):
         ReconstructorConfig(rates=rates)
     assert ReconstructorConfig(field="hexplane", rates=rates).rates is rates
 
 
-def test_rates_in_pixels_alone_are_scaled_to_the_scene():
+def test_only_pixel_rates_are_scaled_to_scene():
     rates = BasisLearningRates(means_px=2.0, sh=3.0).scaled(mm_per_px=5.0, scale=0.5)
     assert (rates["means_px"], rates["sh"]) == (5.0, 1.5)
 
 
 @pytest.mark.parametrize(("field", "chosen"), [("auto", "basis"), ("basis", "basis"), ("hexplane", "hexplane")])
-def test_auto_stands_for_the_basis_field(field, chosen):
+def test_auto_field_is_basis_field(field, chosen):
     assert ReconstructorConfig(field=field).chosen_field == chosen
 
 
 @pytest.mark.parametrize("field", ["auto", "hexplane"])
-def test_offline_there_are_more_gaussians_finer_motion_and_the_error_that_psnr_measures(field):
+def test_offline_config_has_more_gaussians_finer_motion_and_squared_error(field):
     online, offline = ReconstructorConfig(field=field), ReconstructorConfig.offline(field)
     assert offline.field == field
     assert offline.gaussians > online.gaussians
@@ -83,7 +83,7 @@ def test_offline_there_are_more_gaussians_finer_motion_and_the_error_that_psnr_m
 
 @pytest.mark.parametrize("all_known", [True, False])
 @pytest.mark.parametrize("name", DEPTH_ORIGINS)
-def test_right_colours_follow_at_the_full_rate_offline_where_both_eyes_gave_the_depth(make_frame, name, all_known):
+def test_right_colour_rate_is_full_for_complete_stereo_depth(make_frame, name, all_known):
     frame = make_frame(depth=np.full((40, 48), 60.0, np.float32), depth_origin=DEPTH_ORIGINS[name])
     starts = ReconstructorConfig().starting_from(frame, all_known)
     assert starts.rates.right_share == (1.0 if all_known and name == "stereo" else 0.1)
@@ -97,7 +97,7 @@ def test_right_colours_follow_at_the_full_rate_offline_where_both_eyes_gave_the_
         (DEPTH_ORIGINS["learned"], False, 1.0), (DEPTH_ORIGINS["parallax"], True, 1.0),
     ],
 )  # fmt: skip
-def test_the_weight_of_depth_by_its_origin(make_frame, origin, all_known, factor):
+def test_depth_weight_factor_by_origin(make_frame, origin, all_known, factor):
     """Compare with numbers, because a comparison with the table would accept exchanged entries."""
     frame = make_frame(depth=np.full((40, 48), 60.0, np.float32), depth_origin=origin)
     assert ReconstructorConfig(depth_weight=0.1).starting_from(frame, all_known).depth_weight == pytest.approx(
@@ -105,7 +105,7 @@ def test_the_weight_of_depth_by_its_origin(make_frame, origin, all_known, factor
     )
 
 
-def test_without_depth_and_without_an_end_weights_stay_as_they_are(make_frame):
+def test_config_is_unchanged_without_depth_or_with_history(make_frame):
     config, deep = ReconstructorConfig(), make_frame(depth=np.full((40, 48), 60.0, np.float32))
     assert config.starting_from(make_frame(), True) is config
     endless = dataclasses.replace(config, history_s=10.0)
@@ -120,7 +120,7 @@ def test_without_depth_and_without_an_end_weights_stay_as_they_are(make_frame):
         {"ssim_weight": 0.0}, {"ssim_weight": 1.0}, {"depth_weight": 0.0}, {"history_s": 1e-9},
     ],
 )  # fmt: skip
-def test_settings_at_their_limits_are_taken(settings):
+def test_config_accepts_boundary_values(settings):
     made = ReconstructorConfig(**settings)
     assert {name: getattr(made, name) for name in settings} == settings
 
@@ -129,12 +129,12 @@ def test_settings_at_their_limits_are_taken(settings):
     ("name", "value"), [("sh_degree", -1), ("history_s", 0.0), ("history_s", float("inf")),
                         ("default_depth_mm", 0.0), ("motion_spacing_s", float("inf")), ("eyes", "right"), ("motion_detail", "some")],
 )  # fmt: skip
-def test_settings_just_beyond_their_limits_are_refused(name, value):
+def test_config_refuses_values_beyond_limits(name, value):
     with pytest.raises(InvalidSetting, match=name):
         ReconstructorConfig(**{name: value})
 
 
-def test_defaults_are_those_of_the_published_figures():
+def test_config_defaults_equal_published_settings():
     """Figures of `benchmarks/RESULTS.md` and the memory in the docs were taken with these."""
     made = dataclasses.asdict(ReconstructorConfig())
     rates = made.pop("rates")
@@ -158,11 +158,11 @@ def test_defaults_are_those_of_the_published_figures():
     "name", ["gaussians", "max_gaussians", "steps_per_frame", "first_frame_steps", "window_frames"]
 )
 @pytest.mark.parametrize("value", [0, -3, 1.5, float("nan"), "7"])
-def test_counts_are_whole_numbers(name, value):
+def test_config_counts_must_be_whole_numbers(name, value):
     with pytest.raises(InvalidSetting, match=f"{name} is {value!r}; it must be a whole number of at least 1"):
         ReconstructorConfig(**{name: value})
 
 
-def test_losses_are_a_list():
+def test_config_refuses_losses_as_string():
     with pytest.raises(InvalidSetting, match=r"losses is 'flow'; give a list of names, such as \['flow'\]"):
         ReconstructorConfig(losses="flow")

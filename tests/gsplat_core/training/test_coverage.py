@@ -8,13 +8,13 @@ import torch
 from gsplat_core.training.covering import are_worth_filling, uncovered_pixels
 
 
-def test_tissue_of_which_less_than_half_is_covered_is_uncovered() -> None:
+def test_uncovered_pixels_are_tissue_with_alpha_below_half() -> None:
     alpha, mask = torch.tensor([[0.0, 0.49, 0.5, 0.9, 0.0]]), torch.tensor([[1, 255, 1, 1, 0]], dtype=torch.uint8)
     assert uncovered_pixels(alpha, mask).tolist() == [[True, True, False, False, False]]
 
 
 @pytest.mark.parametrize(("count", "is_worth"), [(0, False), (1, False), (2, True), (1000, True)])
-def test_two_pixels_of_a_thousand_are_filled(count: int, is_worth: bool) -> None:
+def test_are_worth_filling_from_two_pixels_per_thousand(count: int, is_worth: bool) -> None:
     uncovered = torch.zeros(25, 40, dtype=torch.bool)
     uncovered.view(-1)[:count] = True
     assert are_worth_filling(uncovered) == is_worth

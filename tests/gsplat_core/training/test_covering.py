@@ -43,7 +43,7 @@ def covering(config=CONFIG, *, beside):
     return made
 
 
-def test_they_join_at_once_or_with_the_next_look_and_are_the_same(step, seen, frame, camera):
+def test_covering_beside_training_adds_same_gaussians_later(step, seen, frame, camera):
     first = step.gaussians.count
     late = covering(beside=True)
     late.check(step, seen, lambda: frame)
@@ -61,7 +61,7 @@ def test_they_join_at_once_or_with_the_next_look_and_are_the_same(step, seen, fr
     assert all(torch.equal(a, b) for a, b in zip(step.gaussians.left_tensors, joined.left_tensors, strict=True))
 
 
-def test_what_is_under_way_for_a_scene_that_is_left_joins_no_other(step, seen, frame):
+def test_pending_covering_of_left_scene_is_discarded(step, seen, frame):
     first, late = step.gaussians.count, covering(beside=True)
     gate = threading.Event()
 
@@ -77,7 +77,7 @@ def test_what_is_under_way_for_a_scene_that_is_left_joins_no_other(step, seen, f
 
 
 @pytest.mark.parametrize("room", [1, 20])
-def test_two_that_were_under_way_at_once_do_not_take_more_room_than_there_is(step, seen, frame, room):
+def test_concurrent_coverings_respect_max_gaussians(step, seen, frame, room):
     first = step.gaussians.count
     config = ReconstructorConfig(gaussians=first, max_gaussians=first + room)
     late = covering(config, beside=True)
@@ -90,7 +90,7 @@ def test_two_that_were_under_way_at_once_do_not_take_more_room_than_there_is(ste
     assert step.gaussians.count <= config.max_gaussians
 
 
-def test_what_goes_wrong_in_the_thread_is_raised_with_the_next_look(step, seen):
+def test_covering_thread_error_is_raised_at_join(step, seen):
     late = covering(beside=True)
 
     def pictures():

@@ -12,26 +12,26 @@ def share_of(damping: Damping) -> float:
     return float(damping.damped(torch.ones(1, 3))[0, 0])
 
 
-def test_it_starts_with_a_constant() -> None:
+def test_damping_starts_with_constant_share() -> None:
     assert share_of(Damping()) == pytest.approx(AT_FIRST)
 
 
 @pytest.mark.parametrize(("ratio", "learned"), [(1.0, 1.0), (0.3, 0.3), (0.0, 0.0), (-0.4, 0.0), (50.0, 1.0)])
-def test_it_learns_the_share_within_its_bounds(ratio: float, learned: float) -> None:
+def test_damping_learns_share_clamped_to_0_and_1(ratio: float, learned: float) -> None:
     damping, last = Damping(), torch.randn(100, 3, generator=torch.Generator().manual_seed(0))
     for _ in range(60):
         damping.learn(last, ratio * last)
     assert share_of(damping) == pytest.approx(learned, abs=1e-3)
 
 
-def test_motion_that_is_noise_is_not_continued() -> None:
+def test_damping_of_random_motion_approaches_zero() -> None:
     damping, random = Damping(), torch.Generator().manual_seed(1)
     for _ in range(60):
         damping.learn(torch.randn(500, 3, generator=random), torch.randn(500, 3, generator=random))
     assert share_of(damping) < 0.1
 
 
-def test_frames_that_say_nothing_change_nothing() -> None:
+def test_damping_ignores_zero_nan_and_empty_motion() -> None:
     damping = Damping()
     damping.learn(torch.zeros(4, 3), torch.ones(4, 3))
     damping.learn(torch.full((4, 3), torch.nan), torch.ones(4, 3))
@@ -40,7 +40,7 @@ def test_frames_that_say_nothing_change_nothing() -> None:
 
 
 @pytest.mark.parametrize(("ratio", "share"), [(1.0, 0.66), (0.0, 0.51), (50.0, 0.735), (-50.0, 0.435)])
-def test_one_frame_counts_by_fifteen_hundredths_and_no_further_than_its_bounds(ratio: float, share: float) -> None:
+def test_damping_update_weight_and_clamp_of_one_frame(ratio: float, share: float) -> None:
     """The estimate starts at 0.6 and moves by 0.15 (ratio - 0.6), with the ratio clamped to [-0.5, 1.5]."""
     damping, last = Damping(), torch.ones(5, 3)
     damping.learn(last, ratio * last)

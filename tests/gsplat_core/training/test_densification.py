@@ -29,7 +29,7 @@ def step(make_frame, camera, request):
     return TrainingStep(gaussians, BasisField(gaussians.count, (0.0, 1.0), bumps=6), config, camera)
 
 
-def test_the_shares_add_up_to_the_picture_and_to_its_error(step, make_frame, camera):
+def test_shares_sum_to_picture_coverage_and_error(step, make_frame, camera):
     mask = np.ones((camera.height_px, camera.width_px), np.uint8)
     mask[:, :13] = 0
     seen = Observation.of(make_frame(2, shift_px=1, mask=mask), camera)
@@ -41,21 +41,21 @@ def test_the_shares_add_up_to_the_picture_and_to_its_error(step, make_frame, cam
     assert shares.error.sum().item() == pytest.approx((alpha * off)[tissue].sum().item(), rel=1e-4)
 
 
-def test_of_several_pictures_the_errors_add_up_and_the_best_view_counts(step, make_frame, camera):
+def test_shares_of_several_pictures_sum_errors_and_take_best_view(step, make_frame, camera):
     one, other = (Observation.of(make_frame(seq, shift_px=seq), camera) for seq in (0, 3))
     both, first, second = shares_of(step, [one, other]), shares_of(step, [one]), shares_of(step, [other])
     torch.testing.assert_close(both.error, first.error + second.error)
     torch.testing.assert_close(both.seen_px, torch.maximum(first.seen_px, second.seen_px))
 
 
-def test_dark_tissue_counts_as_much_as_bright(step, make_frame, camera):
+def test_shares_count_dark_tissue_like_bright_tissue(step, make_frame, camera):
     seen = Observation.of(make_frame(), camera)
     expected = shares_of(step, [seen]).seen_px
     step.gaussians.sh.fill_(-10.0)  # below black: the picture's gradient is zero there
     torch.testing.assert_close(shares_of(step, [seen]).seen_px, expected)
 
 
-def test_gaussians_that_nobody_sees_go_and_those_with_the_largest_error_are_split(step, make_frame, camera):
+def test_densify_removes_unseen_and_splits_largest_errors(step, make_frame, camera):
     count = step.gaussians.count
     seen, error = torch.ones(count), torch.zeros(count)
     seen[7] = UNSEEN_PX / 2
@@ -73,7 +73,7 @@ def test_gaussians_that_nobody_sees_go_and_those_with_the_largest_error_are_spli
     step(Observation.of(make_frame(1), camera))  # optimiser and field fit the new number
 
 
-def test_nothing_is_split_beyond_the_number_asked_for_nor_more_than_once(step):
+def test_densify_splits_each_gaussian_once_up_to_target_count(step):
     count = step.gaussians.count
     shares = Shares(torch.ones(count), torch.arange(count).float())
     densify(step, shares, count)
@@ -82,13 +82,13 @@ def test_nothing_is_split_beyond_the_number_asked_for_nor_more_than_once(step):
     assert step.gaussians.count == 2 * count
 
 
-def test_a_scene_that_nobody_sees_is_left_as_it_is(step):
+def test_densify_keeps_entirely_unseen_scene(step):
     count = step.gaussians.count
     densify(step, Shares(torch.zeros(count), torch.zeros(count)), 2 * count)
     assert step.gaussians.count == count
 
 
-def test_both_halves_move_as_their_parent_did(step, make_frame, camera):
+def test_split_halves_keep_deformation_of_parent(step, make_frame, camera):
     with torch.no_grad():
         step.field.weights.normal_(std=0.3, generator=torch.Generator().manual_seed(0))
     count = step.gaussians.count
@@ -99,7 +99,7 @@ def test_both_halves_move_as_their_parent_did(step, make_frame, camera):
     assert torch.equal(deltas[count:], moved[[5, 9]])
 
 
-def test_halves_lie_along_the_longest_axis_and_cover_their_parent():
+def test_halves_lie_along_longest_axis_of_parent():
     turn = torch.tensor([[np.cos(np.pi / 8), 0, 0, np.sin(np.pi / 8)]], dtype=torch.float32)  # 45 degrees about z
     parent = Gaussians(
         means=torch.tensor([[1.0, 2.0, 3.0]]),
@@ -119,7 +119,7 @@ def test_halves_lie_along_the_longest_axis_and_cover_their_parent():
             assert torch.equal(half.tensors()[name], parent.tensors()[name])
 
 
-def test_two_halves_look_like_their_parent(step, camera):
+def test_halves_render_like_parent(step, camera):
     middle = step.gaussians.means[:, :2].norm(dim=1).argmin()
     one = step.gaussians.select(middle[None])
     whole = render(one, camera).alpha
@@ -128,7 +128,7 @@ def test_two_halves_look_like_their_parent(step, camera):
     assert (both - whole).abs().sum() < 0.25 * whole.sum()
 
 
-def test_the_same_seed_gives_the_same_gaussians(make_frame, camera):
+def test_densify_is_deterministic(make_frame, camera):
     seen = [Observation.of(make_frame(seq, shift_px=seq / 2), camera) for seq in range(3)]
 
     def densified():
@@ -152,7 +152,7 @@ def trained(step, make_frame, camera):
 
 
 @pytest.mark.parametrize("more", [0, 15])
-def test_births_replace_deaths_and_growth_follows_the_schedule(step, make_frame, camera, more):
+def test_birth_death_replaces_unseen_and_grows_to_target_count(step, make_frame, camera, more):
     trained(step, make_frame, camera)
     count = step.gaussians.count
     seen = torch.ones(count)
@@ -164,7 +164,7 @@ def test_births_replace_deaths_and_growth_follows_the_schedule(step, make_frame,
     assert all(tensor.isfinite().all() for tensor in step.gaussians.tensors().values())
 
 
-def test_the_same_scene_gives_the_same_births_and_deaths(step, make_frame, camera):
+def test_birth_death_is_deterministic(step, make_frame, camera):
     trained(step, make_frame, camera)
     other = copy.deepcopy(step)
     for each in (step, other):
@@ -172,7 +172,7 @@ def test_the_same_scene_gives_the_same_births_and_deaths(step, make_frame, camer
     torch.testing.assert_close(step.gaussians.means, other.gaussians.means, rtol=0, atol=0)
 
 
-def test_two_copies_keep_the_opacity_and_the_brightness(device):
+def test_relocated_copies_keep_opacity_and_brightness(device):
     parents = Gaussians(
         torch.zeros(2, 3),
         torch.tensor([[1.0, 0, 0, 0]] * 2),
@@ -188,7 +188,7 @@ def test_two_copies_keep_the_opacity_and_the_brightness(device):
     assert (first.means != second.means).any(1).all()
 
 
-def test_a_fit_with_birth_and_death_keeps_the_count(make_frame, camera):
+def test_fit_with_birth_death_strategy_keeps_count(make_frame, camera):
     config = ReconstructorConfig(field="basis", gaussians=100, max_gaussians=100, strategy="birth_death")
     reconstructor = Reconstructor(config, camera)
     reconstructor.fit([make_frame(seq, shift_px=seq) for seq in range(4)], steps=20)

@@ -26,21 +26,21 @@ def seen(k: int, depth: float, error: float | None = 0.0) -> Observation:
     return Observation.of(found(frame_at(k), depth).with_fields(depth_error=error), CAMERA)
 
 
-def test_a_model_states_its_difference_from_the_depth_of_its_frames(placed):
+def test_depth_errors_are_difference_of_model_and_frame_depth(placed):
     model = placed.snapshot()
     right, far = depth_errors(model, [seen(0, 80.0), seen(2, 100.0)])
     assert right.time_s == frame_at(0).time_s and right.relative < 0.02
     assert far.time_s == frame_at(2).time_s and far.relative == pytest.approx(0.2, abs=0.03)
 
 
-def test_the_standard_error_of_the_frames_depth_adds_to_it(placed):
+def test_depth_errors_include_standard_error_of_frame_depth(placed):
     model = placed.snapshot()
     sure, unsure, unknown = (depth_errors(model, [seen(0, 80.0, error)])[0].relative for error in (0.0, 0.3, None))
     assert unsure == pytest.approx(math.hypot(sure, 0.3))
     assert unknown == pytest.approx(math.hypot(sure, DEPTH_ORIGINS["stereo"].relative_error))
 
 
-def test_errors_belong_to_a_few_frames_inside_of_the_window(placed):
+def test_depth_errors_are_limited_to_few_times_within_window(placed):
     model = placed.snapshot()
     end_s = model.time_window_s[1]
     observations = [replace(seen(0, 80.0), time_s=end_s * k / 20) for k in range(25)]
@@ -50,7 +50,7 @@ def test_errors_belong_to_a_few_frames_inside_of_the_window(placed):
     assert depth_errors(model, [without]) == ()
 
 
-def test_a_run_s_model_has_the_errors_and_nothing_else_changes(placed):
+def test_with_depth_errors_changes_only_depth_source(placed):
     model = placed.snapshot()
     stated = placed.with_depth_errors(model)
     assert model.depth_source.errors == () and len(stated.depth_source.errors) == 4

@@ -58,7 +58,7 @@ def plane_at(depth: float) -> TrainingStep:
     return TrainingStep(scene, BasisField(count, (0.0, 1.0), bumps=8), ReconstructorConfig(), FIRST)
 
 
-def test_a_static_scene_of_the_right_depth_does_not_move() -> None:
+def test_surface_motion_of_static_scene_is_zero() -> None:
     after = moved_camera(x=0.05, z=0.1, turned=0.02)
     depth = torch.full((32 * 40,), 2.0)
     points = on_depth(grid_pixels(), depth)
@@ -68,7 +68,7 @@ def test_a_static_scene_of_the_right_depth_does_not_move() -> None:
     assert motion.arrived(points)[inside].norm(dim=1).max() < 2e-3
 
 
-def test_flow_under_a_still_camera_is_motion_parallel_to_the_picture() -> None:
+def test_surface_motion_of_still_camera_is_parallel_to_picture() -> None:
     motion = SurfaceMotion(torch.tensor([3.0, -1.0]).expand(32, 40, 2), FIRST, FIRST)
     points = on_depth(torch.tensor([[60.0, 50.0], [500.0, 50.0]]), torch.tensor([7.0, 7.0]))
     expected = torch.tensor([[3.0, -1.0, 0.0]]) * 7 / 140
@@ -77,7 +77,7 @@ def test_flow_under_a_still_camera_is_motion_parallel_to_the_picture() -> None:
     assert not motion.ahead(points)[1].any()  # outside of the picture
 
 
-def test_the_distance_of_a_plane_is_found_and_the_first_view_kept() -> None:
+def test_depth_from_motion_finds_plane_distance_and_keeps_first_view() -> None:
     step, after = plane_at(60.0), moved_camera(x=0.06, z=0.02, turned=0.01)
     step.field.weights.data[..., :3].fill_(0.01)  # type: ignore[union-attr, index]
     pixels_before = Seen(FIRST, step.at(0.5).means).pixels
@@ -88,7 +88,7 @@ def test_the_distance_of_a_plane_is_found_and_the_first_view_kept() -> None:
     assert abs(float(scene.log_scales.mean()) - np.log(1.6 / 60)) < 0.1
 
 
-def test_relief_is_refined_by_further_frames() -> None:
+def test_depth_from_motion_refines_relief_with_further_frames() -> None:
     x = grid_pixels()[:, 0] / WIDTH
     depth = 1.5 + 0.4 * torch.sin(6 * x)
     step, after, prior = plane_at(60.0), moved_camera(x=0.1), DepthFromMotion()
@@ -100,14 +100,14 @@ def test_relief_is_refined_by_further_frames() -> None:
 
 
 @pytest.mark.parametrize("after", [FIRST, moved_camera(turned=0.03), moved_camera(x=1e-4)])
-def test_without_parallax_nothing_changes(after: Camera) -> None:
+def test_depth_from_motion_without_parallax_changes_nothing(after: Camera) -> None:
     step = plane_at(60.0)
     before = step.gaussians.means.clone()
     DepthFromMotion().apply(step, SurfaceMotion(flow_of_static(torch.full((1280,), 1.6), after), FIRST, after), 0.5)
     assert torch.equal(step.gaussians.means, before)
 
 
-def test_motion_that_no_distance_explains_places_nothing() -> None:
+def test_depth_from_motion_ignores_inconsistent_flow() -> None:
     step, after = plane_at(60.0), moved_camera(x=0.06)
     before = step.gaussians.means.clone()
     flow = torch.from_numpy(np.random.default_rng(0).normal(0, 6, (32, 40, 2)).astype(np.float32))
@@ -123,7 +123,7 @@ def seen_after(after: Camera, depth: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @pytest.mark.parametrize("after", [moved_camera(3.0), moved_camera(0.0, 4.0), moved_camera(2.0, 3.0, 0.03)])
-def test_inverse_depths_and_their_information_are_those_of_the_motion(after: Camera) -> None:
+def test_inverse_depths_and_information_match_parallax(after: Camera) -> None:
     """Information is the square of the pixels by which the point moves per inverse depth."""
     depth = torch.linspace(40, 90, len(grid_pixels()))
     pixels, target = seen_after(after, depth)
@@ -147,19 +147,19 @@ def distance_of(after: Camera, depth: Tensor, target: Tensor | None = None, know
 
 
 @pytest.mark.parametrize("known", [1 / 600, 1 / 60, 1 / 6])
-def test_the_distance_of_a_plane_does_not_depend_on_the_assumed_one(known: float) -> None:
+def test_plane_distance_is_independent_of_assumed_depth(known: float) -> None:
     depth = torch.full((len(grid_pixels()),), 50.0)
     assert distance_of(moved_camera(3.0), depth, known=known) == pytest.approx(50, rel=1e-3)
 
 
 @pytest.mark.parametrize(("parallax_px", "is_found"), [(1.45, False), (1.55, True)])
-def test_a_parallax_of_one_and_a_half_pixels_is_enough(parallax_px: float, is_found: bool) -> None:
+def test_plane_distance_requires_1_5_pixels_of_parallax(parallax_px: float, is_found: bool) -> None:
     depth = torch.full((len(grid_pixels()),), 50.0)
     found = distance_of(moved_camera(parallax_px * 50 / 140), depth)
     assert found == (pytest.approx(50, rel=1e-3) if is_found else None)
 
 
-def test_points_that_move_by_themselves_count_little() -> None:
+def test_plane_distance_is_robust_to_independently_moving_points() -> None:
     depth = torch.full((len(grid_pixels()),), 50.0)
     _, target = seen_after(moved_camera(3.0), depth)
     moved = target.clone()
@@ -171,7 +171,7 @@ def test_points_that_move_by_themselves_count_little() -> None:
 
 
 @pytest.mark.parametrize(("share", "is_found"), [(0.9, True), (1.1, False)])
-def test_a_plane_must_explain_half_of_the_motion(share: float, is_found: bool) -> None:
+def test_plane_distance_requires_half_of_motion_explained(share: float, is_found: bool) -> None:
     """Motion along the rows is that of the plane; as much across them is not."""
     depth = torch.full((len(grid_pixels()),), 50.0)
     _, target = seen_after(moved_camera(3.0), depth)
@@ -179,7 +179,7 @@ def test_a_plane_must_explain_half_of_the_motion(share: float, is_found: bool) -
     assert (distance_of(moved_camera(3.0), depth, target) is not None) == is_found
 
 
-def test_a_scene_behind_the_camera_has_no_distance() -> None:
+def test_plane_distance_is_none_behind_camera() -> None:
     depth = torch.full((len(grid_pixels()),), 50.0)
     pixels, target = seen_after(moved_camera(3.0), depth)
     assert distance_of(moved_camera(3.0), depth, 2 * pixels - target) is None

@@ -17,18 +17,18 @@ def other_colours(image):
     return np.rint(((image.astype(float) - OFFSET) / GAIN).clip(0, 255)).astype(np.uint8)
 
 
-def test_a_straight_line_between_the_eyes_is_taken_out():
+def test_eye_colours_removes_linear_colour_difference():
     right = seen(RIGHT)[0]
     found = EyeColours().corrected(stereo_frame(right_image=other_colours(right)))
     assert np.abs(found.astype(float) - right).mean() < 0.2 * np.abs(other_colours(right).astype(float) - right).mean()
 
 
-def test_eyes_of_the_same_colours_are_left_alone():
+def test_eye_colours_keeps_equal_eyes_unchanged():
     frame = stereo_frame()
     assert EyeColours().corrected(frame) is frame.right_image
 
 
-def test_highlights_that_one_eye_sees_change_little():
+def test_eye_colours_is_robust_to_highlights_in_one_eye():
     right = seen(RIGHT)[0]
     shining = other_colours(right)
     shining[10:16, 20:28] = 255
@@ -39,14 +39,14 @@ def test_highlights_that_one_eye_sees_change_little():
 
 
 @pytest.mark.parametrize("level", [0, 128, 255])
-def test_a_picture_of_one_level_says_nothing_about_a_factor(level):
+def test_eye_colours_of_flat_picture_only_shifts(level):
     flat = np.full((40, 60, 3), level, np.uint8)
     shifted = np.full((40, 60, 3), min(255, level + 20), np.uint8)
     found = EyeColours().corrected(Frame(0, 0, flat, right_image=shifted))
     assert np.abs(found.astype(int) - level).max() <= NOISE_LEVELS
 
 
-def test_the_line_follows_slowly():
+def test_eye_colours_line_follows_change_slowly():
     colours = EyeColours()
     right = seen(RIGHT)[0]
     colours.corrected(stereo_frame())
@@ -57,7 +57,7 @@ def test_the_line_follows_slowly():
     assert max(before - after for before, after in pairwise(errors)) < 0.35 * errors[0]
 
 
-def test_the_shift_of_the_whole_picture_is_found_whatever_the_colours_are():
+def test_best_shift_is_independent_of_colours():
     random = np.random.default_rng(0)
     wide = random.uniform(0, 255, (20, 60)).astype(np.float32)
     for shift in (-9, 0, 14):
@@ -67,7 +67,7 @@ def test_the_shift_of_the_whole_picture_is_found_whatever_the_colours_are():
         assert best_shift(left, 0.5 * right + 30) == shift
 
 
-def test_tools_are_no_part_of_the_comparison():
+def test_eye_colours_ignores_tools():
     right = seen(RIGHT)[0]
     left = seen(LEFT)[0].copy()
     mask = np.ones(left.shape[:2], np.uint8)
@@ -76,7 +76,7 @@ def test_tools_are_no_part_of_the_comparison():
     assert np.abs(with_tool.astype(float) - right).mean() < 4
 
 
-def test_noise_does_not_make_the_factor_smaller():
+def test_line_between_gain_is_unbiased_by_noise():
     random = np.random.default_rng(1)
     truth = random.uniform(60, 180, (4000, 3)).astype(np.float32)
     left, right = (truth + random.normal(0, 12, truth.shape).astype(np.float32) for _ in range(2))
@@ -84,6 +84,6 @@ def test_noise_does_not_make_the_factor_smaller():
     assert np.abs(gain - 1).max() < 0.04 and np.abs(offset).max() < 5
 
 
-def test_a_width_of_a_few_pixels_is_no_trouble():
+def test_eye_colours_of_tiny_picture():
     tiny = np.arange(2 * 3 * 3, dtype=np.uint8).reshape(2, 3, 3)
     assert np.array_equal(EyeColours().corrected(Frame(0, 0, tiny, right_image=tiny)), tiny)

@@ -37,7 +37,7 @@ def moving_away(make_frame, count):
 
 @pytest.mark.slow
 @FIELDS
-def test_it_learns_what_a_scene_that_grows_learns(make_frame, camera, field):
+def test_preallocated_scene_equals_growing_scene(make_frame, camera, field):
     config = dataclasses.replace(CONFIG, field=field)
     fixed = Reconstructor(dataclasses.replace(config, preallocate=True), camera)
     grown = Reconstructor(config, camera)
@@ -51,7 +51,7 @@ def test_it_learns_what_a_scene_that_grows_learns(make_frame, camera, field):
 
 
 @pytest.mark.slow
-def test_nothing_moves_while_gaussians_join_and_leave(make_frame, camera):
+def test_preallocated_memory_stays_in_place_as_gaussians_change(make_frame, camera):
     config = dataclasses.replace(CONFIG, preallocate=True, history_s=1.0, window_frames=10)
     reconstructor = Reconstructor(config, camera)
     at = None
@@ -72,7 +72,7 @@ def test_nothing_moves_while_gaussians_join_and_leave(make_frame, camera):
     assert (spare.logit_opacities == -torch.inf).all() and (spare.means == 0).all()
 
 
-def test_removed_gaussians_take_their_training_with_them(make_frame, camera):
+def test_removing_gaussians_from_preallocated_scene_equals_growing_scene(make_frame, camera):
     config = dataclasses.replace(CONFIG, preallocate=True)
     both = [Reconstructor(each, camera) for each in (config, dataclasses.replace(config, preallocate=False))]
     for reconstructor in both:
@@ -86,7 +86,7 @@ def test_removed_gaussians_take_their_training_with_them(make_frame, camera):
     assert both[0].snapshot().sha256() == both[1].snapshot().sha256()
 
 
-def test_another_scene_starts_in_the_same_memory_as_it_would_alone(make_frame, camera):
+def test_restarted_scene_reuses_memory_and_equals_fresh_scene(make_frame, camera):
     config = dataclasses.replace(CONFIG, preallocate=True, history_s=1.0)
     used, alone = Reconstructor(config, camera), Reconstructor(config, camera)
     for seq in range(6):
@@ -113,7 +113,7 @@ def observed(frame, camera):
 
 
 @pytest.mark.cuda
-def test_a_gpu_captures_the_step_and_the_pictures_once(gpu, make_frame, camera):
+def test_preallocated_step_and_pictures_are_captured_once_on_cuda(gpu, make_frame, camera):
     from gsplat_core.rendering.alpha import AlphaRenderer
 
     config = dataclasses.replace(CONFIG, preallocate=True, history_s=1.0, window_frames=10)
@@ -138,7 +138,7 @@ def test_a_gpu_captures_the_step_and_the_pictures_once(gpu, make_frame, camera):
 
 
 @pytest.mark.cuda
-def test_spare_rows_stay_inert_on_a_gpu(gpu, make_frame, camera):
+def test_spare_rows_stay_inert_on_cuda(gpu, make_frame, camera):
     config = dataclasses.replace(CONFIG, preallocate=True)
     fixed = Reconstructor(config, camera, device=gpu)
     grown = Reconstructor(dataclasses.replace(config, preallocate=False), camera, device=gpu)

@@ -30,12 +30,12 @@ def columns_of(gaussians):
     return gaussians.means[:, 0] / gaussians.means[:, 2] * 50 + 24
 
 
-def test_a_covered_frame_gets_nothing(make_frame, camera):
+def test_growth_adds_nothing_to_covered_frame(make_frame, camera):
     frame = make_frame()
     assert grown(frame, camera, left_part(frame, camera, 48)) is None
 
 
-def test_uncovered_tissue_is_covered_as_densely_as_the_first_frame(make_frame, camera):
+def test_growth_covers_uncovered_tissue_at_first_frame_density(make_frame, camera):
     frame = make_frame()
     current = left_part(frame, camera)
     added = grown(frame, camera, current)
@@ -46,7 +46,7 @@ def test_uncovered_tissue_is_covered_as_densely_as_the_first_frame(make_frame, c
     assert grown(frame, camera, current.append(added)) is None
 
 
-def test_what_a_tool_covers_is_left_alone(make_frame, camera):
+def test_growth_ignores_pixels_under_tool(make_frame, camera):
     mask = np.ones((40, 48), np.uint8)
     mask[:20] = 0
     frame = make_frame(mask=mask)
@@ -58,13 +58,13 @@ def test_what_a_tool_covers_is_left_alone(make_frame, camera):
 
 
 @pytest.mark.parametrize("room", [1, 10, 50])
-def test_no_more_than_there_is_room_for(make_frame, camera, room):
+def test_growth_is_limited_by_room(make_frame, camera, room):
     frame = make_frame()
     added = grown(frame, camera, left_part(frame, camera), room=room)
     assert 0.5 * room <= added.count <= room
 
 
-def test_single_bare_pixels_are_left_to_training(make_frame, camera):
+def test_growth_ignores_few_uncovered_pixels(make_frame, camera):
     frame = make_frame()
     whole = left_part(frame, camera, 48)
     mask = np.zeros((40, 48), np.uint8)
@@ -76,19 +76,19 @@ def test_single_bare_pixels_are_left_to_training(make_frame, camera):
     assert grown(make_frame(mask=mask), camera, whole) is None
 
 
-def test_depth_is_the_neighbours_where_the_frame_has_none(make_frame, camera):
+def test_growth_takes_depth_of_neighbours_without_frame_depth(make_frame, camera):
     frame = make_frame()
     added = grown(frame, camera, left_part(frame, camera, depth_mm=85.0))
     torch.testing.assert_close(added.means[:, 2], torch.full((added.count,), 85.0), rtol=0.02, atol=0)
 
 
-def test_depth_is_measured_where_the_frame_has_it(make_frame, camera):
+def test_growth_takes_measured_depth(make_frame, camera):
     frame = make_frame(depth=np.full((40, 48), 47.0, np.float32))
     added = grown(frame, camera, left_part(frame, camera))
     torch.testing.assert_close(added.means[:, 2], torch.full((added.count,), 47.0))
 
 
-def test_an_empty_model_grows_on_the_default_plane(make_frame, camera):
+def test_growth_of_empty_model_uses_default_plane(make_frame, camera):
     frame = make_frame()
     nothing = left_part(frame, camera, -100)
     assert nothing.count == 0
@@ -97,7 +97,7 @@ def test_an_empty_model_grows_on_the_default_plane(make_frame, camera):
     torch.testing.assert_close(added.means[:, 2], torch.full((added.count,), 60.0))
 
 
-def test_colours_are_the_pictures(make_frame, camera):
+def test_growth_takes_colours_of_picture(make_frame, camera):
     frame = make_frame()
     current = left_part(frame, camera)
     picture = render(current.append(grown(frame, camera, current)), camera).image[:, 32:]
@@ -107,7 +107,7 @@ def test_colours_are_the_pictures(make_frame, camera):
 
 @pytest.mark.cuda
 @pytest.mark.parametrize("depth_mm", [None, 47.0])
-def test_a_gpu_finds_the_same_places(gpu, make_frame, camera, depth_mm):
+def test_growth_on_cuda_equals_cpu(gpu, make_frame, camera, depth_mm):
     frame = make_frame(depth=None if depth_mm is None else np.full((40, 48), depth_mm, np.float32))
     current = left_part(frame, camera, depth_mm=85.0)
     expected, added = grown(frame, camera, current), grown(frame, camera, current.to(gpu))

@@ -89,7 +89,7 @@ def seen_from(x: float) -> Any:
 STEP = SimpleNamespace(distance=lambda camera: 60.0)
 
 
-def test_a_frame_is_finished_by_archive_upkeep_and_covering(parts: Parts) -> None:
+def test_growth_finish_runs_archive_upkeep_and_covering(parts: Parts) -> None:
     growth = growth_of(parts)
     assert parts.calls == [("archive of", 20), "restart", ("upkeep of", CAMERA)]
     parts.calls.clear()
@@ -101,7 +101,7 @@ def test_a_frame_is_finished_by_archive_upkeep_and_covering(parts: Parts) -> Non
     assert growth.archived == 3 and growth.unseen_s(7) == "unseen 7"
 
 
-def test_without_fixed_rows_nothing_is_archived_and_without_a_history_nothing_maintained(parts: Parts) -> None:
+def test_growth_skips_archive_without_preallocation_and_upkeep_without_history(parts: Parts) -> None:
     growth = growth_of(parts, preallocate=False)
     growth.finish(STEP, None, seen_from(0), parts)
     assert parts.calls == [("upkeep of", CAMERA), ("upkeep", None), "cover", "revealed"]
@@ -113,7 +113,7 @@ def test_without_fixed_rows_nothing_is_archived_and_without_a_history_nothing_ma
     assert parts.calls == ["cover", "revealed"]
 
 
-def test_new_tissue_is_filled_when_the_camera_has_moved_since_the_last_search(parts: Parts) -> None:
+def test_growth_fills_new_tissue_after_camera_motion(parts: Parts) -> None:
     growth = growth_of(parts)
     parts.calls.clear()
     first, near, far = seen_from(0), seen_from(3), seen_from(9)
@@ -126,9 +126,7 @@ def test_new_tissue_is_filled_when_the_camera_has_moved_since_the_last_search(pa
 
 
 @pytest.mark.parametrize(("share", "is_covered"), [(0.99, False), (1.0, True)])
-def test_a_strip_that_motion_reveals_is_covered_before_the_first_step(
-    parts: Parts, share: float, is_covered: bool
-) -> None:
+def test_growth_covers_revealed_strip_before_first_step(parts: Parts, share: float, is_covered: bool) -> None:
     growth = growth_of(parts)
     parts.calls.clear()
     parts.revealed_px = share * REVEALED_SHARE * 200
@@ -136,7 +134,7 @@ def test_a_strip_that_motion_reveals_is_covered_before_the_first_step(
     assert parts.calls == (["cover", "revealed"] if is_covered else [])
 
 
-def test_a_scene_is_relaxed_and_renewed_when_so_many_steps_have_passed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_upkeep_relaxes_and_renews_after_fixed_numbers_of_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     """Counted from the last time, at which steps may already have been many."""
     calls: list[Any] = []
     made = upkeep.Upkeep(CAMERA, CONFIG)

@@ -20,7 +20,7 @@ def texture(shift_x: float, shift_y: float, size: tuple[int, int] = (96, 128)) -
 
 
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (1.5, -0.75), (4.0, 2.0)])
-def test_a_shift_is_measured(shift: tuple[float, float]) -> None:
+def test_image_motion_measures_shift(shift: tuple[float, float]) -> None:
     motion = ImageMotion()
     assert motion.follow(texture(0, 0), None) is None
     flow = motion.follow(texture(*shift), None)
@@ -30,7 +30,7 @@ def test_a_shift_is_measured(shift: tuple[float, float]) -> None:
 
 
 @pytest.mark.parametrize("size", [(96, 128), (420, 501)])
-def test_the_quick_search_measures_in_pixels_of_the_full_picture(size: tuple[int, int]) -> None:
+def test_half_detail_image_motion_is_in_full_size_pixels(size: tuple[int, int]) -> None:
     motion = ImageMotion("half")
     motion.follow(texture(0, 0, size), None)
     flow = motion.follow(texture(3, -2, size), None)
@@ -38,7 +38,7 @@ def test_the_quick_search_measures_in_pixels_of_the_full_picture(size: tuple[int
     assert np.abs(np.median(flow.reshape(-1, 2), axis=0) - (3, -2)).max() < 0.2
 
 
-def test_what_is_not_tissue_moves_as_the_tissue_around_it() -> None:
+def test_image_motion_under_mask_follows_surrounding_tissue() -> None:
     still, moved = texture(0, 0), texture(2, 0)
     mask = np.ones((96, 128), np.uint8)
     mask[30:60, 40:80] = 0
@@ -51,7 +51,7 @@ def test_what_is_not_tissue_moves_as_the_tissue_around_it() -> None:
     assert abs(float(flow[11, 15, 0]) - 2) < 0.3
 
 
-def test_there_is_no_flow_of_the_first_picture_of_another_size_and_of_a_tiny_one() -> None:
+def test_image_motion_is_none_for_first_resized_or_tiny_picture() -> None:
     motion = ImageMotion()
     assert motion.follow(texture(0, 0), None) is None
     assert motion.follow(texture(0, 0, (64, 128)), None) is None
@@ -61,7 +61,7 @@ def test_there_is_no_flow_of_the_first_picture_of_another_size_and_of_a_tiny_one
         assert motion.follow(np.zeros((8, 8, 3), np.uint8), None) is None
 
 
-def test_pictures_without_tissue_or_texture_give_finite_flow() -> None:
+def test_image_motion_without_tissue_or_texture_is_zero() -> None:
     motion = ImageMotion()
     black, nothing = np.zeros((96, 128, 3), np.uint8), np.zeros((96, 128), np.uint8)
     motion.follow(black, nothing)
@@ -70,7 +70,7 @@ def test_pictures_without_tissue_or_texture_give_finite_flow() -> None:
     assert not flow.any()
 
 
-def test_a_picture_reveals_something_at_the_edges_that_its_content_leaves():
+def test_revealed_px_is_width_of_strip_at_edges():
     flow = np.zeros((8, 10, 2), np.float32)
     assert revealed_px(flow) == 0
     flow[..., 0] = 3.0  # to the right: the left edge shows something new

@@ -33,7 +33,7 @@ def rotation_of(q):
 
 @pytest.mark.parametrize(("model", "focal"), [("pinhole", 50.0), ("fisheye", 40.0), ("ortho", 0.8)])
 @pytest.mark.parametrize("pose", [np.eye(4), TURNED])
-def test_the_whole_frame_is_covered_and_looks_like_the_picture(make_frame, model, focal, pose):
+def test_initial_scene_covers_frame_and_matches_picture(make_frame, model, focal, pose):
     frame = make_frame()
     camera = Camera(np.array([[focal, 0, 24], [0, focal, 20], [0, 0, 1]]), 48, 40, pose, model=model)
     picture = render(start(frame, camera), camera)
@@ -45,11 +45,11 @@ def test_the_whole_frame_is_covered_and_looks_like_the_picture(make_frame, model
 
 
 @pytest.mark.parametrize("count", [1, 7, 100, 2000])
-def test_there_are_about_as_many_as_asked_for(make_frame, camera, count):
+def test_initial_scene_has_about_requested_count(make_frame, camera, count):
     assert start(make_frame(), camera, count).count == pytest.approx(count, rel=0.15)
 
 
-def test_recorded_depth_is_honoured(make_frame, camera):
+def test_initial_scene_follows_recorded_depth(make_frame, camera):
     depth = np.linspace(45, 75, 48, dtype=np.float32)[None].repeat(40, 0)
     with_holes = depth.copy()
     with_holes[np.random.default_rng(0).random(depth.shape) < 0.3] = 0
@@ -61,7 +61,7 @@ def test_recorded_depth_is_honoured(make_frame, camera):
     assert float(error.mean()) < 1.2
 
 
-def test_tool_pixels_take_the_tissues_colour_and_depth(make_frame, camera):
+def test_initial_scene_fills_tool_pixels_from_tissue(make_frame, camera):
     mask = np.ones((40, 48), np.uint8)
     mask[12:26, 16:34] = 0
     frame = make_frame(mask=mask, depth=np.where(mask == 1, 60.0, 30.0).astype(np.float32))
@@ -74,14 +74,14 @@ def test_tool_pixels_take_the_tissues_colour_and_depth(make_frame, camera):
     assert float((picture.depth[tool] - 60).abs().max()) < 1
 
 
-def test_a_small_hole_free_picture_is_returned_as_it_is(make_frame):
+def test_tissue_colours_without_holes_returns_image(make_frame):
     for mask in (None, np.ones((40, 48), np.uint8), np.zeros((40, 48), np.uint8)):
         frame = make_frame(mask=mask)
         assert np.array_equal(tissue_colours(frame), frame.image)
 
 
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (6, 5), (3, 40)])
-def test_tiny_frames(make_frame, width, height):
+def test_initial_scene_of_tiny_frames(make_frame, width, height):
     camera = Camera.from_focal(10.0, width, height)
     mask = np.ones((height, width), np.uint8)
     mask[0, 0] = 0  # all of it, in the smallest one
@@ -91,7 +91,7 @@ def test_tiny_frames(make_frame, width, height):
     assert bool(render(gaussians, camera).image.isfinite().all())
 
 
-def test_a_hole_that_reaches_everywhere_at_the_small_size_is_filled_with_the_mean(make_frame):
+def test_tissue_colours_fills_large_hole_with_mean(make_frame):
     mask = np.ones((7, 7), np.uint8)
     mask[2:5, 2:5] = 0
     frame = make_frame(width=7, height=7, mask=mask)
@@ -100,7 +100,7 @@ def test_a_hole_that_reaches_everywhere_at_the_small_size_is_filled_with_the_mea
     assert (tissue_colours(frame) == [120, 60, 30]).all()
 
 
-def test_all_tool_or_no_known_depth_lies_on_the_default_plane(make_frame):
+def test_tissue_depth_without_known_depth_is_default_plane(make_frame):
     depth = np.full((40, 48), 33.0, np.float32)
     for frame in (
         make_frame(),
@@ -110,7 +110,7 @@ def test_all_tool_or_no_known_depth_lies_on_the_default_plane(make_frame):
         assert (tissue_depth(frame, 60.0) == 60).all()
 
 
-def test_where_depth_is_not_known_the_surface_around_it_goes_on(make_frame):
+def test_tissue_depth_extrapolates_into_unknown_pixels(make_frame):
     depth = np.zeros((40, 48), np.float32)
     depth[:, :4], depth[:, 44:] = 50, 70
     filled = tissue_depth(make_frame(depth=depth), 60.0)
@@ -120,20 +120,20 @@ def test_where_depth_is_not_known_the_surface_around_it_goes_on(make_frame):
 
 
 @pytest.mark.parametrize("sh_degree", [1, 3])
-def test_higher_degrees_start_without_dependence_on_the_view(make_frame, camera, sh_degree):
+def test_initial_sh_is_zero_above_degree_0(make_frame, camera, sh_degree):
     gaussians, plain = start(make_frame(), camera, sh_degree=sh_degree), start(make_frame(), camera)
     assert gaussians.sh_degree == sh_degree
     assert torch.equal(gaussians.sh[:, :1], plain.sh)
     assert not gaussians.sh[:, 1:].any()
 
 
-def test_the_seed_decides_the_jitter(make_frame, camera):
+def test_initial_jitter_depends_on_seed(make_frame, camera):
     first, again, other = (start(make_frame(), camera, seed=seed).means for seed in (1, 1, 2))
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
 
 
-def test_quaternions_of_rotations_in_all_four_branches():
+def test_facing_quaternion_equals_rotation_in_all_branches():
     random = np.random.default_rng(0)
     branches = set()
     half_turns = [np.diag(signs) for signs in ([1.0, -1, -1], [-1.0, 1, -1], [-1.0, -1, 1])]
@@ -146,7 +146,7 @@ def test_quaternions_of_rotations_in_all_four_branches():
     assert branches == {0, 1, 2, 3}
 
 
-def test_colours_beside_a_tool_are_those_of_the_tissue_around():
+def test_colours_beside_tools_replaces_tool_edges_with_tissue():
     """Only tissue and its edge count: the tool's own colours stay where no Gaussian is created."""
     image = np.full((64, 80, 3), (180, 60, 50), np.uint8)
     mask = np.ones((64, 80), np.uint8)

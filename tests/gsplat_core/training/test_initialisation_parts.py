@@ -27,7 +27,7 @@ K = np.array([[50.0, 0, 40], [0, 60, 30], [0, 0, 1]])
 
 
 @pytest.mark.parametrize(("width", "height", "count"), [(120, 80, 96), (80, 120, 96), (33, 17, 40), (5, 300, 3)])
-def test_pixels_are_spread_evenly_with_a_jitter_of_a_seventh_of_the_spacing(width, height, count):
+def test_jittered_grid_is_even_with_bounded_jitter(width, height, count):
     pixels, spacing = jittered_grid(width, height, count, 3)
     assert spacing == pytest.approx(np.sqrt(width * height / count))
     columns, rows = max(1, round(width / spacing)), max(1, round(height / spacing))
@@ -53,7 +53,7 @@ def project(camera, points):
 
 
 @pytest.mark.parametrize("model", ["pinhole", "fisheye", "ortho"])
-def test_points_are_at_their_pixels_and_depth_and_a_pixel_has_its_size_there(model):
+def test_unprojected_points_and_pixel_sizes(model):
     camera = Camera(K * [[1], [50 / 60], [1]], 80, 60, model=model)
     pixels = np.random.default_rng(0).uniform([0, 0], [80, 60], (60, 2))
     pixels[0] = camera.K[:2, 2]  # the principal point, whose angle is 0
@@ -68,7 +68,7 @@ def test_points_are_at_their_pixels_and_depth_and_a_pixel_has_its_size_there(mod
     np.testing.assert_allclose(size**2, area, rtol=2e-3)
 
 
-def test_fisheye_pixels_beyond_85_degrees_are_placed_at_85_degrees():
+def test_unprojected_fisheye_angle_is_limited_to_85_degrees():
     camera = Camera(np.array([[20.0, 0, 40], [0, 20, 30], [0, 0, 1]]), 80, 60, model="fisheye")
     angles = np.radians([80.0, 85.0, 90.0, 110.0])
     pixels = np.stack([40 + 20 * angles, np.full(4, 30.0)], 1)
@@ -79,11 +79,11 @@ def test_fisheye_pixels_beyond_85_degrees_are_placed_at_85_degrees():
 
 
 @pytest.mark.parametrize(("spacing", "sigma"), [(0.5, 0.3), (1.0, 0.3), (2.0, 0.6), (10.0, 3.0)])
-def test_pictures_are_blurred_by_three_tenths_of_the_spacing(spacing, sigma):
+def test_blur_sigma_is_three_tenths_of_spacing(spacing, sigma):
     assert blur_sigma_px(spacing) == pytest.approx(sigma)
 
 
-def test_gaussians_of_a_grid_cover_a_picture_without_holes_and_are_flat_towards_the_camera():
+def test_gaussians_at_pixels_cover_picture_and_face_camera():
     camera = Camera.from_focal(60.0, 64, 48)
     pixels, spacing = jittered_grid(64, 48, 300, 0)
     image, depth = np.full((48, 64, 3), 120, np.uint8), np.full((48, 64), 50, np.float32)
@@ -106,7 +106,7 @@ def beside_a_tool(columns=40):
     return Frame(0, 0, image, mask=mask)
 
 
-def test_colours_beside_a_tool_come_from_ten_pixels_around():
+def test_colours_beside_tools_reach_ten_pixels():
     frame = beside_a_tool()
     found = colours_beside_tools(frame)
     np.testing.assert_array_equal(found[:, :38], frame.image[:, :38])  # two pixels next to a tool belong to it
@@ -118,13 +118,13 @@ def test_colours_beside_a_tool_come_from_ten_pixels_around():
 
 @pytest.mark.parametrize("change", [tissue_colours, colours_beside_tools])
 @pytest.mark.parametrize("value", [None, 0, 1])
-def test_pictures_without_tools_or_without_tissue_stay(change, value):
+def test_tissue_colours_without_tools_or_tissue_returns_image(change, value):
     frame = beside_a_tool()
     mask = None if value is None else np.full((40, 80), value, np.uint8)
     assert change(frame.with_fields(mask=mask)) is frame.image
 
 
-def test_a_margin_that_would_leave_no_tissue_is_left_out():
+def test_tissue_colours_drops_margin_that_would_leave_no_tissue():
     image = np.full((40, 80, 3), 255, np.uint8)
     image[10, 10] = 30, 60, 90
     mask = np.zeros((40, 80), np.uint8)
@@ -133,7 +133,7 @@ def test_a_margin_that_would_leave_no_tissue_is_left_out():
 
 
 @pytest.mark.parametrize(("depth", "expected"), [(None, 70.0), (0.0, 70.0), (np.nan, 70.0), (-5.0, 70.0), (50.0, 50.0)])
-def test_the_usual_depth_stands_in_where_none_is_known(depth, expected):
+def test_tissue_depth_uses_default_for_unknown_depth(depth, expected):
     plane = None if depth is None else np.full((40, 80), depth, np.float32)
     found = tissue_depth(beside_a_tool(columns=80).with_fields(depth=plane, mask=None), 70.0)
     assert found.shape == (40, 80) and found.dtype == np.float32
@@ -141,7 +141,7 @@ def test_the_usual_depth_stands_in_where_none_is_known(depth, expected):
 
 
 @pytest.mark.parametrize("coarse", [1, 2, 4])
-def test_filling_averages_cells_and_goes_on_into_holes(coarse):
+def test_filled_averages_cells_and_extrapolates_into_holes(coarse):
     values = torch.arange(64.0).repeat(48, 1)[None]
     known = torch.ones(1, 48, 64)
     known[:, :, 32:] = 0
@@ -153,16 +153,16 @@ def test_filling_averages_cells_and_goes_on_into_holes(coarse):
     assert 15 < float(found[0, 24, 63]) < 32 and float(found.max()) <= 31.01
 
 
-def test_filling_a_picture_of_which_nothing_is_known_gives_zeros():
+def test_filled_without_known_pixels_is_zero():
     assert torch.equal(filled(torch.ones(3, 12, 20), torch.zeros(1, 12, 20)), torch.zeros(3, 12, 20))
 
 
-def test_pictures_that_are_no_multiple_of_the_reduction_count_only_their_own_pixels():
+def test_filled_handles_sizes_that_are_not_multiples():
     assert torch.allclose(filled(torch.full((1, 13, 21), 7.0), torch.ones(1, 13, 21)), torch.tensor(7.0))
 
 
 @pytest.mark.parametrize("sigma", [0.4, 1.0, 2.3])
-def test_the_blur_on_a_device_is_that_of_the_host(sigma):
+def test_blurred_tensor_equals_opencv(sigma):
     picture = np.random.default_rng(0).uniform(size=(40, 60, 3)).astype(np.float32)
     found = initialisation._blurred(torch.from_numpy(picture).permute(2, 0, 1), sigma).permute(1, 2, 0).numpy()
     side = 2 * max(1, int(np.ceil(3 * sigma))) + 1
@@ -171,7 +171,7 @@ def test_the_blur_on_a_device_is_that_of_the_host(sigma):
 
 
 @pytest.mark.parametrize(("side", "is_blurred"), [(3, False), (4, True)])
-def test_a_picture_too_small_for_a_blur_stays(side, is_blurred):
+def test_blurred_keeps_picture_smaller_than_kernel(side, is_blurred):
     picture = torch.rand(1, side, 9, generator=torch.Generator().manual_seed(0))
     assert torch.equal(initialisation._blurred(picture, 1.0), picture) != is_blurred
 
@@ -180,7 +180,7 @@ def test_a_picture_too_small_for_a_blur_stays(side, is_blurred):
     ("changed", "fits"),
     [({}, True), ({"pose": True}, True), ({"width": 66}, False), ({"height": 50}, False), ({"focal": 61.0}, False), ({"model": "fisheye"}, False)],
 )  # fmt: skip
-def test_a_prepared_grid_fits_cameras_of_its_size_lens_and_focal_length(changed, fits):
+def test_start_on_device_fits_cameras_of_same_size_and_lens(changed, fits):
     start = StartOnDevice(Camera.from_focal(60.0, 64, 48), 100, torch.device("cpu"))
     camera = Camera.from_focal(changed.get("focal", 60.0), changed.get("width", 64), changed.get("height", 48))
     if "width" in changed or "height" in changed:

@@ -47,7 +47,7 @@ def wall_of(columns, rows=range(HEIGHT)):
 
 
 @pytest.mark.parametrize("model", ["pinhole", "fisheye"])
-def test_what_the_camera_before_did_not_have_has_entered(model):
+def test_entered_marks_pixels_outside_previous_view(model):
     before = Camera(CAMERA.K, WIDTH, HEIGHT, model=model)
     after = before.with_pose(seen_from(10).world_to_camera)
     pixels = np.array([[5.5, 20.5], [30.5, 20.5], [36.5, 20.5], [46.5, 20.5]])
@@ -56,7 +56,7 @@ def test_what_the_camera_before_did_not_have_has_entered(model):
     assert not entered(pixels, before, before, DEPTH_MM).any()
 
 
-def test_cells_count_what_lies_around_them_and_how_deep():
+def test_around_cells_returns_count_and_depth():
     count, depth = around_cells(wall_of(range(WIDTH)), CAMERA, 4.0, (10, 12))
     assert count.shape == depth.shape == (10, 12)
     assert float(count[5, 5]) == 9 * 16
@@ -66,7 +66,7 @@ def test_cells_count_what_lies_around_them_and_how_deep():
     assert not count.any() and not depth.any()
 
 
-def test_a_camera_has_moved_once_its_picture_has_by_a_fiftieth_of_the_width():
+def test_has_moved_from_a_fiftieth_of_picture_width():
     step_mm = 0.02 * CAMERA.width_px * DEPTH_MM / float(CAMERA.K[0, 0])
     for share, expected in ((0.0, False), (0.9, False), (1.1, True)):
         pose = np.eye(4)
@@ -74,7 +74,7 @@ def test_a_camera_has_moved_once_its_picture_has_by_a_fiftieth_of_the_width():
         assert has_moved(CAMERA.with_pose(pose), CAMERA, DEPTH_MM) is expected
 
 
-def test_cells_are_unfilled_where_tissue_entered_that_the_scene_does_not_have():
+def test_new_tissue_unfilled_cells_are_entered_and_uncovered():
     mask = np.ones((HEIGHT, WIDTH), np.uint8)
     mask[:12] = 0
     observation = Observation.of(frame_at(1, 16, mask=mask), CAMERA)
@@ -91,7 +91,7 @@ def test_cells_are_unfilled_where_tissue_entered_that_the_scene_does_not_have():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("pixels_a_frame", "frames"), [(1, 60), (4, 60)])
-def test_a_camera_that_moves_on_does_not_drag_the_scene_along(device, pixels_a_frame, frames):
+def test_moving_camera_adds_gaussians_and_keeps_score(device, pixels_a_frame, frames):
     config = ReconstructorConfig(
         gaussians=300, max_gaussians=6000, window_frames=20, motion_spacing_s=0.1, history_s=1.0, preallocate=True,
         default_depth_mm=DEPTH_MM,

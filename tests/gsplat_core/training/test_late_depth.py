@@ -49,7 +49,7 @@ def distance(made: Reconstructor, k: int) -> float:
     return float(output.depth.median())
 
 
-def test_the_first_depth_places_the_scene_and_its_picture_stays() -> None:
+def test_first_late_depth_places_scene_and_keeps_picture() -> None:
     made = learner()
     before = render(made.snapshot().at(frame_at(1).time_s), CAMERA).image
     assert distance(made, 2) == pytest.approx(PLANE, rel=0.02) and made.snapshot().depth_source is None
@@ -61,7 +61,7 @@ def test_the_first_depth_places_the_scene_and_its_picture_stays() -> None:
 
 
 @pytest.mark.slow
-def test_rehearsal_looks_at_it() -> None:
+def test_rehearsal_trains_on_late_depth() -> None:
     """The slope is what placing does not give: all of the depth but the first is left to the loss."""
     slope = np.linspace(70, 90, WIDTH, dtype=np.float32)[None, :]
 
@@ -79,7 +79,7 @@ def test_rehearsal_looks_at_it() -> None:
 
 
 @pytest.mark.parametrize("origin", [DEPTH_ORIGINS["light"], DEPTH_ORIGINS["parallax"]])
-def test_depth_without_a_unit_places_a_scene_and_gives_it_none(origin: DepthOrigin) -> None:
+def test_relative_late_depth_places_scene_without_unit(origin: DepthOrigin) -> None:
     made = learner()
     assert made.take_depth(found(frame_at(0), 75.0, origin))
     assert distance(made, 0) == pytest.approx(75, rel=0.02)
@@ -88,7 +88,7 @@ def test_depth_without_a_unit_places_a_scene_and_gives_it_none(origin: DepthOrig
     assert made.snapshot().depth_source == DepthSource(origin, metric=False)
 
 
-def test_the_loss_does_not_see_depth_by_light() -> None:
+def test_late_depth_by_light_is_not_used_by_loss() -> None:
     made = learner()
     made.take_depth(found(frame_at(0), 75.0, DEPTH_ORIGINS["light"]))
     assert made._window.find(0, MOST_LATE).depth is None
@@ -97,7 +97,7 @@ def test_the_loss_does_not_see_depth_by_light() -> None:
 @pytest.mark.parametrize(
     ("origin", "goes_to"), [(DEPTH_ORIGINS["stereo"], (50 * 80) ** 0.5), (DEPTH_ORIGINS["light"], 50.0)]
 )
-def test_a_scene_that_started_from_depth_is_corrected_and_not_placed_again(origin: DepthOrigin, goes_to: float) -> None:
+def test_late_depth_corrects_scene_that_started_from_depth(origin: DepthOrigin, goes_to: float) -> None:
     made = Reconstructor(ReconstructorConfig(gaussians=300, max_gaussians=400), CAMERA, live=LiveTraining())
     made.observe(frame_at(0, depth=np.full((HEIGHT, WIDTH), 50, np.float32)), steps=3)
     made.observe(frame_at(1), steps=3)
@@ -135,7 +135,7 @@ def long_ago(made: Reconstructor) -> None:
 
 
 @pytest.mark.parametrize("overtakes", [another_scene, another_size, a_scene_that_has_not_begun, withheld, long_ago])
-def test_depth_of_what_is_gone_changes_nothing(overtakes: Callable[[Reconstructor], None]) -> None:
+def test_late_depth_of_outdated_frame_is_rejected(overtakes: Callable[[Reconstructor], None]) -> None:
     made, untouched = learner(), learner()
     overtakes(made)
     overtakes(untouched)
@@ -147,7 +147,7 @@ def test_depth_of_what_is_gone_changes_nothing(overtakes: Callable[[Reconstructo
     assert made.snapshot().sha256() == untouched.snapshot().sha256()
 
 
-def test_the_same_calls_give_the_same_model() -> None:
+def test_late_depth_training_is_deterministic() -> None:
     def model() -> str:
         made = learner()
         made.rehearse(2)
@@ -161,7 +161,7 @@ def test_the_same_calls_give_the_same_model() -> None:
     assert model() == model()
 
 
-def test_a_scene_after_a_cut_is_placed_by_its_own_depth() -> None:
+def test_late_depth_places_scene_after_cut() -> None:
     made = learner()
     made.take_depth(found(frame_at(1)))
     another_scene(made)
@@ -171,7 +171,7 @@ def test_a_scene_after_a_cut_is_placed_by_its_own_depth() -> None:
 
 
 @pytest.mark.cuda
-def test_a_gpu_learns_it_too(gpu: torch.device) -> None:
+def test_late_depth_places_scene_on_cuda(gpu: torch.device) -> None:
     config = ReconstructorConfig(gaussians=300, max_gaussians=400, preallocate=True, depth_weight=0.1)
     made = Reconstructor(config, CAMERA, device="cuda", live=LiveTraining())
     for k in range(3):
@@ -189,7 +189,7 @@ def distance_on_gpu(made: Reconstructor, k: int) -> float:
 
 
 @pytest.mark.parametrize("known", [0, 1, 48 * 64])
-def test_late_depth_is_prepared_if_it_is_known_somewhere(known: int) -> None:
+def test_late_depth_of_has_planes_only_if_depth_is_known(known: int) -> None:
     depth = np.zeros(48 * 64, np.float32)
     depth[:known] = 50.0
     frame = Frame(0, 0, np.full((48, 64, 3), 90, np.uint8), depth=depth.reshape(48, 64))

@@ -41,11 +41,11 @@ def run(made, steps=((10, 4), (3, 0), (5, 7))):
     return made.snapshot()
 
 
-def test_the_same_numbers_of_steps_give_the_same_model():
+def test_live_training_is_deterministic_for_given_steps():
     assert run(reconstructor()).sha256() == run(reconstructor()).sha256()
 
 
-def test_how_rehearsal_was_cut_into_calls_does_not_matter():
+def test_split_rehearsal_calls_equal_single_call():
     whole, cut = reconstructor(), reconstructor()
     for made, pieces in ((whole, [6]), (cut, [1, 3, 2])):
         made.observe(frame_at(0), budget=Budget.of_steps(4))
@@ -55,7 +55,7 @@ def test_how_rehearsal_was_cut_into_calls_does_not_matter():
     assert whole.snapshot().sha256() == cut.snapshot().sha256()
 
 
-def test_a_deadline_and_its_count_of_steps_give_the_same_model():
+def test_live_deadline_equals_its_step_count():
     clock = iter(range(10**6))
     timed, counted = reconstructor(), reconstructor()
     reports = [
@@ -68,7 +68,7 @@ def test_a_deadline_and_its_count_of_steps_give_the_same_model():
     assert timed.snapshot().sha256() == counted.snapshot().sha256()
 
 
-def test_a_deadline_that_is_over_still_gives_the_least_steps():
+def test_expired_deadline_still_makes_at_least_steps():
     made = reconstructor()
     made.observe(frame_at(0), budget=Budget.of_steps(2))
     report = made.observe(frame_at(1), budget=Budget.until(0.0, at_least=3, at_most=50, clock=lambda: 1.0))
@@ -81,7 +81,7 @@ def test_rehearsal_before_the_first_frame_is_refused():
 
 
 @pytest.mark.slow
-def test_rehearsal_keeps_the_past():
+def test_rehearsal_preserves_earlier_frames():
     forgetful, keeping = reconstructor(), reconstructor(recent_share=0.0)
     for k in range(6):
         forgetful.observe(frame_at(6 * k), budget=Budget.of_steps(20))
@@ -97,7 +97,7 @@ def test_rehearsal_keeps_the_past():
     assert past_db(keeping) > past_db(forgetful) + 1
 
 
-def test_another_scene_of_another_size_begins_in_the_middle():
+def test_begin_scene_with_other_picture_size():
     made = reconstructor()
     run(made)
     wide = frame_at(50, width=64, height=32)
@@ -110,7 +110,7 @@ def test_another_scene_of_another_size_begins_in_the_middle():
 
 
 @pytest.mark.parametrize("preallocate", [False, True])
-def test_a_scene_that_begins_again_is_as_good_as_the_first_one(preallocate):
+def test_model_after_forget_equals_fresh_model(preallocate):
     """A model depends only on the frames since the reset, not on earlier training."""
     fresh, used = reconstructor(preallocate=preallocate), reconstructor(preallocate=preallocate)
     for k in range(10, 14):
@@ -119,7 +119,7 @@ def test_a_scene_that_begins_again_is_as_good_as_the_first_one(preallocate):
     assert run(fresh).sha256() == run(used).sha256()
 
 
-def test_the_next_scene_takes_over_the_memory_of_the_one_before():
+def test_begin_scene_reuses_preallocated_memory():
     made = reconstructor(preallocate=True)
     run(made)
     address = made._step.gaussians.means.data_ptr()
@@ -128,7 +128,7 @@ def test_the_next_scene_takes_over_the_memory_of_the_one_before():
     assert made._step.gaussians.means.data_ptr() == address
 
 
-def test_a_frame_that_is_not_trained_on_changes_no_parameter():
+def test_observe_without_train_changes_no_parameter():
     made = reconstructor()
     before = run(made)
     made.observe(frame_at(3), budget=Budget.of_steps(5), train=False)
@@ -136,7 +136,7 @@ def test_a_frame_that_is_not_trained_on_changes_no_parameter():
     assert torch.equal(before.gaussians.means, after.gaussians.means)
 
 
-def test_rates_go_from_the_first_to_the_last():
+def test_live_rate_falls_from_first_to_last():
     training = LiveTraining(first_rate=2.0, last_rate=0.5, rate_steps=5)
     rates = [training.rate_at(k) for k in range(8)]
     assert rates[0] == 2.0
@@ -149,18 +149,18 @@ def test_rates_go_from_the_first_to_the_last():
     [{"first_rate": 0.0}, {"last_rate": float("nan")}, {"rate_steps": 0}, {"recent_share": 1.5}]
     + [{"colour_relaxation": wrong} for wrong in (-0.1, 2.0, float("nan"))],
 )
-def test_settings_out_of_range_are_refused(wrong):
+def test_live_training_refuses_invalid_settings(wrong):
     with pytest.raises(InvalidSetting):
         LiveTraining(**wrong)
 
 
-def test_colours_are_not_corrected_in_advance_on_a_gpu():
+def test_corrections_before_is_refused_on_cuda():
     with pytest.raises(InvalidSetting, match=r"corrections_before is 2 on cuda.*set it to 0"):
         Reconstructor(ReconstructorConfig(), CAMERA, live=LiveTraining(corrections_before=2), device="cuda")
 
 
 @pytest.mark.parametrize(("corrections", "relaxation"), [(3, 1.5), (3, 0.0), (0, 1.5)])
-def test_only_steps_on_the_newest_frame_correct_colours_in_advance(monkeypatch, corrections, relaxation):
+def test_corrections_before_applies_to_newest_frame_only(monkeypatch, corrections, relaxation):
     found = []
     monkeypatch.setattr(
         photometric, "correct_colours", lambda *given, **options: (found.append(options["steps"]), given[2])[1]
@@ -169,12 +169,12 @@ def test_only_steps_on_the_newest_frame_correct_colours_in_advance(monkeypatch, 
     assert found == ([corrections] * 3 if corrections and relaxation else [])
 
 
-def test_colours_that_depend_on_the_view_are_not_corrected_on_a_gpu():
+def test_colour_relaxation_with_sh_is_refused_on_cuda():
     with pytest.raises(InvalidSetting, match="set sh_degree or colour_relaxation to 0"):
         Reconstructor(ReconstructorConfig(sh_degree=1), CAMERA, live=LiveTraining(colour_relaxation=1.0), device="cuda")
 
 
-def test_one_step_a_frame_follows_a_light_that_changes_if_it_corrects_colours():
+def test_colour_relaxation_follows_changing_light_with_one_step():
     """Trained colours move by their rate, whatever the picture asks for."""
 
     def shown_db(relaxation):
@@ -190,7 +190,7 @@ def test_one_step_a_frame_follows_a_light_that_changes_if_it_corrects_colours():
     assert shown_db(1.5) > shown_db(0.0) + 3
 
 
-def test_a_picture_that_was_just_trained_on_is_shown_as_it_was_trained():
+def test_published_model_at_trained_frame_equals_training_state():
     """The motion prior does not look at every frame, and says nothing about one that it has not seen."""
     config = ReconstructorConfig(gaussians=120, max_gaussians=240, motion_prior="flow")
     made = Reconstructor(config, Camera.from_focal(40.0, WIDTH, HEIGHT), live=LiveTraining())
@@ -202,7 +202,7 @@ def test_a_picture_that_was_just_trained_on_is_shown_as_it_was_trained():
         made.grow(frame)
 
 
-def test_where_nothing_can_be_trained_on_the_motion_of_the_last_two_frames_goes_on():
+def test_published_model_continues_motion_over_untrained_frame():
     config = ReconstructorConfig(gaussians=300, max_gaussians=600, motion_prior="flow")
     made = Reconstructor(config, Camera.from_focal(80.0, 2 * WIDTH, 2 * HEIGHT), live=LiveTraining())
     frames = [frame_at(k, 2 * WIDTH, 2 * HEIGHT) for k in range(5)]
@@ -219,7 +219,7 @@ def test_where_nothing_can_be_trained_on_the_motion_of_the_last_two_frames_goes_
     assert torch.equal(made.publish().at(frames[1].time_s).means, made._step.at(frames[0].time_s).means)
 
 
-def test_what_a_moving_picture_reveals_is_covered_before_it_is_shown():
+def test_revealed_strip_is_covered_before_publish():
     config = ReconstructorConfig(
         gaussians=600, max_gaussians=1200, motion_prior="flow", motion_detail="half", start_from_motion=True
     )
@@ -233,7 +233,7 @@ def test_what_a_moving_picture_reveals_is_covered_before_it_is_shown():
     assert float(alpha[:, :6].mean()) > 0.8
 
 
-def test_a_published_picture_stays_as_it_is_while_training_goes_on():
+def test_published_model_is_unchanged_by_later_training():
     config = ReconstructorConfig(gaussians=120, max_gaussians=240, motion_prior="flow", start_from_motion=True)
     made = Reconstructor(config, Camera.from_focal(40.0, WIDTH, HEIGHT), live=LiveTraining())
     made.observe(frame_at(0), budget=Budget.of_steps(4))
@@ -246,14 +246,14 @@ def test_a_published_picture_stays_as_it_is_while_training_goes_on():
     assert not torch.equal(trained, before["logit_opacities"])
 
 
-def test_rehearsal_corrects_colours_half_as_much_and_looks_at_depth_at_every_fourth_step():
+def test_rehearsed_relaxation_is_half_and_zero_at_every_fourth_depth_step():
     training = LiveTraining(colour_relaxation=1.2)
     assert [training.rehearsed_relaxation(k, False) for k in range(1, 9)] == pytest.approx([0.6] * 8)
     with_depth = [training.rehearsed_relaxation(k, True) for k in range(1, 9)]
     assert with_depth == pytest.approx([0.6, 0.6, 0.6, 0.0] * 2)
 
 
-def test_the_usual_rates_fall_from_2_to_a_half_within_30_steps():
+def test_default_live_rate_falls_from_2_to_half_in_30_steps():
     training = LiveTraining()
     assert (training.rate_at(0), training.rate_at(29), training.rate_at(500)) == pytest.approx((2.0, 0.5, 0.5))
     assert training.rate_at(14.5) == pytest.approx(1.0)
@@ -273,7 +273,7 @@ def steps_taken(monkeypatch):
     return taken
 
 
-def test_a_scene_begins_at_the_plain_rate_and_goes_on_with_the_schedule(steps_taken):
+def test_first_frame_of_scene_trains_at_plain_rate(steps_taken):
     made = reconstructor(first_rate=3.0, last_rate=0.25, rate_steps=3, colour_relaxation=0.8)
     run(made, [(2, 0), (4, 1)])
     assert [rate for _, rate, _ in steps_taken] == pytest.approx([1, 1, 3, 0.75**0.5, 0.25, 0.25, 0.25])
@@ -281,7 +281,7 @@ def test_a_scene_begins_at_the_plain_rate_and_goes_on_with_the_schedule(steps_ta
 
 
 @pytest.mark.slow
-def test_six_in_ten_rehearsal_steps_go_to_the_newest_frame_and_the_others_are_spread(steps_taken):
+def test_rehearsal_gives_newest_frame_60_percent_of_steps(steps_taken):
     made = reconstructor()
     run(made, [(1, 0)] * 8)
     del steps_taken[:]
@@ -292,7 +292,7 @@ def test_six_in_ten_rehearsal_steps_go_to_the_newest_frame_and_the_others_are_sp
 
 
 @pytest.mark.parametrize(("newer", "is_taken"), [(0, True), (29, True), (30, False)])
-def test_late_depth_is_taken_of_the_newest_30_frames(newer, is_taken):
+def test_take_depth_accepts_newest_30_frames(newer, is_taken):
     config = ReconstructorConfig(gaussians=60, max_gaussians=60, window_frames=60)
     made = Reconstructor(config, CAMERA, live=LiveTraining())
     for k in range(newer + 1):
@@ -304,7 +304,7 @@ def test_late_depth_is_taken_of_the_newest_30_frames(newer, is_taken):
     assert (source is not None and "stereo" in str(source).lower()) == is_taken
 
 
-def test_a_scene_is_left_as_it_was_before_a_doubtful_frame():
+def test_left_scene_excludes_training_on_doubtful_frame():
     """The next scene is not taken for the left one, although the left scene was trained on its first frame."""
     left = reconstructor()
     other = Frame(1, 33_000_000, np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8))

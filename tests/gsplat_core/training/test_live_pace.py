@@ -12,7 +12,7 @@ from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.schedule import Budget, LiveTraining, NewestFirstSchedule
 
 
-def test_rates_fall_from_2_to_a_half_within_thirty_steps_in_equal_ratios():
+def test_live_rate_falls_geometrically_in_thirty_steps():
     live = LiveTraining()
     assert [live.rate_at(step) for step in (0, 29, 30, 500)] == pytest.approx([2.0, 0.5, 0.5, 0.5])
     assert live.rate_at(1) / live.rate_at(0) == pytest.approx(0.25 ** (1 / 29))
@@ -21,14 +21,14 @@ def test_rates_fall_from_2_to_a_half_within_thirty_steps_in_equal_ratios():
 
 
 @pytest.mark.parametrize(("number", "or_depth", "factor"), [(3, True, 0.5), (4, True, 0.0), (8, True, 0.0), (4, False, 0.5)])  # fmt: skip
-def test_every_fourth_rehearsal_step_looks_at_depth_in_place_of_colours(number, or_depth, factor):
+def test_rehearsed_relaxation_is_zero_at_every_fourth_depth_step(number, or_depth, factor):
     assert LiveTraining(colour_relaxation=0.8).rehearsed_relaxation(number, or_depth) == pytest.approx(0.8 * factor)
 
 
 @pytest.mark.parametrize(
     "given", [{"first_rate": 100.0}, {"last_rate": 1e-9}, {"rate_steps": 1}, {"recent_share": 0.0}, {"recent_share": 1.0}]
 )  # fmt: skip
-def test_limits_are_taken(given):
+def test_live_training_accepts_boundary_values(given):
     LiveTraining(**given)
 
 
@@ -36,7 +36,7 @@ def test_limits_are_taken(given):
     ("name", "value"), [("first_rate", 0.0), ("last_rate", 100.1), ("rate_steps", 0), ("recent_share", -0.01), ("recent_share", 1.01),
                         ("colour_relaxation", -0.01), ("corrections_before", -1), ("corrections_before", 101)],
 )  # fmt: skip
-def test_what_is_beyond_is_refused(name, value):
+def test_live_training_refuses_values_beyond_limits(name, value):
     with pytest.raises(InvalidSetting, match=name):
         LiveTraining(**{name: value})
 
@@ -56,7 +56,7 @@ class TimedStep:
         pass
 
 
-def test_a_longer_step_changes_the_usual_time_by_a_tenth_and_a_shorter_one_at_once():
+def test_schedule_step_time_rises_by_a_tenth_and_falls_immediately():
     schedule, step, usual = new_schedule("cpu"), TimedStep(), []
     observation = SimpleNamespace(seq=0, right_eye=None, by_turns=lambda turn: None)
     for step.takes_s in (1.0, 1.5, 9.0, 0.5):
@@ -67,7 +67,7 @@ def test_a_longer_step_changes_the_usual_time_by_a_tenth_and_a_shorter_one_at_on
 
 
 @pytest.mark.parametrize(("device", "steps"), [("cpu", 3), ("cuda", 5)])
-def test_rehearsal_on_a_gpu_waits_for_two_queued_steps(device, steps):
+def test_rehearsal_ns_includes_two_queued_steps_on_cuda(device, steps):
     schedule = new_schedule(device)
     assert schedule.rehearsal_ns(3) == 0
     schedule.step_s = 0.5

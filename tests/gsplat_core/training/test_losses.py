@@ -75,7 +75,7 @@ def make_step(make_frame, camera):
     return make
 
 
-def test_weights_are_those_given_or_the_defaults(small_opacities):
+def test_loss_weights_are_given_or_default(small_opacities):
     assert loss_weights(("photometric", "depth", "small_opacities")) == {"small_opacities": 2.0}
     assert loss_weights(("small_opacities:0.25",)) == {"small_opacities": 0.25}
     assert loss_weights(()) == {}
@@ -93,13 +93,13 @@ def test_weights_are_those_given_or_the_defaults(small_opacities):
         (("small_opacities:nan",), "positive number"),
     ],
 )
-def test_wrong_losses_are_refused(small_opacities, losses, message):
+def test_config_refuses_invalid_losses(small_opacities, losses, message):
     with pytest.raises(InvalidSetting, match=message):
         ReconstructorConfig(losses=losses)
 
 
 @pytest.mark.parametrize("field", ["basis", "hexplane"])
-def test_a_named_loss_is_trained(small_opacities, make_step, make_frame, camera, field):
+def test_named_loss_changes_training(small_opacities, make_step, make_frame, camera, field):
     seen = Observation.of(make_frame(4, shift_px=1), camera)
     # Only opacities learn, and the loss outweighs the picture's.
     rates = LearningRates(0.0, 0.0, 0.0, 0.1, 0.0)
@@ -111,7 +111,7 @@ def test_a_named_loss_is_trained(small_opacities, make_step, make_frame, camera,
 
 
 @pytest.mark.parametrize("field", ["basis", "hexplane"])
-def test_a_named_loss_of_rays_is_trained_in_some_steps(near_surface, make_step, make_frame, camera, field):
+def test_named_ray_loss_is_compared_every_few_steps(near_surface, make_step, make_frame, camera, field):
     seen = Observation.of(make_frame(4, shift_px=1), camera)
     rates = LearningRates(0.5, 0.0, 0.0, 0.0, 0.0)
     plain, with_loss = make_step(field, rates=rates), make_step(field, rates=rates, losses=("near_surface:100",))
@@ -123,7 +123,7 @@ def test_a_named_loss_of_rays_is_trained_in_some_steps(near_surface, make_step, 
     assert float(nearer.median()) > 0.02
 
 
-def test_the_loss_value_is_added(small_opacities, make_step, make_frame, camera):
+def test_named_loss_value_is_added_to_step_loss(small_opacities, make_step, make_frame, camera):
     seen = Observation.of(make_frame(4, shift_px=1), camera)
     step = make_step(losses=("small_opacities:0.5",))
     scene = step.at(seen.time_s)
@@ -134,7 +134,7 @@ def test_the_loss_value_is_added(small_opacities, make_step, make_frame, camera)
 @pytest.mark.parametrize(
     ("result", "found"), [(torch.zeros(3, 2), r"\[3, 2\]"), (0.5, "float"), (np.float32(0.5), "float32")]
 )
-def test_a_loss_that_returns_no_single_value_is_named(
+def test_loss_that_returns_no_scalar_tensor_is_refused(
     small_opacities, make_step, make_frame, camera, monkeypatch, result, found
 ):
     monkeypatch.setattr(SmallOpacities, "__call__", lambda *arguments: result)
@@ -143,7 +143,7 @@ def test_a_loss_that_returns_no_single_value_is_named(
         step(Observation.of(make_frame(4, shift_px=1), camera))
 
 
-def test_a_loss_without_anything_to_compare_changes_nothing(small_opacities, make_step, make_frame, camera):
+def test_loss_returning_none_changes_nothing(small_opacities, make_step, make_frame, camera):
     seen = dataclasses.replace(Observation.of(make_frame(4, shift_px=1), camera), seq=100)
     plain, with_loss = make_step(), make_step(losses=("small_opacities",))
     assert plain(seen) == with_loss(seen)
@@ -151,7 +151,7 @@ def test_a_loss_without_anything_to_compare_changes_nothing(small_opacities, mak
         assert torch.equal(one, other)
 
 
-def test_a_loss_sees_the_frames_that_are_trained_on(small_opacities, make_frame, camera):
+def test_loss_context_contains_trained_frames(small_opacities, make_frame, camera):
     config = ReconstructorConfig(gaussians=300, losses=("small_opacities",), first_frame_steps=1, steps_per_frame=1)
     online = Reconstructor(config, camera)
     for seq in range(3):
@@ -163,7 +163,7 @@ def test_a_loss_sees_the_frames_that_are_trained_on(small_opacities, make_frame,
     assert all(count >= 300 for _, _, count in SEEN_BY_THE_LOSS)
 
 
-def test_the_losses_of_every_step_can_be_evaluated_alone(make_step, make_frame, camera):
+def test_photometric_and_depth_losses_sum_to_step_loss(make_step, make_frame, camera):
     step = make_step()
     seen = Observation.of(make_frame(4, shift_px=1), camera)
     depth = torch.full(seen.image.shape[:2], 50.0)
@@ -178,7 +178,7 @@ def test_the_losses_of_every_step_can_be_evaluated_alone(make_step, make_frame, 
 
 @pytest.mark.cuda
 @pytest.mark.parametrize("field", ["basis", "hexplane"])
-def test_a_named_loss_is_trained_on_a_gpu(gpu, small_opacities, make_frame, camera, field):
+def test_named_loss_changes_training_on_cuda(gpu, small_opacities, make_frame, camera, field):
     rates = LearningRates(0.0, 0.0, 0.0, 0.1, 0.0)
     config = ReconstructorConfig(
         field=field, gaussians=300, rates=rates, losses=("small_opacities:1000",), first_frame_steps=3
@@ -194,7 +194,7 @@ def test_a_named_loss_is_trained_on_a_gpu(gpu, small_opacities, make_frame, came
 
 @pytest.mark.cuda
 @pytest.mark.parametrize("field", ["basis", "hexplane"])
-def test_a_named_loss_of_rays_is_captured_on_a_gpu(gpu, near_surface, make_frame, camera, field):
+def test_named_ray_loss_is_captured_on_cuda(gpu, near_surface, make_frame, camera, field):
     """Python runs for few of ten comparisons: before a capture and in it."""
     rates = LearningRates(0.5, 0.0, 0.0, 0.0, 0.0)
     config = ReconstructorConfig(

@@ -29,7 +29,7 @@ def pair():
     return image, target, mask
 
 
-def test_psnr_by_hand():
+def test_psnr_equals_hand_computed_values():
     image = np.zeros((2, 2, 3))
     target = image.copy()
     target[0, 0] = 0.1
@@ -55,7 +55,7 @@ def test_ssim_agrees_with_opencvs_windows(pair):
     assert ssim(image, target, mask) == pytest.approx(expected.mean(), abs=1e-5)
 
 
-def test_types_of_images_do_not_matter(pair):
+def test_metrics_accept_uint8_and_float_images(pair):
     image, target, mask = pair
     floats = torch.from_numpy(image).double() / 255
     for measure in (psnr_tissue_db, psnr_frame_db, ssim):
@@ -64,13 +64,13 @@ def test_types_of_images_do_not_matter(pair):
         assert measure(image[..., ::-1], target[..., ::-1], mask * 255) == pytest.approx(expected, abs=1e-4)
 
 
-def test_equal_images_have_the_stated_cap(pair):
+def test_psnr_of_equal_images_is_cap(pair):
     image, _, mask = pair
     assert psnr_tissue_db(image, image, mask) == psnr_frame_db(image, image, mask) == PSNR_CAP_DB
     assert ssim(image, image, mask) == pytest.approx(1)
 
 
-def test_frames_without_tissue_are_left_out_of_means_and_none_in_json(pair):
+def test_quality_tracker_means_exclude_frames_without_tissue(pair):
     image, target, mask = pair
     tracker = QualityTracker()
     scored = tracker.observe(0, image, target, mask)
@@ -84,7 +84,7 @@ def test_frames_without_tissue_are_left_out_of_means_and_none_in_json(pair):
     assert QualityTracker().means() == dict.fromkeys(("psnr_tissue_db", "psnr_frame_db", "ssim"))
 
 
-def test_a_nan_under_the_tool_is_not_seen(pair):
+def test_metrics_ignore_nan_under_mask(pair):
     image, target, mask = pair
     floats = image.astype(np.float32) / 255
     floats[mask == 0] = np.nan
@@ -92,7 +92,7 @@ def test_a_nan_under_the_tool_is_not_seen(pair):
         assert measure(floats, target, mask) == pytest.approx(measure(image, target, mask), abs=1e-5)
 
 
-def test_a_broken_picture_scores_as_a_black_one_and_stays_in_the_means(pair):
+def test_non_finite_picture_scores_like_black_picture(pair):
     image, target, mask = pair
     broken = np.full(image.shape, np.nan, np.float32)
     broken[0] = np.inf
@@ -106,7 +106,7 @@ def test_a_broken_picture_scores_as_a_black_one_and_stays_in_the_means(pair):
     assert first.psnr_tissue_db < 10
 
 
-def test_a_mean_is_that_of_all_values_at_once(rng):
+def test_scored_mean_is_exact_and_order_independent(rng):
     for values in (
         rng.normal(35, 3, 1000).tolist(),
         (10.0 ** rng.uniform(-12, 12, 300) * rng.choice([-1, 1], 300)).tolist(),
@@ -123,7 +123,7 @@ def test_a_mean_is_that_of_all_values_at_once(rng):
     assert ScoredMean().mean is None
 
 
-def test_wrong_shapes_and_types_are_refused(pair):
+def test_metrics_refuse_wrong_shapes_and_types(pair):
     image, target, mask = pair
     with pytest.raises(InvalidInput, match="one size"):
         psnr_tissue_db(image[:-1], target, mask)

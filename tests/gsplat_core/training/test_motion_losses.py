@@ -41,7 +41,7 @@ def seen(scene: Gaussians, seq: int, camera: Camera = CAMERA) -> Observation:
     return Observation(seq, seq / 10, camera, image, torch.ones(image.shape[:2], dtype=torch.uint8), None)
 
 
-def test_flow_that_does_not_return_or_is_on_a_tool_is_unreliable():
+def test_consistent_flow_is_nan_for_inconsistent_or_masked_pixels():
     wall = textured_wall()
     first, second = seen(wall, 0).image.numpy(), seen(at(wall, wall.means + torch.tensor([0.9, 0, 0])), 1).image.numpy()
     flow = consistent_flow(first, second)
@@ -57,7 +57,7 @@ def test_flow_that_does_not_return_or_is_on_a_tool_is_unreliable():
     assert np.isnan(consistent_flow(first[:40], second[:40])).all()
 
 
-def test_flow_loss_moves_the_scene_as_the_pictures_show():
+def test_flow_loss_gradient_moves_scene_along_flow():
     wall = textured_wall()
     shift = torch.tensor([0.9, -0.5, 0.0])
     frames = [seen(wall, 0), seen(at(wall, wall.means + shift), 1)]
@@ -143,7 +143,7 @@ def test_triangulation_returns_exact_points_and_refuses_contradictions():
     assert reliable[:10].all() and not reliable[10:].any()
 
 
-def test_points_of_pictures_are_on_the_surface_and_project_to_the_centres_of_their_pixels():
+def test_triangulated_points_lie_on_surface_and_reproject():
     frames = [seen(textured_wall(), seq, camera) for seq, camera in enumerate(around()[:4])]
     found = triangulated(frames[0], frames[1:])
     assert found is not None and len(found.pixels) > 20
@@ -154,7 +154,7 @@ def test_points_of_pictures_are_on_the_surface_and_project_to_the_centres_of_the
     assert (found.pixels % 1 == 0.5).all() and (found.pixels < torch.tensor([96, 80])).all()
 
 
-def test_a_displaced_surface_is_moved_back():
+def test_triangulation_loss_gradient_moves_surface_back():
     wall = textured_wall()
     frames = [seen(wall, seq, camera) for seq, camera in enumerate(around())]
     loss = TriangulationLoss()
@@ -170,7 +170,7 @@ def test_a_displaced_surface_is_moved_back():
     assert float((outwards > 0).float().mean()) > 0.9
 
 
-def test_a_fixed_single_eye_is_refused():
+def test_triangulation_loss_refuses_fixed_camera():
     wall = textured_wall(2.0)
     frames = [seen(wall, seq) for seq in range(3)]
     with pytest.raises(InvalidSetting, match="several places, but the camera does not move"):
@@ -178,6 +178,6 @@ def test_a_fixed_single_eye_is_refused():
     assert TriangulationLoss()(wall, frames[0], LossContext(frames[:2], lambda _: wall)) is None
 
 
-def test_both_are_chosen_by_name():
+def test_flow_and_triangulation_losses_are_registered():
     config = ReconstructorConfig(losses=("flow:0.1", "triangulation"))
     assert config.losses == ("flow:0.1", "triangulation")

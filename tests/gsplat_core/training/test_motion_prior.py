@@ -62,7 +62,7 @@ def scored(model: Model, time_s: float, target: NDArray[np.uint8]) -> float:
 
 
 @pytest.mark.parametrize("start_from_motion", [False, True])
-def test_a_constant_velocity_goes_on(start_from_motion: bool) -> None:
+def test_flow_prior_predicts_constant_velocity(start_from_motion: bool) -> None:
     shifts = [1.2 * k for k in range(7)]
     model = learned(learner(start_from_motion=start_from_motion), stream(shifts[:-1]))
     newest_s, next_picture = 5 * INTERVAL_S, picture(shifts[-1])
@@ -70,7 +70,7 @@ def test_a_constant_velocity_goes_on(start_from_motion: bool) -> None:
     assert predicted > hold + 1.0
 
 
-def test_training_starts_where_a_frame_shows_the_scene() -> None:
+def test_start_from_motion_improves_single_step_training() -> None:
     shifts = [0.0, 1.0, 2.0, 4.5]
     gains = []
     for start_from_motion in (False, True):
@@ -79,24 +79,24 @@ def test_training_starts_where_a_frame_shows_the_scene() -> None:
     assert gains[1] > gains[0] + 1.0
 
 
-def test_noise_is_not_amplified() -> None:
+def test_flow_prior_does_not_amplify_noise() -> None:
     model = learned(learner(), stream([0.0] * 6, noise=6.0))
     newest_s, clean = 5 * INTERVAL_S, picture(0.0)
     assert scored(model, newest_s + INTERVAL_S, clean) > scored(model, newest_s, clean) - 0.1
 
 
-def test_a_jump_of_the_picture_does_not_go_on() -> None:
+def test_flow_prior_does_not_continue_jump() -> None:
     model = learned(learner(), stream([0.0, 0.2, 0.4, 0.6, 6.0]))
     newest_s = 4 * INTERVAL_S
     assert torch.equal(model.at(newest_s).means, model.at(newest_s + INTERVAL_S).means)
 
 
-def test_after_a_gap_in_time_there_is_no_velocity() -> None:
+def test_flow_prior_has_no_velocity_after_time_gap() -> None:
     model = learned(learner(), stream([0.0, 1.0, 2.0], [0.0, INTERVAL_S, 2.0]))
     assert torch.equal(model.at(2.0).means, model.at(2.0 + INTERVAL_S).means)
 
 
-def test_irregular_times_give_a_velocity_in_time_and_not_in_frames() -> None:
+def test_flow_prior_velocity_is_per_time_not_per_frame() -> None:
     model = learned(learner(), stream([0.0, 1.0, 3.0], [0.0, INTERVAL_S, 3 * INTERVAL_S]))
     newest_s = 3 * INTERVAL_S
     whole = model.at(newest_s + 2 * INTERVAL_S).means - model.at(newest_s).means
@@ -106,14 +106,14 @@ def test_irregular_times_give_a_velocity_in_time_and_not_in_frames() -> None:
     assert 0.4 < moved_px < 0.8  # one pixel an interval, damped
 
 
-def test_the_prediction_ends_at_its_horizon() -> None:
+def test_flow_prior_prediction_ends_at_horizon() -> None:
     model = learned(learner(), stream([0.0, 1.0, 2.0]))
     newest_s = 2 * INTERVAL_S
     assert torch.equal(model.at(newest_s + HORIZON_S).means, model.at(newest_s + 5.0).means)
 
 
 @pytest.mark.slow
-def test_a_frame_that_is_not_trained_on_is_predicted_and_not_looked_at() -> None:
+def test_prediction_of_untrained_frame_ignores_its_picture() -> None:
     shown = []
     for seed in (0, 1):
         reconstructor = learner()
@@ -128,14 +128,14 @@ def test_a_frame_that_is_not_trained_on_is_predicted_and_not_looked_at() -> None
 
 
 @pytest.mark.slow
-def test_the_same_frames_give_the_same_bytes() -> None:
+def test_motion_prior_training_is_deterministic() -> None:
     first, second = (
         learned(learner(start_from_motion=True), stream([0.0, 1.0, 2.0, 2.5])).at(4 * INTERVAL_S) for _ in range(2)
     )
     assert all(torch.equal(a, b) for a, b in zip(first.tensors().values(), second.tensors().values(), strict=True))
 
 
-def test_training_knows_nothing_of_the_continuation() -> None:
+def test_publishing_does_not_change_training() -> None:
     """Publishing or not, and how often, changes no later model."""
     often, seldom = learner(), learner()
     for frame in stream([0.0, 1.0, 2.0, 3.0]):
@@ -147,12 +147,12 @@ def test_training_knows_nothing_of_the_continuation() -> None:
     assert all(torch.equal(a[name], b[name]) for name in a)
 
 
-def test_without_a_prior_nothing_is_added() -> None:
+def test_bumps_prior_has_no_continuation() -> None:
     model = learned(learner("bumps"), stream([0.0, 1.0, 2.0]))
     assert model.field is not None and model.field.continuation is None
 
 
-def test_new_gaussians_and_a_prior_that_starts_anew() -> None:
+def test_flow_prior_handles_new_gaussians_and_forget() -> None:
     reconstructor = learner(start_from_motion=True)
     learned(reconstructor, stream([0.0, 1.0, 2.0]))
     step, prior = reconstructor._step, reconstructor._motion.prior
@@ -165,7 +165,7 @@ def test_new_gaussians_and_a_prior_that_starts_anew() -> None:
     assert prior.velocity(step) is None
 
 
-def test_pictures_without_tissue_texture_or_light_give_finite_models() -> None:
+def test_flow_prior_of_degenerate_pictures_gives_finite_model() -> None:
     reconstructor = learner(start_from_motion=True, depth_from_motion=True)
     frames = list(stream([0.0, 1.0, 2.0, 3.0]))
     black, white = (np.full((*SIZE, 3), value, np.uint8) for value in (0, 255))
@@ -175,32 +175,32 @@ def test_pictures_without_tissue_texture_or_light_give_finite_models() -> None:
     assert all(t.isfinite().all() for t in model.at(4 * INTERVAL_S).tensors().values())
 
 
-def test_a_field_that_cannot_be_continued_has_no_prior() -> None:
+def test_hexplane_field_has_no_motion_prior() -> None:
     reconstructor = learner(field="hexplane")
     reconstructor.observe(next(stream([0.0])), steps=1)
     assert reconstructor._motion.prior is None
 
 
-def test_an_unknown_prior_is_refused() -> None:
+def test_unknown_motion_prior_is_refused() -> None:
     with pytest.raises(InvalidSetting, match="motion prior"):
         learner("psychic")
 
 
-def test_widening_grows_with_the_motion_and_is_bounded() -> None:
+def test_widened_scale_grows_with_motion_up_to_bound() -> None:
     log_scales = torch.zeros(3, 3)
     added = widened(log_scales, torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1e4, 0.0, 0.0]]))
     assert not added[0].any()
     assert 0 < float(added[1, 0]) < float(added[2, 0]) < 1.0
 
 
-def test_the_configuration_selects_the_motion_prior() -> None:
+def test_config_selects_motion_prior() -> None:
     field = learner()
     field.observe(next(stream([0.0])), steps=1)
     assert field._step is not None
     assert isinstance(new_motion_prior(ReconstructorConfig(motion_prior="flow"), field._step.field), FlowPrior)
 
 
-def test_every_published_state_shows_its_own_continuation(device: str) -> None:
+def test_published_snapshots_keep_own_continuation(device: str) -> None:
     """Slots and captured frames read it where it lies, frame after frame, and show what a model of the same state computes."""
     config = ReconstructorConfig(
         gaussians=700, max_gaussians=900, motion_prior="flow", start_from_motion=True, history_s=1.0, preallocate=True
@@ -211,7 +211,7 @@ def test_every_published_state_shows_its_own_continuation(device: str) -> None:
 
 
 @pytest.mark.parametrize("start_from_motion", [False, True])
-def test_what_is_published_live_shows_what_the_whole_model_does(start_from_motion: bool) -> None:
+def test_live_published_model_equals_whole_model(start_from_motion: bool) -> None:
     config = ReconstructorConfig(
         gaussians=700, max_gaussians=900, motion_prior="flow", start_from_motion=start_from_motion, history_s=1.0
     )
@@ -234,7 +234,7 @@ def test_what_is_published_live_shows_what_the_whole_model_does(start_from_motio
         assert reconstructor.whole_model(shown).field is not None
 
 
-def test_what_is_published_live_is_whole_where_nothing_says_how_it_goes_on() -> None:
+def test_live_published_model_is_whole_without_motion_prior() -> None:
     reconstructor = Reconstructor(ReconstructorConfig(gaussians=700, max_gaussians=900), CAMERA, live=LiveTraining())
     assert reconstructor.parameter_count == 0
     with pytest.raises(InvalidInput, match="no model yet"):
@@ -247,7 +247,7 @@ def test_what_is_published_live_is_whole_where_nothing_says_how_it_goes_on() -> 
 @pytest.mark.parametrize(
     ("moved_px", "is_sudden", "usual_px"), [(1.0, False, 0.28), (1.01, True, 0.28), (0.4, False, 0.22)]
 )
-def test_a_motion_of_five_times_the_usual_one_and_more_than_a_pixel_is_sudden(moved_px, is_sudden, usual_px):
+def test_flow_prior_sudden_motion_threshold(moved_px, is_sudden, usual_px):
     prior = FlowPrior(ReconstructorConfig())
     prior._judge(0.2)
     assert prior._usual_px == pytest.approx(0.2) and not prior._is_sudden
@@ -256,14 +256,14 @@ def test_a_motion_of_five_times_the_usual_one_and_more_than_a_pixel_is_sudden(mo
 
 
 @pytest.mark.parametrize(("interval_s", "is_usable"), [(0.0, False), (-0.1, False), (0.15, True), (0.1501, False)])
-def test_frames_more_than_150_ms_apart_show_no_velocity(interval_s, is_usable):
+def test_flow_prior_ignores_frames_over_150_ms_apart(interval_s, is_usable):
     prior = FlowPrior(ReconstructorConfig())
     prior._motion, prior._interval_s = "motion", interval_s
     assert (prior._usable_motion() == "motion") == is_usable
     assert prior.horizon_s == 0.15
 
 
-def test_gaussians_are_widened_by_a_twentieth_of_the_squared_motion():
+def test_widened_variance_adds_a_twentieth_of_squared_motion():
     """Variances add: a Gaussian of width 1 that moved by 2 has 1 + 0.05 * 4."""
     found = widened(torch.tensor([[0.0, math.log(10.0), -9.0]]), torch.tensor([[2.0, 0.0, 0.0]]))
     torch.testing.assert_close(found, torch.tensor([[0.5 * math.log(1.2), 0.5 * math.log(1.002), 0.7]]))

@@ -47,7 +47,7 @@ def seen_by(after: Camera, depths: torch.Tensor = DEPTHS) -> torch.Tensor:
     return local[:, :2] / local[:, 2:] * FOCAL_PX + CENTRE
 
 
-def test_the_share_of_a_motion_that_continues_is_a_moving_average():
+def test_damping_share_is_moving_average():
     """Six tenths at first. Each frame takes part by 0.15, with the least-squares share between -0.5 and 1.5."""
     last = torch.tensor([[1.0, 0, 0], [0, 2, 0]])
     damping = Damping()
@@ -66,7 +66,7 @@ def test_the_share_of_a_motion_that_continues_is_a_moving_average():
 
 
 @pytest.mark.parametrize("after", [camera(x=2.0), camera(1.0, -2.0, 3.0), camera(-1.0, 0.5, -2.0, turn=0.1)])
-def test_inverse_depths_are_exact_and_as_sure_as_a_pixel_moves_with_them(after):
+def test_inverse_depths_are_exact_with_information_of_parallax(after):
     target = seen_by(after)
     found, information = inverse_depths(PIXELS, target, FIRST, after)
     torch.testing.assert_close(found, 1 / DEPTHS)
@@ -77,7 +77,7 @@ def test_inverse_depths_are_exact_and_as_sure_as_a_pixel_moves_with_them(after):
     torch.testing.assert_close(information, (by_inverse * 1.0).square().sum(1), rtol=0.2, atol=0)
 
 
-def test_cameras_that_only_turn_have_no_translation():
+def test_translation_between_rotating_cameras_is_zero():
     assert not translation_between(FIRST, camera(turn=0.3)).any()
     assert not translation_between(camera(1.0), camera(1.0 + 0.9e-9)).any()
     moved = translation_between(camera(1.0), camera(1.0 + 2e-9))
@@ -116,7 +116,7 @@ class Step:
         self.taken.append(after)
 
 
-def test_the_first_motion_gives_the_distance_of_the_scene(monkeypatch):
+def test_depth_from_motion_finds_distance_at_first_motion(monkeypatch):
     """A scene at 50 was assumed at 10. Relief is within 15 %, and one pixel of motion has an error of one."""
     after = camera(x=4.0)
     step, depth = Step(torch.full((60,), 10.0).double(), after, seen_by(after), monkeypatch), DepthFromMotion()
@@ -130,7 +130,7 @@ def test_the_first_motion_gives_the_distance_of_the_scene(monkeypatch):
     assert step.move(depth) is not None and step.taken == [after], "the distance is found once"
 
 
-def test_depths_are_refined_by_their_errors_and_by_a_factor_of_1_4_at_most(monkeypatch):
+def test_depth_refinement_is_weighted_and_limited_to_factor_1_4(monkeypatch):
     after = camera(x=1.0)
     wrong = DEPTHS * 1.1
     wrong[:5], wrong[5:10] = 500.0, 5.0
@@ -152,7 +152,7 @@ def test_depths_are_refined_by_their_errors_and_by_a_factor_of_1_4_at_most(monke
 
 
 @pytest.mark.parametrize(("baseline", "enough"), [(0.7, False), (0.8, True)])
-def test_a_median_parallax_of_a_pixel_and_a_half_is_enough(monkeypatch, baseline, enough):
+def test_depth_from_motion_requires_median_parallax_of_1_5_pixels(monkeypatch, baseline, enough):
     """At a distance of 50 it is 1.4 pixels for a baseline of 0.7."""
     after = camera(x=baseline)
     flat = torch.full((60,), 50.0).double()
@@ -164,7 +164,7 @@ def test_a_median_parallax_of_a_pixel_and_a_half_is_enough(monkeypatch, baseline
 
 
 @pytest.mark.parametrize(("across_px", "explains"), [(3.8, True), (4.2, False)])
-def test_one_distance_must_explain_half_of_the_squared_motion(monkeypatch, across_px, explains):
+def test_depth_from_motion_requires_half_of_squared_motion_explained(monkeypatch, across_px, explains):
     """All points move by 4 pixels as one distance explains, and up or down by turns, which none does."""
     after = camera(x=2.0)
     flat = torch.full((60,), 50.0).double()
@@ -174,7 +174,7 @@ def test_one_distance_must_explain_half_of_the_squared_motion(monkeypatch, acros
     assert (step.move(DepthFromMotion()) is not None) == explains
 
 
-def test_points_that_move_by_themselves_hardly_change_the_distance(monkeypatch):
+def test_depth_from_motion_is_robust_to_moving_points(monkeypatch):
     after = camera(x=2.0)
     target = seen_by(after, torch.full((60,), 50.0).double())
     target[:10, 0] -= 8.0
@@ -183,7 +183,7 @@ def test_points_that_move_by_themselves_hardly_change_the_distance(monkeypatch):
     assert factor is not None and float(factor[10:].median()) == pytest.approx(5.0, rel=0.06)
 
 
-def test_a_camera_that_only_turns_changes_nothing(monkeypatch):
+def test_depth_from_motion_ignores_rotating_camera(monkeypatch):
     after = camera(turn=0.2)
     step, depth = Step(DEPTHS, after, seen_by(after), monkeypatch), DepthFromMotion()
     depth._distance_is_known = True
@@ -205,7 +205,7 @@ class Prior:
 
 
 @pytest.mark.parametrize("at_once", [True, False])
-def test_a_prior_gets_all_frames_at_once_or_the_two_newest_before_a_frame_is_skipped(at_once):
+def test_following_passes_all_frames_or_two_newest_to_prior(at_once):
     following = Following(ReconstructorConfig(), at_once=at_once)
     prior = following.prior = Prior()
     image = np.zeros((4, 4, 3), np.uint8)

@@ -20,7 +20,7 @@ def window(make_frame, camera, frames, capacity=30, seed=0):
     return filled
 
 
-def test_an_observation_holds_what_the_frame_holds(make_frame, camera):
+def test_observation_of_frame_has_equal_fields(make_frame, camera):
     mask = np.ones((40, 48), np.uint8)
     mask[:3] = 0
     depth = np.full((40, 48), 55.0, np.float64)
@@ -36,14 +36,14 @@ def test_an_observation_holds_what_the_frame_holds(make_frame, camera):
 
 
 @pytest.mark.parametrize("origin", [DEPTH_ORIGINS["light"], DEPTH_ORIGINS["learned"]])
-def test_depth_of_a_single_picture_is_for_the_start_of_a_scene_and_not_for_the_loss(make_frame, camera, origin):
+def test_observation_drops_single_picture_depth(make_frame, camera, origin):
     frame = make_frame(depth=np.full((40, 48), 55.0), depth_origin=origin)
     assert Observation.of(frame, camera).depth is None
     assert Observation.of(frame.with_fields(depth_origin=DEPTH_ORIGINS["parallax"]), camera).depth is not None
 
 
 @pytest.mark.cuda
-def test_a_gpu_holds_the_same(gpu, make_frame, camera):
+def test_observation_on_cuda_equals_cpu(gpu, make_frame, camera):
     frame = make_frame(depth=np.full((40, 48), 55.0), mask=np.eye(40, 48, dtype=np.uint8))
     here, there = Observation.of(frame, camera), Observation.of(frame, camera, gpu)
     for name in ("image", "mask", "depth"):
@@ -52,14 +52,14 @@ def test_a_gpu_holds_the_same(gpu, make_frame, camera):
         assert torch.equal(tensor.cpu(), getattr(here, name))
 
 
-def test_without_mask_and_depth_all_is_tissue_of_unknown_depth(make_frame, camera):
+def test_observation_without_mask_and_depth_is_all_tissue(make_frame, camera):
     seen = Observation.of(make_frame(), camera)
     assert seen.mask.shape == (40, 48)
     assert bool((seen.mask == 1).all())
     assert seen.depth is None
 
 
-def test_depth_that_is_no_distance_is_unknown(make_frame, camera):
+def test_observation_sets_invalid_depth_to_zero(make_frame, camera):
     depth = np.full((40, 48), 55.0, np.float32)
     depth[0, :4] = [np.nan, np.inf, -np.inf, -3.0]
     seen = Observation.of(make_frame(depth=depth), camera)
@@ -67,13 +67,13 @@ def test_depth_that_is_no_distance_is_unknown(make_frame, camera):
     assert np.isnan(depth[0, 0])  # the frame itself is left as it is
 
 
-def test_the_frames_pose_wins(make_frame, camera):
+def test_observation_uses_pose_of_frame(make_frame, camera):
     pose = np.eye(4)
     pose[:3, 3] = [1, 2, 3]
     assert Observation.of(make_frame(pose=pose), camera).camera == camera.with_pose(pose)
 
 
-def test_a_read_only_image_is_copied_and_not_changed(make_frame, camera):
+def test_observation_copies_read_only_image(make_frame, camera):
     frame = make_frame()
     frame.image.setflags(write=False)
     seen = Observation.of(frame, camera)
@@ -81,7 +81,7 @@ def test_a_read_only_image_is_copied_and_not_changed(make_frame, camera):
     assert frame.image.any()
 
 
-def test_a_camera_of_another_size_is_refused(make_frame):
+def test_observation_refuses_camera_of_other_size(make_frame):
     with pytest.raises(InvalidInput, match="48x40, its camera 24x20"):
         Observation.of(make_frame(7), Camera.from_focal(25.0, 24, 20))
 
@@ -89,9 +89,7 @@ def test_a_camera_of_another_size_is_refused(make_frame):
 @pytest.mark.parametrize("steps", [1, 2, 7, 8, 20])
 @pytest.mark.parametrize("share", [0.1, 0.5, 1.0])
 @pytest.mark.parametrize("frames", [1, 2, 10])
-def test_the_schedule_has_its_length_its_share_and_ends_with_the_newest(
-    make_frame, camera, steps, share, frames, monkeypatch
-):
+def test_window_schedule_length_newest_share_and_last_step(make_frame, camera, steps, share, frames, monkeypatch):
     monkeypatch.setattr(observations, "NEWEST_SHARE", share)
     schedule = window(make_frame, camera, frames).schedule(steps)
     assert len(schedule) == steps
@@ -100,32 +98,32 @@ def test_the_schedule_has_its_length_its_share_and_ends_with_the_newest(
     assert newest == (steps if frames == 1 else max(1, round(steps * share)))
 
 
-def test_the_newest_frames_turns_are_spread(make_frame, camera, monkeypatch):
+def test_window_schedule_spreads_steps_of_newest_frame(make_frame, camera, monkeypatch):
     monkeypatch.setattr(observations, "NEWEST_SHARE", 0.5)
     turns = [seen.seq == 4 for seen in window(make_frame, camera, 5).schedule(8)]
     assert turns == [False, True] * 4
 
 
-def test_older_frames_are_drawn_from_the_whole_window_and_only_from_it(make_frame, camera):
+def test_window_schedule_draws_from_whole_window(make_frame, camera):
     filled = window(make_frame, camera, 20, capacity=6)
     assert len(filled) == 6
     assert {seen.seq for seen in filled.schedule(400)} == {14, 15, 16, 17, 18, 19}
 
 
-def test_the_seed_decides_the_draw(make_frame, camera):
+def test_window_schedule_depends_on_seed(make_frame, camera):
     draw = lambda seed: [seen.seq for seen in window(make_frame, camera, 20, seed=seed).schedule(40)]
     assert draw(3) == draw(3)
     assert draw(3) != draw(4)
 
 
-def test_no_steps_are_an_empty_schedule_and_a_negative_number_is_refused(make_frame, camera):
+def test_window_schedule_of_zero_or_negative_steps(make_frame, camera):
     filled = window(make_frame, camera, 3)
     assert filled.schedule(0) == []
     with pytest.raises(InvalidInput, match="steps is -1"):
         filled.schedule(-1)
 
 
-def test_a_frame_is_found_by_its_number_among_the_newest_and_replaced_in_its_place(make_frame, camera):
+def test_window_find_and_replace_by_frame_number(make_frame, camera):
     frames = window(make_frame, camera, 8, capacity=5)
     assert [frames.find(seq, among=3) is not None for seq in range(9)] == [False] * 5 + [True] * 3 + [False]
     assert frames.find(2, among=99) is None and frames.find(3, among=99).seq == 3

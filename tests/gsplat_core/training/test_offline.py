@@ -23,7 +23,7 @@ from tests.gsplat_core.training.two_eyes import LEFT, stereo_frame
 CONFIG = ReconstructorConfig(field="basis", gaussians=300, max_gaussians=500, squared_error=True)
 
 
-def test_rates_fall_from_all_to_what_is_left():
+def test_offline_rate_falls_from_1_to_0_02():
     rates = [offline.rate_at(share / 10) for share in range(11)]
     assert rates[0] == 1
     assert rates[5] == pytest.approx(0.51)
@@ -31,7 +31,7 @@ def test_rates_fall_from_all_to_what_is_left():
     assert rates == sorted(rates, reverse=True)
 
 
-def test_rounds_are_spread_evenly_up_to_their_share_of_the_steps():
+def test_densification_rounds_are_evenly_spaced():
     assert streaming.densification_rounds(600) == [70, 140, 210, 280, 350, 420]
 
 
@@ -45,7 +45,7 @@ def fitted(camera, frames, steps, config=CONFIG, **constants):
     return learning, counts
 
 
-def test_gaussians_grow_round_by_round_to_the_most_allowed(tissue_video, camera):
+def test_offline_fit_grows_per_round_to_max_gaussians(tissue_video, camera):
     learning, counts = fitted(camera, tissue_video(4), 40, DENSIFY_ROUNDS=4, DENSIFY_UNTIL=0.8)
     grown = [step for step, (before, after) in enumerate(itertools.pairwise(counts), 1) if after > before]
     assert grown == [8, 16, 24, 32]
@@ -53,25 +53,25 @@ def test_gaussians_grow_round_by_round_to_the_most_allowed(tissue_video, camera)
     assert learning.snapshot().field.count == CONFIG.max_gaussians
 
 
-def test_fewer_steps_than_rounds_still_end(tissue_video, camera):
+def test_offline_fit_with_fewer_steps_than_rounds(tissue_video, camera):
     for steps in (1, 2, 3):
         _, counts = fitted(camera, tissue_video(2), steps, DENSIFY_ROUNDS=10)
         assert len(counts) == steps
 
 
-def test_without_rounds_the_gaussians_stay(tissue_video, camera):
+def test_offline_fit_without_rounds_keeps_count(tissue_video, camera):
     _, counts = fitted(camera, tissue_video(3), 6, DENSIFY_ROUNDS=0)
     assert set(counts) == {counts[0]}
 
 
-def test_progress_is_stated_after_each_step_with_its_loss(tissue_video, camera):
+def test_offline_fit_reports_progress_after_each_step(tissue_video, camera):
     done = []
     report = Reconstructor(CONFIG, camera).fit(tissue_video(2), 4, progress=lambda *step: done.append(step))
     assert [number for number, _ in done] == [1, 2, 3, 4]
     assert report.loss == done[-1][1]
 
 
-def test_every_frame_is_trained_on_equally_often(tissue_video, camera, monkeypatch):
+def test_offline_fit_trains_on_every_frame_equally_often(tissue_video, camera, monkeypatch):
     seen = Counter()
     take = TrainingStep.__call__
 
@@ -84,7 +84,7 @@ def test_every_frame_is_trained_on_equally_often(tissue_video, camera, monkeypat
     assert seen == dict.fromkeys(range(5), 3)
 
 
-def test_bumps_keep_their_timing_offline(tissue_video, camera):
+def test_offline_fit_keeps_timing_of_bumps(tissue_video, camera):
     config = dataclasses.replace(ReconstructorConfig.offline("basis"), gaussians=100, max_gaussians=100)
     field = fitted(camera, tissue_video(4), 6, config)[0].snapshot().field
     assert field.weights.abs().max() > 0
@@ -92,7 +92,7 @@ def test_bumps_keep_their_timing_offline(tissue_video, camera):
     assert field.log_widths.abs().max() == 0
 
 
-def test_smoothing_brings_neighbours_in_time_together(tissue_video, camera):
+def test_offline_smoothing_reduces_temporal_roughness(tissue_video, camera):
     def roughness(smoothing):
         learning, _ = fitted(camera, tissue_video(12), 60, DENSIFY_ROUNDS=0, SMOOTHING=smoothing)
         weights = learning.snapshot().field.weights
@@ -102,7 +102,7 @@ def test_smoothing_brings_neighbours_in_time_together(tissue_video, camera):
 
 
 @pytest.mark.slow
-def test_smoothing_never_goes_beyond_the_neighbours(tissue_video, camera, monkeypatch):
+def test_offline_smoothing_amount_is_limited(tissue_video, camera, monkeypatch):
     amounts = []
     monkeypatch.setattr(BasisField, "smooth_in_time", lambda self, amount: amounts.append(amount))
     fitted(camera, tissue_video(2), 100, SMOOTHING=5.0)
@@ -125,7 +125,7 @@ def relaxations(camera, frames, steps, monkeypatch, config=CONFIG):
     return found
 
 
-def test_colours_are_corrected_ever_more_in_the_second_half(tissue_video, camera, monkeypatch):
+def test_offline_colour_relaxation_rises_in_second_half(tissue_video, camera, monkeypatch):
     # Equal frames are as steady as frames can be.
     still = [frame.with_fields(image=tissue_video(1)[0].image) for frame in tissue_video(4)]
     values = [value for value, _ in relaxations(camera, still, 40, monkeypatch)]
@@ -133,19 +133,19 @@ def test_colours_are_corrected_ever_more_in_the_second_half(tissue_video, camera
     assert values[21:] == pytest.approx([number / 20 for number in range(1, 20)])
 
 
-def test_colours_of_unsteady_frames_are_trained_to_the_end(tissue_video, camera, monkeypatch):
+def test_offline_colours_of_unsteady_frames_are_not_corrected(tissue_video, camera, monkeypatch):
     frames = tissue_video(4)
     dimmed = [frame.with_fields(image=frame.image // (1 + frame.seq % 2)) for frame in frames]
     assert {value for value, _ in relaxations(camera, dimmed, 40, monkeypatch)} == {0.0}
 
 
-def test_a_field_without_colours_in_time_trains_them_to_the_end(tissue_video, camera, monkeypatch):
+def test_offline_colours_of_hexplane_are_not_corrected(tissue_video, camera, monkeypatch):
     config = dataclasses.replace(CONFIG, field="hexplane")
     still = [frame.with_fields(image=tissue_video(1)[0].image) for frame in tissue_video(2)]
     assert {value for value, _ in relaxations(camera, still, 6, monkeypatch, config)} == {0.0}
 
 
-def test_every_second_step_of_frames_with_depth_trains_colours(tissue_video, camera, monkeypatch):
+def test_offline_colours_with_depth_are_corrected_every_second_step(tissue_video, camera, monkeypatch):
     shape = tissue_video(1)[0].image.shape[:2]
     still = [
         frame.with_fields(image=tissue_video(1)[0].image, depth=np.full(shape, 90.0, np.float32))
@@ -156,7 +156,7 @@ def test_every_second_step_of_frames_with_depth_trains_colours(tissue_video, cam
     assert not any(values[21::2])
 
 
-def test_colours_of_the_right_eye_are_trained_to_the_end(monkeypatch):
+def test_offline_colours_of_right_eye_are_not_corrected(monkeypatch):
     config = dataclasses.replace(CONFIG, eyes="both")
     still = [dataclasses.replace(stereo_frame(0), seq=seq, pts_ns=seq * 33_000_000) for seq in range(4)]
     found = relaxations(LEFT, still, 40, monkeypatch, config)
@@ -164,7 +164,7 @@ def test_colours_of_the_right_eye_are_trained_to_the_end(monkeypatch):
     assert max(value for value, one in found if not one.of_right) > 0.5
 
 
-def test_correction_of_colours_fits_detail_that_training_has_not_reached(tissue_video, camera):
+def test_offline_colour_correction_reduces_error(tissue_video, camera):
     def error(correction):
         learning, _ = fitted(camera, frames, 40, CORRECTION=correction)
         pictures = [
@@ -176,7 +176,7 @@ def test_correction_of_colours_fits_detail_that_training_has_not_reached(tissue_
     assert error(1.0) < 0.9 * error(0.0)
 
 
-def test_neighbours_move_more_alike_the_more_rigid_tissue_is(tissue_video, camera):
+def test_offline_rigidity_makes_neighbours_move_alike(tissue_video, camera):
     def unlike(rigidity):
         learning, _ = fitted(camera, tissue_video(6), 60, DENSIFY_ROUNDS=1, RIGIDITY=rigidity)
         model = learning.snapshot()
@@ -188,7 +188,7 @@ def test_neighbours_move_more_alike_the_more_rigid_tissue_is(tissue_video, camer
 
 
 @pytest.mark.slow
-def test_densification_helps_where_the_first_frame_was_too_coarse(tissue_video, camera):
+def test_densification_reduces_error_of_coarse_start(tissue_video, camera):
     frames = tissue_video(5)
     config = dataclasses.replace(CONFIG, gaussians=60, max_gaussians=240)
 
@@ -201,7 +201,7 @@ def test_densification_helps_where_the_first_frame_was_too_coarse(tissue_video, 
     assert error(5) < 0.7 * error(0)
 
 
-def test_tissue_that_only_few_frames_show_is_kept(tissue_video, camera):
+def test_densification_keeps_tissue_shown_in_few_frames(tissue_video, camera):
     """A tool that goes away at the end: pictures that are chosen for a round seldom show what was below it."""
     frames = list(tissue_video(12))
     mask = np.ones(frames[0].image.shape[:2], np.uint8)

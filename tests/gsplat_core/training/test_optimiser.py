@@ -16,7 +16,7 @@ def tensors(count, seed=0):
     return {"means": draw(3), "sh": draw(4, 3), "logit_opacities": draw()}
 
 
-def test_equals_torchs_adam_with_rates_that_change():
+def test_fused_adam_equals_torch_adam_with_changing_rates():
     ours = {name: tensor.requires_grad_() for name, tensor in tensors(50).items()}
     theirs = {name: tensor.detach().clone().requires_grad_() for name, tensor in ours.items()}
     optimiser = FusedAdam(ours, RATES)
@@ -34,7 +34,7 @@ def test_equals_torchs_adam_with_rates_that_change():
 
 
 @pytest.mark.parametrize("index", [torch.tensor([7, 2, 2, 0]), torch.arange(10) % 3 == 0])
-def test_moments_follow_their_rows(index):
+def test_fused_adam_select_keeps_moments_of_rows(index):
     whole, gradients = tensors(10), tensors(10, seed=1)
     optimiser = FusedAdam(whole, RATES)
     optimiser.step(whole, gradients)
@@ -51,7 +51,7 @@ def test_moments_follow_their_rows(index):
         assert torch.equal(part[name], whole[name][index])
 
 
-def test_appended_rows_start_without_moments_and_leave_the_others_alone():
+def test_fused_adam_append_adds_rows_without_moments():
     whole, gradients = tensors(6), tensors(6, seed=1)
     optimiser = FusedAdam(whole, RATES)
     optimiser.step(whole, gradients)
@@ -65,7 +65,7 @@ def test_appended_rows_start_without_moments_and_leave_the_others_alone():
         optimiser.step(whole, gradients)
 
 
-def test_appended_rows_can_start_with_steps_of_the_usual_size():
+def test_fused_adam_append_usual_limits_first_steps():
     """Rows that join after many steps share a bias correction that is over."""
     moved = {}
     for usual in (False, True):
@@ -86,7 +86,7 @@ def test_appended_rows_can_start_with_steps_of_the_usual_size():
     assert moved[True] < moved[False] / 2
 
 
-def test_rows_with_gradients_that_are_not_finite_are_counted_and_kept():
+def test_fused_adam_skips_and_counts_non_finite_rows():
     values, gradients = tensors(6), tensors(6, seed=1)
     before = {name: tensor.clone() for name, tensor in values.items()}
     gradients["means"][1, 2] = torch.nan
@@ -100,14 +100,14 @@ def test_rows_with_gradients_that_are_not_finite_are_counted_and_kept():
     assert all(torch.isfinite(moment).all() for moment in optimiser.second_moments.values())
 
 
-def test_a_missing_gradient_leaves_its_tensor_alone():
+def test_fused_adam_keeps_tensor_without_gradient():
     values = tensors(3)
     before = values["sh"].clone()
     FusedAdam(values, RATES).step(values, {"means": torch.ones(3, 3), "sh": None})
     assert torch.equal(values["sh"], before)
 
 
-def test_reset_forgets_some_rows():
+def test_fused_adam_reset_clears_moments_of_rows():
     values = tensors(4)
     optimiser = FusedAdam(values, RATES)
     optimiser.step(values, tensors(4, seed=1))
@@ -118,7 +118,7 @@ def test_reset_forgets_some_rows():
     assert not optimiser.second_moments["sh"].any()
 
 
-def test_dense_tensors_skip_single_elements():
+def test_fused_adam_dense_tensors_skip_single_elements():
     plane = {"plane": torch.zeros(2, 5)}
     optimiser = FusedAdam(plane, {"plane": 0.1}, rows=False)
     gradient = torch.ones(2, 5)
@@ -138,7 +138,7 @@ def test_dense_tensors_skip_single_elements():
     assert optimiser.first_moments["plane"].shape == (2, 5)
 
 
-def test_no_gaussians_at_all():
+def test_fused_adam_of_empty_tensors():
     values = tensors(0)
     optimiser = FusedAdam(values, RATES)
     assert optimiser.step(values, tensors(0)) == 0
@@ -146,7 +146,7 @@ def test_no_gaussians_at_all():
     assert optimiser.count == 3
 
 
-def test_what_does_not_match_is_refused():
+def test_fused_adam_refuses_mismatched_names_and_rows():
     values = tensors(4)
     with pytest.raises(InvalidInput, match="must match"):
         FusedAdam(values, {"means": 0.1})
@@ -161,7 +161,7 @@ def test_what_does_not_match_is_refused():
 @pytest.mark.parametrize(
     ("shape", "kept"), [((5, 3), 5), ((8, 3), 5), ((4, 3), 0), ((5, 4), 0), ((8, 4), 0), ((5, 3, 2), 0)]
 )
-def test_moments_of_a_replaced_tensor_stay_only_if_rows_were_added(shape, kept):
+def test_fused_adam_follow_keeps_moments_if_rows_were_added(shape, kept):
     optimiser = FusedAdam({"a": torch.zeros(5, 3), "b": torch.zeros(2)}, rows=False)
     for moments in (optimiser.first_moments, optimiser.second_moments):
         for moment in moments.values():

@@ -26,7 +26,7 @@ def trained(make_frame, camera):
     return online, reports
 
 
-def test_training_lowers_the_loss_and_records_the_renderer(trained, make_frame, camera):
+def test_weighted_sum_training_lowers_error_and_records_renderer(trained, make_frame, camera):
     online, _ = trained
     model = online.snapshot()
     assert model.trained_by.renderer == "weighted_sum"
@@ -45,7 +45,7 @@ def test_training_lowers_the_loss_and_records_the_renderer(trained, make_frame, 
     assert model.trained_by.values["sigma"] != pytest.approx(first["sigma"], rel=1e-4)
 
 
-def test_scenes_grow_and_fit_offline(make_frame, camera):
+def test_weighted_sum_offline_fit_grows_scene(make_frame, camera):
     config = ReconstructorConfig(gaussians=200, max_gaussians=400, renderer="weighted_sum")
     offline = Reconstructor(config, camera)
     offline.fit([make_frame(seq) for seq in range(4)], steps=40)
@@ -55,7 +55,7 @@ def test_scenes_grow_and_fit_offline(make_frame, camera):
     assert all(t.isfinite().all() for t in model.tensors().values())
 
 
-def test_a_bundle_keeps_the_renderer(trained, tmp_path):
+def test_bundle_keeps_renderer_of_weighted_sum_model(trained, tmp_path):
     model = trained[0].snapshot()
     save_bundle(model, tmp_path / "model")
     loaded = load_bundle(tmp_path / "model")
@@ -69,7 +69,7 @@ def test_a_bundle_keeps_the_renderer(trained, tmp_path):
     assert torch.equal(*pictures)
 
 
-def test_other_renderers_refuse_the_model_and_this_one_refuses_others(trained):
+def test_renderers_refuse_models_trained_by_other_renderer(trained):
     model = trained[0].snapshot()
     with pytest.raises(InvalidSetting, match="'alpha' cannot show this model, which was trained by 'weighted_sum'"):
         new_renderer("alpha", model.camera).prepare(model)
@@ -78,7 +78,7 @@ def test_other_renderers_refuse_the_model_and_this_one_refuses_others(trained):
         new_renderer("weighted_sum", model.camera).prepare(plain)
 
 
-def test_the_model_is_not_exported_to_viewers_that_blend_by_alpha(trained, tmp_path):
+def test_weighted_sum_model_export_is_refused(trained, tmp_path):
     with pytest.raises(ExportError, match="trained by renderer 'weighted_sum'"):
         export_model(trained[0].snapshot(), tmp_path / "a.ply", ExportWish(FORMATS["ply"]))
     assert not (tmp_path / "a.ply").exists()
@@ -86,7 +86,7 @@ def test_the_model_is_not_exported_to_viewers_that_blend_by_alpha(trained, tmp_p
 
 @pytest.mark.cuda
 @pytest.mark.parametrize("preallocate", [False, True])
-def test_training_on_a_gpu_gives_the_same_model_twice(gpu, make_frame, camera, preallocate):
+def test_weighted_sum_training_on_cuda_is_deterministic(gpu, make_frame, camera, preallocate):
     config = ReconstructorConfig(
         gaussians=300, renderer="weighted_sum", first_frame_steps=20, steps_per_frame=10, preallocate=preallocate
     )

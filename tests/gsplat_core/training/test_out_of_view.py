@@ -62,17 +62,17 @@ def score(made, frame):
     return psnr_tissue_db((image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy(), frame.image)
 
 
-def there_and_on(first, columns):
+def wandering_frames(first, columns):
     return [frame_at(first + k, column) for k, column in enumerate(columns)]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("rows", [6000, 700])
-def test_a_scope_that_is_back_after_a_minute_finds_what_it_left(device, rows):
+def test_returning_scope_finds_scene_after_a_minute(device, rows):
     """Cover capacity for the whole scene, and capacity for two pictures, where most of the scene is archived."""
     made = reconstructor(rows, device)
-    watch(made, there_and_on(0, [0] * 30), steps=8)
-    watch(made, there_and_on(30, range(0, 380, 4)))
+    watch(made, wandering_frames(0, [0] * 30), steps=8)
+    watch(made, wandering_frames(30, range(0, 380, 4)))
     at = frame_at(125, 376)
     watch(made, [at.with_fields(seq=125 + k, pts_ns=at.pts_ns + k * 3 * 10**9) for k in range(20)], steps=2)
     assert (made.kept()["archived"] > 200) == (rows == 700)
@@ -89,15 +89,15 @@ def test_a_scope_that_is_back_after_a_minute_finds_what_it_left(device, rows):
 
 
 @pytest.mark.slow
-def test_tissue_is_remembered_before_anything_is_learned_again():
+def test_tissue_out_of_view_is_remembered_without_training():
     made = reconstructor(6000)
-    watch(made, there_and_on(0, [0] * 30), steps=8)
-    watch(made, there_and_on(30, range(0, 200, 4)))
+    watch(made, wandering_frames(0, [0] * 30), steps=8)
+    watch(made, wandering_frames(30, range(0, 200, 4)))
     assert score(made, frame_at(100, 0, time_s=made.snapshot().time_window_s[1])) > 24
 
 
 @pytest.mark.slow
-def test_what_a_tool_hides_never_makes_room():
+def test_gaussians_behind_tool_are_never_archived():
     made = reconstructor(310)  # fewer free rows than are kept free
     mask = np.ones((HEIGHT, WIDTH), np.uint8)
     mask[:, 24:] = 0
@@ -115,7 +115,7 @@ def moved(count, **at):
     return Gaussians(means, one, one[:, :3], one[:, 0], torch.zeros(count, 1, 3))
 
 
-def test_only_what_lies_on_tissue_in_the_picture_is_seen():
+def test_last_seen_counts_only_visible_tissue():
     seen = LastSeen(6, torch.device("cpu"))
     mask = np.ones((HEIGHT, WIDTH), np.uint8)
     mask[:, 30:] = 0
@@ -138,7 +138,7 @@ def test_only_what_lies_on_tissue_in_the_picture_is_seen():
 
 
 @pytest.mark.parametrize("model", ["pinhole", "fisheye", "ortho"])
-def test_pixels_are_those_of_the_renderer(model):
+def test_pixels_of_equals_renderer_projection(model):
     from gsplat_core.ops.projection import fully_fused_projection
 
     camera = Camera(CAMERA.K if model != "ortho" else np.diag([0.8, 0.8, 1.0]) + np.array([[0, 0, 24.0], [0, 0, 20], [0, 0, 0]]),
@@ -152,7 +152,7 @@ def test_pixels_are_those_of_the_renderer(model):
     torch.testing.assert_close(pixels[visible], expected[1][0][visible], rtol=1e-3, atol=1e-2)
 
 
-def test_the_archive_is_bounded_and_counts_what_it_drops():
+def test_archive_is_bounded_and_counts_forgotten():
     archive = Archive(5)
     archive.put(moved(4, r0=1.0, r1=2.0, r2=3.0, r3=4.0))
     archive.put(moved(3, r0=5.0, r1=6.0, r2=7.0))
@@ -168,7 +168,7 @@ def test_the_archive_is_bounded_and_counts_what_it_drops():
 
 
 @pytest.mark.slow
-def test_a_published_model_knows_what_was_not_seen(device):
+def test_published_model_has_unseen_times(device):
     """A published model counts tissue as seen at first and as remembered once the scope has left it."""
     made = reconstructor(2000, device)
     here, there = frame_at(0, 0), frame_at(60, WIDTH, time_s=2.0)
@@ -190,7 +190,7 @@ def test_a_published_model_knows_what_was_not_seen(device):
 
 
 @pytest.mark.parametrize("capacity", [300, 30])
-def test_visibility_is_tested_every_eighth_frame_or_in_every_one_if_there_is_no_capacity(capacity):
+def test_visibility_is_tested_every_eighth_frame_or_each_without_capacity(capacity):
     """The scope moves on after the first frame."""
     out_of_view = OutOfView(capacity, torch.device("cpu"))
     scene = moved(30)
@@ -204,7 +204,7 @@ def test_visibility_is_tested_every_eighth_frame_or_in_every_one_if_there_is_no_
     assert unseen == pytest.approx(expected, abs=1e-6)
 
 
-def test_gaussians_leave_from_a_tenth_of_the_width_outside_of_the_picture_on(monkeypatch):
+def test_make_room_archives_gaussians_a_tenth_width_outside_picture(monkeypatch):
     """Only as many as are wanted, and only after the given time."""
     camera = Camera.from_focal(100.0, 100, 80)
     pixels = torch.tensor(
@@ -225,7 +225,7 @@ def test_gaussians_leave_from_a_tenth_of_the_width_outside_of_the_picture_on(mon
     assert outside.tolist() == [False, False, True, False, True, False, True]
 
 
-def test_nothing_is_brought_back_where_nothing_was_archived_or_is_wanted(monkeypatch):
+def test_bring_back_searches_archive_around_wanted_pixels(monkeypatch):
     out, searched = OutOfView(10, torch.device("cpu")), []
     seen = SimpleNamespace(camera=None)
     monkeypatch.setattr(out.archive, "take_uncovered", lambda camera, near, most: searched.append((near, most)))
@@ -282,14 +282,14 @@ def wandered(capacity, count=20, alpha=0.0):
 
 
 @pytest.mark.parametrize(("capacity", "archived"), [(400, 0), (20, 2), (30, 0)])
-def test_as_many_gaussians_leave_as_a_tenth_of_the_capacity_lacks(capacity, archived):
+def test_archive_keeps_a_tenth_of_capacity_free(capacity, archived):
     step, out = wandered(capacity)
     assert len(out.archive) == archived and step.gaussians.count == 20 - archived
     assert set(step.columns) <= {round(-5 + 0.5 * k, 3) for k in range(20)}
 
 
 @pytest.mark.parametrize(("alpha", "is_back"), [(0.0, True), (1.0, False)])
-def test_archived_gaussians_are_back_where_nothing_covers_the_picture(alpha, is_back):
+def test_archived_gaussians_return_to_uncovered_pixels(alpha, is_back):
     step, out = wandered(20, alpha=alpha)
     all_columns = [round(-5 + 0.5 * k, 3) for k in range(20)]
     assert len(out.archive) == 2 and step.pictures == [], "no Gaussian of the archive is in that picture"
@@ -305,7 +305,7 @@ def test_archived_gaussians_are_back_where_nothing_covers_the_picture(alpha, is_
         assert out.last_seen.times().tolist() == pytest.approx([1.1] * 14)
 
 
-def test_what_has_no_room_stays_in_the_archive():
+def test_gaussians_without_room_stay_in_archive():
     step, out = wandered(20)
     out._capacity = 19
     out.follow(step, seen_from(0, 1.1))
@@ -315,7 +315,7 @@ def test_what_has_no_room_stays_in_the_archive():
 
 
 @pytest.mark.parametrize("room", [0, 3, 500])
-def test_new_tissue_is_filled_up_to_the_capacity(monkeypatch, room):
+def test_fill_new_tissue_is_limited_by_capacity(monkeypatch, room):
     """From the archive first, if there is one."""
     calls = []
     observation, frame = seen_from(0, 2.0), frame_at(0, 0, time_s=2.0)

@@ -63,7 +63,7 @@ def by_autograd(gaussians, seen, weights):
     [LossWeights(), LossWeights(ssim=0.3), LossWeights(depth=5.0), LossWeights(0.2, 5.0), LossWeights(squared=True)],
 )
 @pytest.mark.parametrize(("model", "pose"), [("pinhole", None), ("pinhole", MOVED), ("fisheye", MOVED)])
-def test_equals_render_loss_and_backward(make_gaussians, assert_near, sh_degree, weights, model, pose):
+def test_loss_and_gradients_equal_render_and_autograd(make_gaussians, assert_near, sh_degree, weights, model, pose):
     gaussians, seen = make_gaussians(150, sh_degree), observation(model, pose)
     loss, gradients, *_ = loss_and_gradients(gaussians, seen, weights)
     expected_loss, expected = by_autograd(gaussians, seen, weights)
@@ -76,7 +76,7 @@ def test_equals_render_loss_and_backward(make_gaussians, assert_near, sh_degree,
 
 
 @pytest.mark.parametrize("sh_degree", [0, 3])
-def test_equals_the_float64_reference(make_gaussians, assert_near, sh_degree):
+def test_loss_and_gradients_equal_float64_reference(make_gaussians, assert_near, sh_degree):
     seen, weights = observation(pose=MOVED, width=21, height=18), LossWeights(0.2, 5.0)
     gaussians = make_gaussians(25, sh_degree)
     loss, gradients, *_ = loss_and_gradients(gaussians, seen, weights)
@@ -104,7 +104,7 @@ def test_equals_the_float64_reference(make_gaussians, assert_near, sh_degree):
         assert_near(gradients[name], tensor.grad, of_largest=1e-4)
 
 
-def test_without_depth_the_depth_weight_has_no_effect(make_gaussians):
+def test_depth_weight_has_no_effect_without_depth(make_gaussians):
     gaussians, seen = make_gaussians(80), observation(depth=False)
     loss, gradients, *_ = loss_and_gradients(gaussians, seen, LossWeights(depth=3.0))
     plain_loss, plain, *_ = loss_and_gradients(gaussians, seen, LossWeights())
@@ -112,7 +112,7 @@ def test_without_depth_the_depth_weight_has_no_effect(make_gaussians):
     assert all(torch.equal(gradients[name], plain[name]) for name in plain)
 
 
-def test_what_lies_under_the_tool_is_not_seen(make_gaussians):
+def test_loss_and_gradients_ignore_masked_pixels(make_gaussians):
     gaussians, seen = make_gaussians(80), observation()
     other = seen.image.clone()
     other[seen.mask == 0] = 255 - other[seen.mask == 0]
@@ -124,7 +124,7 @@ def test_what_lies_under_the_tool_is_not_seen(make_gaussians):
 
 
 @pytest.mark.parametrize("weights", [LossWeights(), LossWeights(0.2, 0.1)])
-def test_no_gaussians_give_the_loss_of_a_black_picture(make_gaussians, weights):
+def test_loss_without_gaussians_is_loss_of_black_picture(make_gaussians, weights):
     seen = observation(tool=False)
     loss, gradients, *_ = loss_and_gradients(make_gaussians(0), seen, weights)
     black = torch.zeros(HEIGHT_PX, WIDTH_PX, 3)
@@ -138,7 +138,7 @@ def test_no_gaussians_give_the_loss_of_a_black_picture(make_gaussians, weights):
     + [(name, float("inf")) for name in ("means", "quats", "log_scales", "sh")],
 )
 @pytest.mark.parametrize("sh_degree", [0, 3])
-def test_a_gaussian_that_is_not_finite_does_not_touch_the_others(make_gaussians, name, sh_degree, bad):
+def test_non_finite_gaussian_does_not_change_other_gradients(make_gaussians, name, sh_degree, bad):
     gaussians, seen = make_gaussians(40, sh_degree), observation()
     gaussians.means[7] = torch.tensor([1.0, 2.0, 50.0])  # in the middle of the picture
     others = torch.arange(40) != 7
@@ -152,7 +152,7 @@ def test_a_gaussian_that_is_not_finite_does_not_touch_the_others(make_gaussians,
 
 
 @pytest.mark.parametrize("size", [(1, 1), (17, 3), (16, 16)])
-def test_odd_sizes(make_gaussians, assert_near, size):
+def test_loss_and_gradients_at_odd_picture_sizes(make_gaussians, assert_near, size):
     gaussians, seen = make_gaussians(30), observation(tool=False, width=size[0], height=size[1])
     loss, gradients, *_ = loss_and_gradients(gaussians, seen, LossWeights(0.2, 1.0))
     expected_loss, expected = by_autograd(gaussians, seen, LossWeights(0.2, 1.0))
@@ -161,7 +161,7 @@ def test_odd_sizes(make_gaussians, assert_near, size):
         assert_near(gradient, expected[name], relative=1e-3, of_largest=1e-4)
 
 
-def test_the_number_of_threads_does_not_change_a_bit(make_gaussians):
+def test_loss_and_gradients_are_identical_for_any_thread_count(make_gaussians):
     # More than 32768 Gaussians: from there on torch splits elementwise work among its threads.
     gaussians, seen = make_gaussians(50_016), observation()
     gaussians.logit_opacities.mul_(3)

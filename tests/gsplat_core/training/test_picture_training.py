@@ -36,7 +36,7 @@ def scene(count: int = 3) -> Gaussians:
     )
 
 
-def test_values_begin_at_the_distance_of_the_scene_and_again_with_the_next_one(training: PictureTraining) -> None:
+def test_picture_training_values_restart_at_scene_distance(training: PictureTraining) -> None:
     assert {name: pytest.approx(float(value)) for name, value in training.values.items()} == {
         "density": 60.0,
         "other": 0.5,
@@ -47,7 +47,7 @@ def test_values_begin_at_the_distance_of_the_scene_and_again_with_the_next_one(t
     assert float(training.values["density"]) == pytest.approx(20.0) and training._adam is not adam
 
 
-def test_a_step_changes_logarithms_of_values_at_the_renderers_rates(
+def test_picture_training_step_updates_logarithms_at_renderer_rates(
     training: PictureTraining, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     gradients = {"density": torch.tensor(0.25), "other": torch.tensor(-3.0)}
@@ -76,7 +76,9 @@ def test_a_step_changes_logarithms_of_values_at_the_renderers_rates(
     assert drawn[0][:3] == (given, "camera", None) and float(drawn[0][3]["density"]) == pytest.approx(60.0)
 
 
-def test_a_step_goes_down_the_slope(training: PictureTraining, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_picture_training_step_follows_negative_gradient(
+    training: PictureTraining, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(
         step_module, "loss_by_autograd",
         lambda *_: SimpleNamespace(loss=torch.tensor(1.0), gradients={}, values=dict.fromkeys(("density", "other"), torch.tensor(1.0))),

@@ -40,7 +40,7 @@ def shown(reconstructor: Reconstructor, frame: Frame) -> tuple[np.ndarray, np.nd
     return output.depth.numpy(), output.image.numpy()
 
 
-def test_the_scene_goes_to_the_first_depth_at_once_and_looks_the_same() -> None:
+def test_first_depth_places_scene_and_keeps_picture() -> None:
     reconstructor, frames = learner(), stream(3)
     reconstructor.observe(frames[0])
     before, picture = shown(reconstructor, frames[0])
@@ -53,7 +53,7 @@ def test_the_scene_goes_to_the_first_depth_at_once_and_looks_the_same() -> None:
     assert np.abs(same - image)[INSIDE].mean() < np.abs(picture - image)[INSIDE].mean() + 0.03
 
 
-def test_later_depth_moves_it_half_of_the_way() -> None:
+def test_later_depth_moves_scene_half_way() -> None:
     reconstructor, frames = learner(), stream(1)
     reconstructor.observe(frames[0])
     reconstructor.observe(with_depth(frames[0].with_fields(seq=1), DEPTH_ORIGINS["parallax"]), steps=1)
@@ -63,7 +63,7 @@ def test_later_depth_moves_it_half_of_the_way() -> None:
 
 
 @pytest.mark.parametrize("origin", [DEPTH_ORIGINS["measured"], DEPTH_ORIGINS["stereo"]])
-def test_depth_that_is_not_of_parallax_moves_tissue_at_its_own_time(origin) -> None:
+def test_measured_depth_moves_tissue_only_at_its_time(origin) -> None:
     reconstructor, frames = learner(), stream(1)
     reconstructor.observe(with_depth(frames[0], origin))
     later = frames[0].with_fields(seq=1, pts_ns=2_000_000_000)
@@ -74,7 +74,7 @@ def test_depth_that_is_not_of_parallax_moves_tissue_at_its_own_time(origin) -> N
     assert np.abs(picture - before)[INSIDE].mean() < 0.03
 
 
-def test_what_the_depth_does_not_show_goes_along_with_what_is_around_it() -> None:
+def test_placement_moves_unknown_depth_with_surroundings() -> None:
     reconstructor, frames = learner(), stream(1)
     reconstructor.observe(with_depth(frames[0], DEPTH_ORIGINS["stereo"]))
     later = with_depth(frames[0].with_fields(seq=1, pts_ns=2_000_000_000), DEPTH_ORIGINS["stereo"], 1.21)
@@ -85,7 +85,7 @@ def test_what_the_depth_does_not_show_goes_along_with_what_is_around_it() -> Non
     assert np.median((moved / depth_of_surface())[24:40, 28:44]) == pytest.approx(1.1, rel=0.03)
 
 
-def test_depth_by_light_moves_nothing_once_there_is_depth() -> None:
+def test_depth_by_light_does_not_move_placed_scene() -> None:
     reconstructor, frames = learner(), stream(1)
     reconstructor.observe(with_depth(frames[0], DEPTH_ORIGINS["stereo"]))
     reconstructor.observe(with_depth(frames[0].with_fields(seq=1), DEPTH_ORIGINS["light"], 1.21), steps=1)
@@ -93,7 +93,7 @@ def test_depth_by_light_moves_nothing_once_there_is_depth() -> None:
     assert np.median(np.abs(depth / depth_of_surface() - 1)[INSIDE]) < 0.02
 
 
-def test_depth_that_is_believed_nowhere_places_nothing() -> None:
+def test_depth_without_confidence_places_nothing() -> None:
     reconstructor, frames = learner(), stream(1)
     reconstructor.observe(frames[0])
     blind = with_depth(frames[0].with_fields(seq=1), DEPTH_ORIGINS["parallax"])
@@ -104,7 +104,7 @@ def test_depth_that_is_believed_nowhere_places_nothing() -> None:
 
 
 @pytest.mark.parametrize("origin", [DEPTH_ORIGINS["stereo"], DEPTH_ORIGINS["parallax"]])
-def test_a_field_whose_positions_cannot_be_set_is_trained_as_it_is(origin) -> None:
+def test_hexplane_scene_with_depth_is_trained_without_placement(origin) -> None:
     config = ReconstructorConfig(field="hexplane", gaussians=200, max_gaussians=300, first_frame_steps=2)
     reconstructor, frames = Reconstructor(config, FIRST), stream(1)
     reconstructor.observe(frames[0])
@@ -112,7 +112,7 @@ def test_a_field_whose_positions_cannot_be_set_is_trained_as_it_is(origin) -> No
     reconstructor.observe(with_depth(frames[0].with_fields(seq=2), origin), steps=1)
 
 
-def test_a_scene_whose_first_depth_is_possible_nowhere_is_placed_by_the_next_one() -> None:
+def test_scene_is_placed_by_second_depth_if_first_is_unusable() -> None:
     reconstructor, frames = learner(), stream(1)
     blind = with_depth(frames[0], DEPTH_ORIGINS["stereo"])
     reconstructor.observe(blind.with_fields(depth_confidence=np.zeros((HEIGHT, WIDTH), np.float32)))
@@ -121,7 +121,7 @@ def test_a_scene_whose_first_depth_is_possible_nowhere_is_placed_by_the_next_one
     assert np.median(np.abs(depth / depth_of_surface() - 1)[INSIDE]) < 0.02
 
 
-def test_live_the_depth_that_a_frame_comes_with_moves_the_scene_after_it_was_shown() -> None:
+def test_live_recorded_depth_moves_scene_at_grow() -> None:
     """The first one starts the scene; those after it wait for `grow`, so that no picture waits for them."""
     config = ReconstructorConfig(gaussians=1500, max_gaussians=2000, squared_error=True)
     reconstructor, frames = Reconstructor(config, FIRST, live=LiveTraining()), stream(1)

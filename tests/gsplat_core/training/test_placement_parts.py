@@ -18,13 +18,13 @@ PIXELS = torch.tensor([[10.0, 12.0], [48.0, 32.0], [95.5, 63.5], [-30.0, 200.0]]
 @pytest.mark.parametrize(
     ("ratio", "factor"), [(1.0, 1.0), (1.2, math.sqrt(1.2)), (0.81, 0.9), (1.95, math.sqrt(1.95)), (2.1, 1.4), (0.3, 1 / 1.4)]
 )  # fmt: skip
-def test_a_scene_moves_half_of_the_way_to_its_depth_and_by_two_fifths_at_most(ratio, factor):
+def test_smooth_factor_moves_half_way_limited_to_1_4(ratio, factor):
     shown = torch.full((64, 96), 50.0)
     found = smooth_factor(ratio * shown, shown, WHOLE, PIXELS)
     torch.testing.assert_close(found, torch.full((4,), factor), rtol=1e-4, atol=0)
 
 
-def test_a_factor_is_that_of_the_place_of_a_gaussian():
+def test_smooth_factor_varies_along_columns():
     """The depth rises from left to right, and the factor with it. Beyond the picture it is that of the edge."""
     shown = torch.full((64, 96), 50.0)
     depth = shown * torch.exp(torch.linspace(-0.2, 0.2, 96))
@@ -35,7 +35,7 @@ def test_a_factor_is_that_of_the_place_of_a_gaussian():
     assert float(found[2]) == pytest.approx(float(found[3]), rel=1e-3)
 
 
-def test_unknown_depth_takes_the_factor_around_it_and_blocks_of_16_pixels_move_together():
+def test_smooth_factor_of_unknown_depth_and_within_16_pixel_blocks():
     shown = torch.full((64, 96), 50.0)
     known = WHOLE.clone()
     known[:, 48:] = False
@@ -46,7 +46,7 @@ def test_unknown_depth_takes_the_factor_around_it_and_blocks_of_16_pixels_move_t
     torch.testing.assert_close(found, torch.full((3,), 1.21**0.25), rtol=0.01, atol=0)
 
 
-def test_gaussians_stay_on_their_rays_and_grow_with_the_distance():
+def test_move_along_rays_keeps_rays_and_scales_with_distance():
     random = np.random.default_rng(0)
     means, deltas = (torch.from_numpy(random.normal(size=(20, width))) for width in (3, RAW_COLUMNS))
     before, centre = deltas.clone(), torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64)
@@ -63,7 +63,7 @@ def test_gaussians_stay_on_their_rays_and_grow_with_the_distance():
     assert torch.equal(deltas[:, others], before[:, others])
 
 
-def test_a_factor_is_that_of_the_row_of_a_gaussian():
+def test_smooth_factor_varies_along_rows():
     """The depth rises from top to bottom."""
     shown = torch.full((64, 96), 50.0)
     depth = shown * torch.exp(torch.linspace(-0.2, 0.2, 64))[:, None]

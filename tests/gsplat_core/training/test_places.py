@@ -44,7 +44,7 @@ def left(*seeds):
     return places
 
 
-def test_a_frame_finds_its_own_place_and_takes_it():
+def test_places_take_returns_and_removes_matching_place():
     places = left(1, 2, 3)
     assert places.take(frame_of(2)).left_s == 2.0
     assert len(places) == 2 and places.take(frame_of(2)) is None
@@ -52,13 +52,13 @@ def test_a_frame_finds_its_own_place_and_takes_it():
 
 
 @pytest.mark.parametrize("gain,offset", [(0.5, 0), (1.3, 0), (0.6, 40)])
-def test_exposure_and_white_balance_play_no_part(gain, offset):
+def test_places_take_is_independent_of_exposure_and_white_balance(gain, offset):
     image = tissue(2) * np.array([gain, 0.9 * gain, 1.1 * gain]) + offset
     frame = Frame(0, 0, np.clip(image, 0, 255).astype(np.uint8))
     assert left(1, 2, 3).take(frame).left_s == 2.0
 
 
-def test_only_tissue_is_compared():
+def test_places_take_compares_only_tissue():
     mask = np.ones((HEIGHT, WIDTH), np.uint8)
     mask[:, :30] = 0
     image = tissue(2)
@@ -69,11 +69,11 @@ def test_only_tissue_is_compared():
     assert left(2).take(Frame(0, 0, tissue(2), mask=np.zeros_like(mask))) is None
 
 
-def test_a_picture_of_another_size_shows_the_same_place():
+def test_places_take_accepts_picture_of_other_size():
     assert left(1, 2).take(Frame(0, 0, tissue(2, 96, 72))).left_s == 2.0
 
 
-def test_the_last_picture_stands_for_the_scene_where_the_camera_is_the_same():
+def test_places_compare_last_picture_without_pose():
     """Without a pose no scene is rendered: the picture decides, whatever the Gaussians are."""
     gaussians = gaussians_from_frame(frame_of(1), CAMERA, 400, sh_degree=0, default_depth_mm=60.0)
     places = Places()
@@ -85,7 +85,7 @@ def test_the_last_picture_stands_for_the_scene_where_the_camera_is_the_same():
 
 
 @pytest.mark.parametrize("given", [True, False])
-def test_a_scene_is_left_with_the_picture_of_its_last_frame_or_rendered(given):
+def test_left_scenes_use_last_frame_or_rendered_picture(given):
     gaussians = gaussians_from_frame(frame_of(1), CAMERA, 400, sh_degree=0, default_depth_mm=60.0)
     step = SimpleNamespace(at=lambda time_s: gaussians)
     scenes = LeftScenes()
@@ -95,13 +95,13 @@ def test_a_scene_is_left_with_the_picture_of_its_last_frame_or_rendered(given):
 
 
 @pytest.mark.parametrize("share", [0.28, 0.32])
-def test_a_picture_with_little_tissue_does_not_stand_for_the_scene(share):
+def test_structure_of_is_none_for_little_tissue(share):
     mask = np.zeros((HEIGHT, WIDTH), np.uint8)
     mask[:, : round(share * WIDTH)] = 1
     assert (structure_of(frame_of(2, mask=mask)) is not None) == (share > LEAST_SHARE)
 
 
-def test_a_place_is_a_copy():
+def test_places_leave_copies_gaussians():
     gaussians = gaussians_from_frame(frame_of(1), CAMERA, 400, sh_degree=0, default_depth_mm=60.0)
     before, places = gaussians.means.clone(), Places()
     places.leave(gaussians, CAMERA, 1.0)
@@ -109,7 +109,7 @@ def test_a_place_is_a_copy():
     assert torch.equal(places._left[0].gaussians.means, before)
 
 
-def test_places_are_moved_to_the_host_while_frames_are_rehearsed(monkeypatch):
+def test_rehearsal_moves_places_to_host(monkeypatch):
     moved = []
     monkeypatch.setattr(Places, "to_host", lambda places: moved.append(places))
     made = Reconstructor(ReconstructorConfig(gaussians=60, max_gaussians=60), CAMERA, live=LiveTraining())
@@ -120,7 +120,7 @@ def test_places_are_moved_to_the_host_while_frames_are_rehearsed(monkeypatch):
 
 
 @pytest.mark.cuda
-def test_on_a_gpu_the_newest_place_stays_there_until_there_is_time(gpu):
+def test_newest_place_stays_on_cuda_until_to_host(gpu):
     gaussians = gaussians_from_frame(frame_of(1), CAMERA, 400, sh_degree=0, default_depth_mm=60.0)
     places = Places()
     for time_s in (1.0, 2.0):
@@ -132,7 +132,7 @@ def test_on_a_gpu_the_newest_place_stays_there_until_there_is_time(gpu):
     assert [place.gaussians.means.device.type for place in places._left] == ["cpu"]
 
 
-def test_a_pose_that_looks_elsewhere_does_not_show_the_place():
+def test_places_take_is_none_for_pose_looking_elsewhere():
     away = np.eye(4)
     away[0, 3] = -30.0
     assert left(2).take(frame_of(2, pose=np.eye(4))) is not None
@@ -140,7 +140,7 @@ def test_a_pose_that_looks_elsewhere_does_not_show_the_place():
 
 
 @pytest.mark.parametrize("image", [np.zeros((HEIGHT, WIDTH, 3)), np.full((HEIGHT, WIDTH, 3), 255), tissue(2)[:, ::-1]])
-def test_black_white_and_mirrored_pictures_show_no_place(image):
+def test_places_take_is_none_for_black_white_or_mirrored_picture(image):
     assert left(1, 2, 3).take(Frame(0, 0, np.ascontiguousarray(image, np.uint8))) is None
 
 
@@ -166,20 +166,20 @@ def mixed(likeness):
 @pytest.mark.parametrize(
     ("likeness", "is_found"), [(0.3, False), (0.6, False), (0.7, False), (0.79, True), (0.9, True)]
 )
-def test_a_picture_shows_a_place_from_a_likeness_of_three_quarters_on(likeness, is_found):
+def test_places_take_requires_likeness_of_0_75(likeness, is_found):
     """Different places reach 0.6; a place that is kept in view stays above 0.75."""
     places, frame = left(1, 2, 3), mixed(likeness)
     assert (places.take(frame) is not None) == is_found
     assert len(places) == 3 - is_found
 
 
-def test_the_number_of_places_is_bounded():
+def test_number_of_places_is_limited():
     places = left(*range(MOST_PLACES + 3))
     assert len(places) == MOST_PLACES
     assert places.take(frame_of(0)) is None and places.take(frame_of(5)) is not None
 
 
-def test_likeness_of_too_little_is_none():
+def test_likeness_is_zero_without_known_pixels_or_structure():
     known = np.zeros((HEIGHT, WIDTH), bool)
     whole, unknown = _structure(tissue(1)), _structure(tissue(1), known)
     assert whole.likeness(unknown) == unknown.likeness(whole) == 0.0
@@ -188,7 +188,7 @@ def test_likeness_of_too_little_is_none():
     assert whole.likeness(grey) == pytest.approx(0.0, abs=1e-3), "a picture without structure is like none"
 
 
-def test_pixels_that_are_not_known_have_no_effect():
+def test_structure_ignores_unknown_pixels():
     """The structure of the known part is that of the picture without the other part, up to the blur across the border."""
     known = np.ones((HEIGHT, WIDTH), bool)
     known[:, 40:] = False
@@ -198,7 +198,7 @@ def test_pixels_that_are_not_known_have_no_effect():
     assert _structure(changed, known).likeness(_structure(picture)) > 0.97
 
 
-def test_the_likeness_of_channels_is_averaged():
+def test_likeness_is_mean_over_channels():
     """A channel that is inverted correlates with -1."""
     inverted = tissue(1).copy()
     inverted[..., 0] = 255 - inverted[..., 0]
@@ -232,7 +232,7 @@ def swinging(seed, first, count, new_scene=None):
 
 
 @pytest.mark.slow
-def test_a_scope_that_comes_back_after_a_minute_goes_on_where_it_left(device):
+def test_returning_scope_resumes_left_scene(device):
     made = reconstructor(device)
     watch(made, swinging(1, 0, 60), steps=8)
     memory = [tensor.data_ptr() for tensor in made._step.field.training_tensors()]
@@ -253,7 +253,7 @@ def test_a_scope_that_comes_back_after_a_minute_goes_on_where_it_left(device):
     assert [tensor.data_ptr() for tensor in made._step.field.training_tensors()] == memory
 
 
-def test_a_place_never_seen_starts_anew(device):
+def test_begin_scene_of_unseen_place_starts_new_scene(device):
     made = reconstructor(device)
     watch(made, swinging(1, 0, 5), steps=4)
     other = next(iter(swinging(2, 5, 1)))
@@ -264,7 +264,7 @@ def test_a_place_never_seen_starts_anew(device):
     assert made.snapshot().version > 0
 
 
-def test_another_size_begins_in_memory_of_its_own():
+def test_recognised_scene_of_other_size_uses_new_memory():
     made = reconstructor()
     watch(made, swinging(1, 0, 20), steps=6)
     large = Frame(20, 20 * 33_333_333, tissue(1, 96, 72, shift_px=1.5 * np.sin(4)), new_scene="resized")
@@ -274,7 +274,7 @@ def test_another_size_begins_in_memory_of_its_own():
     assert score(made, large) > 30
 
 
-def test_a_warm_up_leaves_no_place_behind():
+def test_forget_removes_places():
     made = reconstructor()
     watch(made, swinging(1, 0, 3), steps=2)
     made.begin_scene(next(iter(swinging(2, 3, 1))))
@@ -283,7 +283,7 @@ def test_a_warm_up_leaves_no_place_behind():
 
 
 @pytest.mark.cuda
-def test_a_cut_captures_nothing_again(gpu):
+def test_cut_reuses_captured_cuda_graph(gpu):
     made = reconstructor(gpu)
     watch(made, swinging(1, 0, 10), steps=6)
     graph = made._step._captured._captured
@@ -293,18 +293,18 @@ def test_a_cut_captures_nothing_again(gpu):
 
 
 @pytest.mark.parametrize(("share", "is_known"), [(0.25, False), (0.35, True)])
-def test_a_place_is_compared_where_three_tenths_of_the_picture_are_known(share, is_known):
+def test_likeness_requires_three_tenths_of_pixels_known(share, is_known):
     known = np.zeros((HEIGHT, WIDTH), bool)
     known[:, : round(share * WIDTH)] = True
     assert (_structure(tissue(1), known).likeness(_structure(tissue(1), known)) > 0.99) == is_known
 
 
-def test_eight_places_are_kept_and_no_more():
+def test_at_most_eight_places_are_kept():
     assert len(left(*range(7))) == 7 and len(left(*range(8))) == len(left(*range(9))) == 8
 
 
 @pytest.mark.parametrize(("samples", "is_known"), [(7, False), (8, True), (9, True)])
-def test_a_compared_pixel_is_known_if_half_of_its_samples_are(samples, is_known):
+def test_structure_pixel_is_known_if_half_of_samples_are(samples, is_known):
     mask = np.ones((4 * HEIGHT, 4 * WIDTH), np.uint8)
     block = np.zeros(16, np.uint8)  # the samples of one compared pixel
     block[:samples] = 1

@@ -41,7 +41,7 @@ def wall(z, device="cpu"):
 
 @pytest.mark.parametrize("name", ["time_of_flight", "structured_light", "oct_line"])
 @pytest.mark.parametrize("form", ["column", "image"])
-def test_a_rendered_wall_gives_the_scan_of_its_depth_map(camera, device, name, form):
+def test_render_ranges_equals_simulated_scan(camera, device, name, form):
     sensor = SENSORS[name](20.0, 60.0, 80, form)
     depth = np.full((SIZE, SIZE), 40.25, np.float32)
     scan = simulate_scan(depth, camera, sensor, np.random.default_rng(0), photons=np.inf, jitter_bins=0)
@@ -56,7 +56,7 @@ def test_a_rendered_wall_gives_the_scan_of_its_depth_map(camera, device, name, f
     assert float((cumulated[0] - cumulated[1]).abs().sum(1).max()) < 0.5  # bins
 
 
-def test_noise_is_that_of_the_photons(camera):
+def test_simulated_scan_noise_follows_photon_count(camera):
     sensor = StructuredLight(20.0, 60.0, 40)
     depth = np.full((SIZE, SIZE), 40.5, np.float32)
     depth[:, 3] = 0
@@ -71,7 +71,7 @@ def test_noise_is_that_of_the_photons(camera):
 
 
 @pytest.mark.parametrize("offset", [-6.0, 0.4, 6.0])
-def test_the_loss_moves_a_wall_to_the_measured_depth(camera, device, offset):
+def test_range_loss_gradient_moves_wall_to_measured_depth(camera, device, offset):
     sensor = TimeOfFlight(20.0, 60.0, 256)
     scan = simulate_scan(np.full((SIZE, SIZE), 40.0, np.float32), camera, sensor, np.random.default_rng(0))
     scene = wall(40.0 + offset, device).requires_grad_()
@@ -88,19 +88,19 @@ def test_the_loss_moves_a_wall_to_the_measured_depth(camera, device, offset):
     assert LOSSES["range"] is RangeLoss
 
 
-def test_rows_without_returns_do_not_count():
+def test_range_loss_ignores_rows_without_returns():
     measured = torch.tensor([[0.0, 3, 1], [0, 0, 0]])
     assert float(range_loss(torch.tensor([[0.0, 6, 2], [5, 0, 0]]), measured)) < 1e-6
     assert float(range_loss(torch.tensor([[6.0, 0, 2], [5, 0, 0]]), measured)) > 0.1
 
 
-def test_a_frame_carries_its_scan_to_the_loss(camera):
+def test_observation_keeps_range_scan_of_frame(camera):
     scan = RangeScan(StructuredLight(1.0, 2.0, 4), np.ones((SIZE, 4), np.float32))
     frame = Frame(0, 0, np.zeros((SIZE, SIZE, 3), np.uint8), ranges=scan)
     assert Observation.of(frame, camera).ranges is scan
 
 
-def test_wrong_arguments_are_refused(camera):
+def test_range_sensors_and_loss_refuse_invalid_arguments(camera):
     with pytest.raises(InvalidSetting, match="from 5 to 2"):
         TimeOfFlight(5, 2)
     with pytest.raises(InvalidSetting, match="form is 'row'"):
@@ -119,7 +119,7 @@ def test_wrong_arguments_are_refused(camera):
 
 
 @pytest.mark.parametrize("value", [-1.0, np.nan, np.inf])
-def test_counts_that_no_sensor_gives_are_refused(value):
+def test_range_scan_refuses_invalid_counts(value):
     counts = np.zeros((4, 8), np.float32)
     counts[2, 3] = value
     with pytest.raises(InvalidInput, match="1 of 32 counts of a scan are negative, NaN or infinite"):
@@ -130,12 +130,12 @@ def test_counts_that_no_sensor_gives_are_refused(value):
     ("argument", "value"),
     [("photons", -5.0), ("photons", np.nan), ("jitter_bins", -1.0), ("jitter_bins", np.nan), ("ambient", -1.0), ("ambient", np.inf)],
 )  # fmt: skip
-def test_a_simulation_names_a_number_out_of_range(camera, argument, value):
+def test_simulate_scan_refuses_numbers_out_of_range(camera, argument, value):
     depth = np.full((camera.height_px, camera.width_px), 4.0)
     with pytest.raises(InvalidInput, match=f"{argument} is {value}; it must be 0 or more"):
         simulate_scan(depth, camera, StructuredLight(1, 9, 8), np.random.default_rng(0), **{argument: value})
 
 
-def test_bins_are_a_whole_number():
+def test_range_sensor_bins_must_be_whole_number():
     with pytest.raises(InvalidSetting, match=r"bins is 1\.5; it must be a whole number"):
         StructuredLight(1, 9, 1.5)

@@ -59,7 +59,7 @@ def with_threads():
 
 
 @EACH_FIELD
-def test_learns_a_moving_scene_as_it_arrives(small_hexplane, tissue_video, camera, field, device):
+def test_online_training_follows_moving_scene(small_hexplane, tissue_video, camera, field, device):
     frames = tissue_video(17)
     learning = Reconstructor(dataclasses.replace(CONFIG, field=field), camera, device=device)
     live = []
@@ -77,7 +77,7 @@ def test_learns_a_moving_scene_as_it_arrives(small_hexplane, tissue_video, camer
 
 @pytest.mark.slow
 @EACH_FIELD
-def test_offline_beats_one_picture_for_all_times(small_hexplane, tissue_video, camera, field, device):
+def test_offline_fit_beats_static_model(small_hexplane, tissue_video, camera, field, device):
     frames = tissue_video(9, amplitude_px=6)
     config = dataclasses.replace(CONFIG, field=field)
     done = []
@@ -96,7 +96,7 @@ def test_offline_beats_one_picture_for_all_times(small_hexplane, tissue_video, c
     assert mean(model) > mean(static.snapshot()) + 2.5
 
 
-def test_learns_what_a_moving_camera_sees(device):
+def test_online_training_follows_moving_camera(device):
     scene = SyntheticScene.from_seed(0, 48, 40, 2.0, moving=True)
     frames = []
     for seq in range(10):
@@ -127,7 +127,7 @@ def test_learns_what_a_moving_camera_sees(device):
 
 
 @EACH_FIELD
-def test_the_seed_decides_and_nothing_else(tissue_video, camera, field, with_threads, small_hexplane):
+def test_training_depends_only_on_seed(tissue_video, camera, field, with_threads, small_hexplane):
     config = dataclasses.replace(CONFIG, field=field, first_frame_steps=3, steps_per_frame=3, ssim_weight=0.2)
     frames = tissue_video(4)
     digests = []
@@ -140,7 +140,7 @@ def test_the_seed_decides_and_nothing_else(tissue_video, camera, field, with_thr
     assert digests[3] != digests[0]
 
 
-def test_making_a_field_leaves_torchs_random_numbers_alone(make_frame, camera):
+def test_new_field_keeps_global_random_state(make_frame, camera):
     torch.manual_seed(5)
     expected = torch.rand(3)
     torch.manual_seed(5)
@@ -148,7 +148,7 @@ def test_making_a_field_leaves_torchs_random_numbers_alone(make_frame, camera):
     assert torch.equal(torch.rand(3), expected)
 
 
-def test_fitting_is_deterministic(tissue_video, camera, device):
+def test_offline_fit_is_deterministic(tissue_video, camera, device):
     def digest(seed):
         learning = Reconstructor(CONFIG, camera, seed=seed, device=device)
         learning.fit(tissue_video(4), 10)
@@ -159,7 +159,7 @@ def test_fitting_is_deterministic(tissue_video, camera, device):
 
 
 @EACH_FIELD
-def test_a_held_out_frame_teaches_nothing(tissue_video, camera, field, small_hexplane, device):
+def test_heldout_frame_does_not_change_training(tissue_video, camera, field, small_hexplane, device):
     frames = tissue_video(4)
     config = dataclasses.replace(CONFIG, field=field, first_frame_steps=5)
     learning = learn(frames[:2], camera, config, device=device)
@@ -179,7 +179,7 @@ def test_a_held_out_frame_teaches_nothing(tissue_video, camera, field, small_hex
     assert learning.snapshot().sha256() == other.snapshot().sha256()
 
 
-def test_snapshots_count_up_and_never_change(tissue_video, camera, device):
+def test_snapshots_have_increasing_versions_and_are_immutable(tissue_video, camera, device):
     frames = tissue_video(6)
     learning = Reconstructor(CONFIG, camera, recording_digest="ab" * 32, device=device)
     published = []
@@ -198,7 +198,7 @@ def test_snapshots_count_up_and_never_change(tissue_video, camera, device):
 
 @pytest.mark.slow
 @EACH_FIELD
-def test_tissue_that_comes_into_view_is_added(make_frame, camera, field, device):
+def test_online_training_adds_gaussians_for_new_tissue(make_frame, camera, field, device):
     config = dataclasses.replace(CONFIG, field=field, first_frame_steps=4, max_gaussians=450)
     learning = Reconstructor(config, camera, device=device)
     learning.observe(make_frame(0))
@@ -215,7 +215,7 @@ def test_tissue_that_comes_into_view_is_added(make_frame, camera, field, device)
 
 @pytest.mark.slow
 @pytest.mark.parametrize("window_frames", [1, 30])
-def test_tissue_that_a_tool_hides_stays_as_it_was_last_seen(tissue_video, make_frame, camera, window_frames, device):
+def test_tissue_behind_tool_keeps_last_seen_position(tissue_video, make_frame, camera, window_frames, device):
     frames = tissue_video(9)  # 2 px to the right in 0.4 s
     learning = learn(frames, camera, dataclasses.replace(CONFIG, window_frames=window_frames), device=device)
     last_s = frames[-1].time_s
@@ -236,7 +236,7 @@ def test_tissue_that_a_tool_hides_stays_as_it_was_last_seen(tissue_video, make_f
 
 
 @EACH_FIELD
-def test_depth_that_is_not_finite_is_harmless(tissue_video, camera, field, device):
+def test_non_finite_depth_does_not_harm_training(tissue_video, camera, field, device):
     depth = np.full((40, 48), 60.0, np.float32)
     depth[::3] = np.nan
     depth[::5] = np.inf
@@ -248,7 +248,7 @@ def test_depth_that_is_not_finite_is_harmless(tissue_video, camera, field, devic
     assert psnr_db(model, frames[-1]) > 20
 
 
-def test_no_steps_only_grow_the_model(make_frame, camera, device):
+def test_observe_with_zero_steps_changes_no_gaussian(make_frame, camera, device):
     learning = Reconstructor(dataclasses.replace(CONFIG, first_frame_steps=2), camera, device=device)
     learning.observe(make_frame(0))
     means = learning.snapshot().gaussians.means
@@ -257,7 +257,7 @@ def test_no_steps_only_grow_the_model(make_frame, camera, device):
     assert torch.equal(learning.snapshot().gaussians.means, means)
 
 
-def test_the_models_camera_is_the_first_frames(make_frame, camera):
+def test_model_camera_is_camera_of_first_frame(make_frame, camera):
     pose = np.eye(4)
     pose[:3, 3] = [3, -2, 500]
     learning = learn([make_frame(pose=pose)], camera, dataclasses.replace(CONFIG, first_frame_steps=5))
@@ -271,7 +271,7 @@ def test_the_models_camera_is_the_first_frames(make_frame, camera):
     assert float(moved.median()) < 5 * 0.05 * 60 / 50
 
 
-def test_one_frame_is_enough_for_both_ways(make_frame, device):
+def test_single_frame_trains_online_and_offline(make_frame, device):
     small = Camera.from_focal(8.0, 5, 3)
     frame = make_frame(width=5, height=3)
     config = ReconstructorConfig(gaussians=6, first_frame_steps=2)
@@ -282,7 +282,7 @@ def test_one_frame_is_enough_for_both_ways(make_frame, device):
         assert bool(learning.snapshot().render(0.0).image.isfinite().all())
 
 
-def test_another_scene_is_not_compared_with_the_loss_of_the_one_before():
+def test_begin_scene_resets_loss_used_for_jump_detection():
     """A frame whose loss jumps gets four times its steps in addition; the frames of another scene get none."""
     flat = np.full((40, 48, 3), 120, np.uint8)
     noise = np.random.default_rng(0).integers(0, 256, (40, 48, 3), np.uint8)
@@ -300,7 +300,7 @@ def test_another_scene_is_not_compared_with_the_loss_of_the_one_before():
     assert steps(new_scene=True) == [2, 2]
 
 
-def test_only_offline_training_knows_all_frames(monkeypatch, make_frame, camera):
+def test_stereo_depth_weight_is_larger_offline(monkeypatch, make_frame, camera):
     """The weights of a scene depend on this. Stereo depth counts ten times as much offline as online."""
     weights = []
     usual = ReconstructorConfig.starting_from
@@ -319,7 +319,7 @@ def test_only_offline_training_knows_all_frames(monkeypatch, make_frame, camera)
     assert weights == pytest.approx([10, 1])
 
 
-def test_queued_steps_are_checked_before_the_scene_is_read_or_left(make_frame, camera, monkeypatch):
+def test_queued_steps_are_settled_before_scene_is_read_or_left(make_frame, camera, monkeypatch):
     """On a GPU they may have to be repeated."""
     learning = learn([make_frame(0)], camera)
     step, settled = learning._step, []
@@ -334,7 +334,7 @@ def test_queued_steps_are_checked_before_the_scene_is_read_or_left(make_frame, c
 
 
 @pytest.mark.parametrize("excluded", ["mask", "loss_mask"])
-def test_validation_leaves_out_tools_and_what_the_scope_does_not_see(excluded):
+def test_validation_psnr_excludes_masked_pixels(excluded):
     """The picture is off by 10 levels where the frame counts, and by 200 elsewhere. A frame without such pixels has no score."""
     image = np.full((8, 12, 3), 40, np.uint8)
     kept = np.zeros((8, 12), np.uint8)

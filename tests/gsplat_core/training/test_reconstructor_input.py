@@ -14,7 +14,7 @@ from gsplat_core.training.reconstructor import Reconstructor
 CONFIG = ReconstructorConfig(gaussians=400, max_gaussians=800, first_frame_steps=20, steps_per_frame=6)
 
 
-def test_the_first_frame_has_to_be_trained_on(make_frame, camera):
+def test_observe_refuses_first_frame_without_training(make_frame, camera):
     learning = Reconstructor(CONFIG, camera)
     with pytest.raises(InvalidInput, match="frame 0 is the first one"):
         learning.observe(make_frame(), train=False)
@@ -23,7 +23,7 @@ def test_the_first_frame_has_to_be_trained_on(make_frame, camera):
     assert learning.gaussians == 0
 
 
-def test_frames_that_do_not_fit_are_refused_and_leave_the_model_alone(make_frame, camera):
+def test_observe_refuses_invalid_frames_and_keeps_model(make_frame, camera):
     learning = Reconstructor(dataclasses.replace(CONFIG, first_frame_steps=2), camera)
     learning.observe(make_frame(4))
     digest = learning.snapshot().sha256()
@@ -41,6 +41,6 @@ def test_frames_that_do_not_fit_are_refused_and_leave_the_model_alone(make_frame
 @pytest.mark.parametrize(
     ("seqs", "steps", "message"), [((), 5, "no frames"), ((0, 2, 1), 5, "in order"), ((0,), 0, "steps is 0")]
 )
-def test_what_cannot_be_fitted_is_refused(make_frame, camera, seqs, steps, message):
+def test_fit_refuses_invalid_frames_or_steps(make_frame, camera, seqs, steps, message):
     with pytest.raises(InvalidInput, match=message):
         Reconstructor(CONFIG, camera).fit([make_frame(seq) for seq in seqs], steps)

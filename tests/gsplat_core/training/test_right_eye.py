@@ -29,7 +29,7 @@ def inner(picture):
     return picture[8:-8, 12:-12]
 
 
-def test_the_right_eye_is_where_the_frame_says_from_wherever_the_left_one_is():
+def test_right_observation_camera_is_relative_to_left_pose():
     pose = np.eye(4)
     pose[:3, 3] = [1, -2, 3]
     left = BothEyes("both").observation(stereo_frame(pose=pose), LEFT)
@@ -41,7 +41,7 @@ def test_the_right_eye_is_where_the_frame_says_from_wherever_the_left_one_is():
     assert left.by_turns(0) is left and left.by_turns(1) is right and left.by_turns(2) is left
 
 
-def test_its_intrinsics_are_its_own():
+def test_right_observation_has_own_intrinsics():
     K = RIGHT.K.copy()
     K[1, 2] += 0.5
     own = dataclasses.replace(RIGHT, K=K)
@@ -50,14 +50,14 @@ def test_its_intrinsics_are_its_own():
 
 
 @pytest.mark.parametrize("missing", ["right_image", "right_camera"])
-def test_without_a_right_eye_there_is_the_left_one_at_every_turn(missing):
+def test_observation_without_right_eye_always_returns_left(missing):
     eyes = BothEyes("both")
     left = eyes.observation(stereo_frame(**{missing: None}), LEFT)
     assert left.right is None and left.by_turns(1) is left
     assert eyes.trained == "left"
 
 
-def test_the_right_eye_is_left_out_where_it_is_not_wanted_and_where_nothing_is_trained():
+def test_right_observation_is_none_for_left_eyes_or_untrained_frame():
     assert BothEyes("left").observation(stereo_frame(), LEFT).right is None
     eyes = BothEyes("both")
     assert eyes.observation(stereo_frame(), LEFT, trains=False).right is None
@@ -66,7 +66,7 @@ def test_the_right_eye_is_left_out_where_it_is_not_wanted_and_where_nothing_is_t
     assert eyes.trained == "both"
 
 
-def test_cameras_of_two_models_are_refused():
+def test_both_eyes_refuses_different_camera_models():
     with pytest.raises(InvalidInput, match="right camera is fisheye, the left one pinhole"):
         BothEyes("both").observation(stereo_frame(right_camera=dataclasses.replace(RIGHT, model="fisheye")), LEFT)
 
@@ -77,7 +77,7 @@ def tool_mask():
     return mask
 
 
-def test_a_tool_is_left_out_where_its_depth_puts_it_in_the_right_picture():
+def test_right_tissue_excludes_tool_at_its_disparity():
     mask = tool_mask()
     depth = np.full((HEIGHT, WIDTH), 56.0, np.float32)
     depth[mask == 0] = 20.0  # 15 px of disparity
@@ -87,7 +87,7 @@ def test_a_tool_is_left_out_where_its_depth_puts_it_in_the_right_picture():
     assert found[16:32, 29:].all(), "where the left eye sees it the right one sees tissue"
 
 
-def test_a_tool_of_unknown_depth_hides_all_that_it_may_hide():
+def test_right_tissue_excludes_range_of_tool_of_unknown_depth():
     mask = tool_mask()
     depth = np.where(mask == 1, np.float32(56), np.float32(0))
     found = right_tissue(stereo_frame(mask=mask, depth=depth), LEFT, RIGHT, 0.0)
@@ -99,7 +99,7 @@ def test_a_tool_of_unknown_depth_hides_all_that_it_may_hide():
     assert np.array_equal(without_any, found), "the shift of the whole picture says as much"
 
 
-def test_depth_that_is_not_believed_says_nothing_about_a_tool():
+def test_right_tissue_treats_unconfident_tool_depth_as_unknown():
     mask = tool_mask()
     depth = np.full((HEIGHT, WIDTH), 56.0, np.float32)
     depth[mask == 0] = 20.0
@@ -110,16 +110,16 @@ def test_depth_that_is_not_believed_says_nothing_about_a_tool():
 
 
 @pytest.mark.parametrize("mask", [None, np.ones((HEIGHT, WIDTH), np.uint8)])
-def test_without_a_tool_all_of_the_right_picture_is_tissue(mask):
+def test_right_tissue_is_complete_without_tool(mask):
     assert right_tissue(stereo_frame(mask=mask), LEFT, RIGHT, 5.0).all()
 
 
-def test_where_all_is_tool_nothing_is_learned_of_what_may_be_it():
+def test_right_tissue_is_empty_if_left_is_all_tool():
     nothing = right_tissue(stereo_frame(mask=np.zeros((HEIGHT, WIDTH), np.uint8)), LEFT, RIGHT, 5.0)
     assert not nothing[:, : WIDTH - 16].any()
 
 
-def test_a_tool_that_leaves_the_right_picture_hides_nothing_there():
+def test_right_tissue_ignores_tool_outside_right_picture():
     mask = np.ones((HEIGHT, WIDTH), np.uint8)
     mask[:, :6] = 0
     depth = np.full((HEIGHT, WIDTH), 15.0, np.float32)
@@ -134,7 +134,7 @@ def trained(eyes, frames=2, **fields):
 
 
 @pytest.mark.slow
-def test_both_eyes_meet_in_one_surface():
+def test_training_on_both_eyes_improves_depth_and_third_view():
     """Stereo is the only cue to the surface distance: the third view and depth improve with both eyes."""
     views, depths = {}, {}
     for eyes in ("left", "both"):
@@ -149,7 +149,7 @@ def test_both_eyes_meet_in_one_surface():
     assert depths["both"] < 0.7 * depths["left"]
 
 
-def test_tissue_that_only_the_right_eye_sees_gets_gaussians():
+def test_tissue_seen_only_by_right_eye_gets_gaussians():
     covered = trained("both", frames=1, with_depth=True).snapshot().at(0.0)
     picture, _ = seen(RIGHT, covered)
     alone = trained("left", frames=1, with_depth=True).snapshot().at(0.0)
@@ -158,7 +158,7 @@ def test_tissue_that_only_the_right_eye_sees_gets_gaussians():
 
 
 @pytest.mark.slow
-def test_offline_training_takes_both_eyes(monkeypatch):
+def test_offline_fit_trains_on_both_eyes(monkeypatch):
     monkeypatch.setattr(streaming, "DENSIFY_ROUNDS", 1)
     config = dataclasses.replace(CONFIG, depth_of_recording=None)
     views = {}
@@ -170,14 +170,14 @@ def test_offline_training_takes_both_eyes(monkeypatch):
 
 
 @pytest.mark.slow
-def test_the_same_frames_give_the_same_bytes():
+def test_stereo_training_is_deterministic():
     first, second = (trained("both", frames=3).snapshot() for _ in range(2))
     assert first.sha256() == second.sha256()
     assert first.sha256() != trained("left", frames=3).snapshot().sha256()
 
 
 @pytest.mark.slow
-def test_a_frame_without_a_right_eye_trains_as_ever():
+def test_both_eyes_without_right_image_equals_left_training():
     alone = trained("both", frames=3, right_image=None).snapshot()
     assert alone.sha256() == trained("left", frames=3, right_image=None).snapshot().sha256()
 
@@ -193,7 +193,7 @@ def tinted(seq: int) -> Frame:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("way", "better_db"), [("online", 0.1), ("offline", 0.2), ("live", 4)])
-def test_each_eye_keeps_its_own_colours(way, better_db, monkeypatch):
+def test_training_keeps_separate_colours_per_eye(way, better_db, monkeypatch):
     """A tint of one eye appears in its own rendered picture and not in that of the other eye."""
     monkeypatch.setattr(streaming, "DENSIFY_ROUNDS", 1)
     frames = [tinted(seq) for seq in range(4)]
@@ -222,12 +222,12 @@ def test_each_eye_keeps_its_own_colours(way, better_db, monkeypatch):
     assert model.at(0.1).right_sh is not None and right.right_sh is None
 
 
-def test_a_scene_of_one_eye_has_no_colours_for_the_other():
+def test_right_sh_is_none_for_monocular_training():
     assert trained("left", frames=1).snapshot().gaussians.right_sh is None
     assert trained("both", frames=1, right_image=None).snapshot().gaussians.right_sh is None
 
 
-def test_live_the_eyes_take_turns_and_the_left_one_begins(monkeypatch):
+def test_live_training_alternates_eyes_starting_with_left(monkeypatch):
     learning = Reconstructor(
         dataclasses.replace(CONFIG, squared_error=True), LEFT, live=LiveTraining(colour_relaxation=1.0)
     )
@@ -241,7 +241,7 @@ def test_live_the_eyes_take_turns_and_the_left_one_begins(monkeypatch):
     assert taken == [left, left, right, left, right, left, right, left]
 
 
-def test_live_makes_both_eyes_better():
+def test_live_training_improves_both_eyes():
     learning = Reconstructor(
         dataclasses.replace(CONFIG, squared_error=True, history_s=2.0, preallocate=True),
         LEFT,

@@ -36,7 +36,7 @@ def step(make_frame, camera, request):
     return made
 
 
-def test_field_moments_extra_tensors_and_statistics_follow_rows(step, make_frame, camera):
+def test_change_rows_keeps_field_moments_extra_and_statistics_aligned(step, make_frame, camera):
     """`split` changes the order of rows, and `remove` leaves gaps."""
     deltas, before = step.field.deltas(0.4).detach().clone(), step.gaussians.detach().clone()
     averages = step.moments("means")["exp_avg"]
@@ -62,7 +62,7 @@ def test_field_moments_extra_tensors_and_statistics_follow_rows(step, make_frame
     step(Observation.of(make_frame(2), camera))
 
 
-def test_the_step_keeps_gradients_in_the_picture_for_strategies_that_read_them(step, make_frame, camera):
+def test_training_step_keeps_screen_gradients_for_strategies(step, make_frame, camera):
     seen = Observation.of(make_frame(2), camera)
     scene = step.at(seen.time_s)
     viewmat, intrinsics = (matrix[None] for matrix in camera.matrices("cpu"))
@@ -77,7 +77,7 @@ def test_the_step_keeps_gradients_in_the_picture_for_strategies_that_read_them(s
     assert torch.equal(step.screen.radii, info["radii"][0])
 
 
-def test_adc_stays_below_the_cap_by_the_largest_gradients():
+def test_capped_adc_grows_largest_gradients_up_to_cap():
     gradients = torch.tensor([1.0, 5.0, 3.0, 4.0, 2.0])
     strategy = CappedAdc(cap_max=7, grow_grad2d=1.5)
     state = {"grad2d": gradients, "count": torch.ones(5), "scene_scale": 1.0}
@@ -88,7 +88,7 @@ def test_adc_stays_below_the_cap_by_the_largest_gradients():
 
 
 @pytest.mark.parametrize("name", ["adc", "mcmc"])
-def test_a_fit_changes_the_gaussians_up_to_the_cap_and_repeats_by_seed(name, tissue_video, camera):
+def test_fit_with_strategy_respects_cap_and_is_deterministic(name, tissue_video, camera):
     config = ReconstructorConfig(field="basis", gaussians=200, max_gaussians=225, strategy=name, squared_error=True)
     ends, counts = [], []
     for _ in range(2):
@@ -101,7 +101,7 @@ def test_a_fit_changes_the_gaussians_up_to_the_cap_and_repeats_by_seed(name, tis
     assert max(counts) <= 225 and (name == "adc" or counts[59] == 225)
 
 
-def test_mcmc_moves_dead_gaussians_of_a_scene_with_their_motion(make_frame, camera):
+def test_scene_mcmc_relocates_dead_gaussians_with_motion(make_frame, camera):
     gaussians = gaussians_from_frame(make_frame(), camera, COUNT, sh_degree=0, default_depth_mm=60.0)
     config = ReconstructorConfig(field="basis", gaussians=COUNT, max_gaussians=COUNT, strategy="mcmc")
     step = TrainingStep(gaussians, BasisField(COUNT, (0.0, 1.0), bumps=6), config, camera)
@@ -119,7 +119,7 @@ def test_mcmc_moves_dead_gaussians_of_a_scene_with_their_motion(make_frame, came
     assert all((before == row).all(1).any() for row in after)
 
 
-def test_the_losses_of_mcmc_can_be_weighed_by_the_user(make_frame, camera):
+def test_mcmc_loss_weights_can_be_overridden(make_frame, camera):
     seen = Observation.of(make_frame(1), camera)
     gaussians = gaussians_from_frame(make_frame(), camera, COUNT, sh_degree=0, default_depth_mm=60.0)
     loss = {}
@@ -134,7 +134,7 @@ def test_the_losses_of_mcmc_can_be_weighed_by_the_user(make_frame, camera):
 
 
 @pytest.mark.parametrize("name", ["adc", "mcmc"])
-def test_strategies_of_alpha_blending_name_what_works_with_other_renderers(name):
+def test_alpha_strategies_are_refused_for_other_renderers(name):
     with pytest.raises(InvalidSetting, match=f"strategy '{name}' uses .* choose renderer alpha, or strategy streaming"):
         ReconstructorConfig(renderer="weighted_sum", strategy=name)
     assert ReconstructorConfig(renderer="points", strategy=name).strategy == name
@@ -142,7 +142,7 @@ def test_strategies_of_alpha_blending_name_what_works_with_other_renderers(name)
 
 
 @pytest.mark.parametrize("count", [1000, (1 << 24) + 2])
-def test_indices_are_drawn_in_proportion_to_any_number_of_weights(count):
+def test_draw_is_proportional_to_weights_beyond_2_24_entries(count):
     """`torch.multinomial` takes up to 2^24 of them."""
     weights = torch.zeros(count)
     weights[7], weights[count - 1] = 1.0, 3.0

@@ -70,7 +70,7 @@ def trained(
     return step.calls[before:], report
 
 
-def test_the_first_step_is_on_the_newest_frame_and_the_others_on_the_window_in_its_order() -> None:
+def test_window_schedule_first_step_is_newest_frame_then_window() -> None:
     step = Step()
     calls, report = trained(WindowSchedule(CPU), step, Budget.of_steps(5), first=True)
     assert calls == [1, 100, 101, 102, 103]
@@ -78,14 +78,14 @@ def test_the_first_step_is_on_the_newest_frame_and_the_others_on_the_window_in_i
     assert step.settled and step.settled[0].seq == 1
 
 
-def test_a_frame_without_a_step_has_no_loss() -> None:
+def test_schedule_report_without_steps_has_no_loss() -> None:
     for schedule in (WindowSchedule(CPU), NewestFirstSchedule(LiveTraining(), ReconstructorConfig(), CPU)):
         calls, report = trained(schedule, Step(), Budget.of_steps(0))
         assert calls == [] and (report.steps, report.arriving_loss) == (0, None)
 
 
 @pytest.mark.parametrize(("loss", "first", "extra"), [(1.79, False, 0), (1.81, False, 1), (1.81, True, 0)])
-def test_a_jump_of_a_counted_frame_has_four_times_as_many_steps_more(loss: float, first: bool, extra: int) -> None:
+def test_window_schedule_adds_four_times_steps_after_jump(loss: float, first: bool, extra: int) -> None:
     schedule, step = WindowSchedule(CPU), Step(1.0)
     trained(schedule, step, Budget.of_steps(3))
     step.losses, step.settled = loss, []
@@ -100,7 +100,7 @@ def test_a_jump_of_a_counted_frame_has_four_times_as_many_steps_more(loss: float
     assert len(step.settled) == 1
 
 
-def test_a_timed_jump_has_all_steps_that_are_left() -> None:
+def test_window_schedule_timed_jump_uses_all_remaining_steps() -> None:
     schedule, step = WindowSchedule(CPU), Step(1.0, takes_s=1.0)
     calls, _ = trained(schedule, step, step.within(4.5), 1)
     assert calls[0] == 1 and set(calls[1:]) <= {100, 101, 102, 103}
@@ -117,7 +117,7 @@ def test_a_timed_jump_has_all_steps_that_are_left() -> None:
     ("losses", "usual"),
     [([1.0], 1.0), ([1.0, 1.0], 1.0), ([1.0, 0.5], 0.95), ([1.0, 1.5], 1.05), ([1.0, 50.0], 1.08)],
 )
-def test_the_usual_loss_changes_by_a_tenth_and_by_a_jump_at_most(losses: list[float], usual: float) -> None:
+def test_window_schedule_usual_loss_average_is_limited(losses: list[float], usual: float) -> None:
     schedule = WindowSchedule(CPU)
     for loss in losses:
         schedule._learn_first_loss(loss)
@@ -126,7 +126,7 @@ def test_the_usual_loss_changes_by_a_tenth_and_by_a_jump_at_most(losses: list[fl
     assert schedule._usual_first_loss == float("inf")
 
 
-def test_the_loss_of_a_scenes_first_frame_is_no_usual_one() -> None:
+def test_window_schedule_usual_loss_excludes_first_frame() -> None:
     schedule, step = WindowSchedule(CPU), Step(9.0)
     trained(schedule, step, Budget.of_steps(1), first=True)
     assert schedule._usual_first_loss == float("inf")
@@ -141,7 +141,7 @@ def test_the_loss_of_a_scenes_first_frame_is_no_usual_one() -> None:
         ("live", [1.0], 1.0), ("live", [1.0, 0.5], 0.5), ("live", [1.0, 1.5], 1.05), ("live", [1.0, 9.0], 1.1),
     ],
 )  # fmt: skip
-def test_the_usual_time_of_a_step(make: Any, times: list[float], usual: float) -> None:
+def test_schedule_step_time_average(make: Any, times: list[float], usual: float) -> None:
     schedule = make(CPU) if make != "live" else NewestFirstSchedule(LiveTraining(), ReconstructorConfig(), CPU)
     assert schedule.step_s is None and schedule.rehearsal_ns(3) == 0
     finished = []
@@ -154,7 +154,7 @@ def test_the_usual_time_of_a_step(make: Any, times: list[float], usual: float) -
 
 
 @pytest.mark.parametrize("timed", [True, False])
-def test_only_timed_steps_change_the_usual_time(timed: bool) -> None:
+def test_schedule_step_time_changes_only_with_deadline(timed: bool) -> None:
     makes: tuple[Callable[[], Any], ...] = (
         lambda: WindowSchedule(CPU),
         lambda: NewestFirstSchedule(LiveTraining(), ReconstructorConfig(), CPU),
@@ -165,7 +165,7 @@ def test_only_timed_steps_change_the_usual_time(timed: bool) -> None:
         assert schedule.step_s == (pytest.approx(1.0) if timed else None)
 
 
-def test_rehearsal_of_the_window_is_checked_later() -> None:
+def test_window_schedule_rehearsal_is_settled_later() -> None:
     schedule, step, window = WindowSchedule(CPU), Step(), Window()
     schedule.rehearse(step, window, 3)
     assert window.asked == [3] and step.calls == [100, 101, 102] and step.settled == []
@@ -173,7 +173,7 @@ def test_rehearsal_of_the_window_is_checked_later() -> None:
     assert [each.seq for each in step.settled] == [102]
 
 
-def test_live_rehearsal_begins_with_the_second_eye_and_again_in_the_next_scene() -> None:
+def test_live_rehearsal_starts_with_right_eye_in_each_scene() -> None:
     live = LiveTraining(recent_share=0.7, last_rate=0.25, colour_relaxation=0.5)
     schedule = NewestFirstSchedule(live, ReconstructorConfig(), CPU)
     step, window = Step(), Window()
@@ -187,7 +187,7 @@ def test_live_rehearsal_begins_with_the_second_eye_and_again_in_the_next_scene()
     assert [each.seq for each in step.settled] == ["100 right"]
 
 
-def test_live_steps_are_on_the_newest_frame_at_falling_rates() -> None:
+def test_live_steps_train_on_newest_frame_at_falling_rates() -> None:
     live = LiveTraining(first_rate=4.0, last_rate=1.0, rate_steps=3, corrections_before=2, colour_relaxation=0.25)
     schedule, step = NewestFirstSchedule(live, ReconstructorConfig(), CPU), Step()
     calls, report = trained(schedule, step, Budget.of_steps(4))

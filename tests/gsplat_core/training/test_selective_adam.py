@@ -8,7 +8,7 @@ from gsplat_core.errors import InvalidInput
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_visible_rows_take_adam_steps_without_bias_correction_and_others_none(dtype):
+def test_selective_adam_updates_only_visible_rows_without_bias_correction(dtype):
     random = torch.Generator().manual_seed(0)
     parameter = torch.randn(9, 2, 3, generator=random).to(dtype).requires_grad_()
     wanted = parameter.detach().double().clone()
@@ -31,7 +31,7 @@ def test_visible_rows_take_adam_steps_without_bias_correction_and_others_none(dt
     assert optimizer.state[parameter]["exp_avg"].shape == parameter.shape
 
 
-def test_a_mask_of_another_length_is_refused():
+def test_selective_adam_refuses_mask_of_wrong_length():
     parameter = torch.zeros(4, 3, requires_grad=True)
     parameter.grad = torch.ones(4, 3)
     with pytest.raises(InvalidInput, match="one per row"):

@@ -37,7 +37,7 @@ def intersection_over_union(shown: np.ndarray, wanted: np.ndarray) -> float:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("field", ["basis", "hexplane"])
-def test_labels_on_some_frames_classify_the_others(field, tmp_path):
+def test_semantics_of_labelled_frames_classify_other_frames(field, tmp_path):
     config = replace(ReconstructorConfig.offline(field), losses=("semantics",), gaussians=800)
     reconstructor = Reconstructor(config, CAMERA, seed=0)
     reconstructor.fit(frames(10, 5), 60)
@@ -52,7 +52,7 @@ def test_labels_on_some_frames_classify_the_others(field, tmp_path):
 
 
 @pytest.mark.slow
-def test_labels_change_neither_colours_nor_geometry():
+def test_semantics_loss_keeps_colours_and_geometry():
     models = []
     for losses in ((), ("semantics",)):
         config = replace(ReconstructorConfig.offline(), losses=losses, gaussians=300)
@@ -64,12 +64,12 @@ def test_labels_change_neither_colours_nor_geometry():
     assert labelled["extra.semantics"].any()
 
 
-def test_labels_must_have_the_size_of_the_picture():
+def test_frame_refuses_labels_of_other_size():
     with pytest.raises(InvalidInput, match="labels is \\[2, 2\\]"):
         Frame(0, 0, np.zeros((4, 4, 3), np.uint8), labels=np.zeros((2, 2), np.uint8))
 
 
-def test_classes_are_0_to_3_and_other_labels_are_unknown():
+def test_semantics_loss_ignores_labels_above_3():
     """Without logits all four classes are as likely, and only pixels with a class count."""
     loss, context = Semantics(), LossContext([], lambda _: wall(0.0))
     scene = loss.extended(wall(0.0))

@@ -30,7 +30,7 @@ def both(frame, camera, count=200, sh_degree=0):
 @pytest.mark.parametrize("pose", [np.eye(4), TURNED])
 @pytest.mark.parametrize("with_depth", [False, True])
 @pytest.mark.parametrize("sh_degree", [0, 2])
-def test_they_are_those_of_the_host(make_frame, model, focal, pose, with_depth, sh_degree):
+def test_start_on_device_equals_host_initialisation(make_frame, model, focal, pose, with_depth, sh_degree):
     frame = make_frame()
     if with_depth:
         depth = np.linspace(40, 80, frame.image[..., 0].size, dtype=np.float32).reshape(frame.image.shape[:2])
@@ -44,7 +44,7 @@ def test_they_are_those_of_the_host(make_frame, model, focal, pose, with_depth, 
         torch.testing.assert_close(device.tensors()[name], tensor, **tolerance)
 
 
-def test_what_a_tool_hides_takes_the_colours_around_it(make_frame):
+def test_start_on_device_fills_tool_with_surrounding_colours(make_frame):
     frame = make_frame()
     image = np.full_like(frame.image, 90)
     image[10:30, 10:30] = 250
@@ -56,7 +56,7 @@ def test_what_a_tool_hides_takes_the_colours_around_it(make_frame):
 
 
 @pytest.mark.parametrize("value", [0, 1])
-def test_a_mask_that_says_nothing_leaves_the_picture(make_frame, value):
+def test_start_on_device_ignores_uniform_mask(make_frame, value):
     frame = make_frame()
     mask = np.full(frame.image.shape[:2], value, np.uint8)
     camera = Camera.from_focal(50.0, 48, 40)
@@ -66,13 +66,13 @@ def test_a_mask_that_says_nothing_leaves_the_picture(make_frame, value):
 
 
 @pytest.mark.parametrize(("width", "height", "count"), [(1, 1, 4), (3, 2, 1), (5, 40, 7), (48, 1, 50)])
-def test_pictures_of_any_size_start_a_scene(width, height, count):
+def test_start_on_device_accepts_any_picture_size(width, height, count):
     frame = Frame(0, 0, np.full((height, width, 3), 120, np.uint8), mask=np.eye(height, width, dtype=np.uint8))
     _, device = both(frame, Camera.from_focal(20.0, width, height), count)
     assert all(tensor.isfinite().all() for tensor in device.tensors().values())
 
 
-def test_it_fits_its_camera_in_any_pose_and_no_other():
+def test_start_on_device_fits_own_camera_in_any_pose():
     camera = Camera.from_focal(50.0, 48, 40)
     start = StartOnDevice(camera, 100, CPU)
     assert start.fits(replace(camera, world_to_camera=TURNED))
@@ -81,7 +81,7 @@ def test_it_fits_its_camera_in_any_pose_and_no_other():
     assert not start.fits(replace(camera, model="fisheye"))
 
 
-def test_filling_keeps_what_is_known_of_a_constant_picture_and_lies_between_its_values():
+def test_filled_keeps_constant_picture_and_value_range():
     generator = torch.Generator().manual_seed(0)
     known = (torch.rand(1, 37, 53, generator=generator) < 0.1).float()
     constant = filled(torch.full((3, 37, 53), 0.4), known)
@@ -92,7 +92,7 @@ def test_filling_keeps_what_is_known_of_a_constant_picture_and_lies_between_its_
     assert float(whole.max()) <= float(picture.max())
 
 
-def test_nothing_is_shown_far_outside_of_the_loss_mask(make_frame):
+def test_initial_scene_is_transparent_far_outside_loss_mask(make_frame):
     frame = make_frame()
     inside = np.zeros(frame.image.shape[:2], np.uint8)
     inside[8:32, 12:36] = 1

@@ -18,7 +18,7 @@ from tests.gsplat_core.training.posed_pictures import posed_pictures
 SHIFT = np.array([30.0, -20, 10])
 
 
-def test_training_brings_the_pictures_closer():
+def test_static_training_improves_psnr():
     pictures, points = posed_pictures()
     trainer = StaticTrainer(pictures, points, StaticConfig(60, "none", sh_degree=1))
     before = np.mean([trainer.psnr_db(k) for k in range(5)])
@@ -27,7 +27,7 @@ def test_training_brings_the_pictures_closer():
     assert all(sorted(seen[first : first + 5]) == [0, 1, 2, 3, 4] for first in range(0, 60, 5))
 
 
-def test_the_unit_and_the_origin_of_the_world_do_not_matter():
+def test_static_training_is_independent_of_unit_and_origin():
     """The rates refer to the distance of the cameras, so the result in another unit is the converted one."""
     results = []
     for factor, shift in ((1.0, 0.0), (100.0, SHIFT)):
@@ -42,7 +42,7 @@ def test_the_unit_and_the_origin_of_the_world_do_not_matter():
     assert (other.opacities - own.opacities).abs().max() < 2e-3
 
 
-def test_coordinates_put_the_centre_of_attention_at_zero():
+def test_training_coordinates_centre_on_viewed_point():
     pictures, _ = posed_pictures(7.0, SHIFT)
     coordinates = TrainingCoordinates.of([each.camera for each in pictures])
     assert np.abs(coordinates.centre - SHIFT).max() < 7 * 0.3
@@ -54,7 +54,7 @@ def test_coordinates_put_the_centre_of_attention_at_zero():
 
 
 @pytest.mark.parametrize(("strategy", "fewest", "most"), [("adc", 61, 200), ("mcmc", 66, 66), ("none", 60, 60)])
-def test_the_strategy_changes_the_number_and_the_seed_repeats_it(strategy, fewest, most):
+def test_static_strategy_changes_count_and_is_deterministic(strategy, fewest, most):
     pictures, points = posed_pictures()
     found = []
     for seed in (3, 3, 4):
@@ -67,7 +67,7 @@ def test_the_strategy_changes_the_number_and_the_seed_repeats_it(strategy, fewes
     assert found[0].shape != found[2].shape or not torch.equal(found[0], found[2])
 
 
-def test_a_full_training_has_the_schedule_of_gsplat():
+def test_static_strategy_schedule_equals_gsplat():
     generator = torch.Generator()
     adc, mcmc = (StaticConfig(strategy=name).new_strategy(200, generator) for name in ("adc", "mcmc"))
     assert (adc, mcmc) == (DefaultStrategy(generator=generator), MCMCStrategy(generator=generator))
@@ -84,7 +84,7 @@ def test_a_full_training_has_the_schedule_of_gsplat():
     assert shorter.reset_every == 600 and shorter.refine_stop_iter == 300
 
 
-def test_adam_takes_the_steps_of_torch():
+def test_compiled_adam_equals_torch_adam():
     generator = torch.Generator().manual_seed(1)
     ours, theirs = (torch.nn.Parameter(torch.ones(7, 3)) for _ in range(2))
     optimizers = CompiledAdam([ours], lr=0.01, eps=1e-15), torch.optim.Adam([theirs], lr=0.01, eps=1e-15)
@@ -106,7 +106,7 @@ def test_adam_takes_the_steps_of_torch():
 @pytest.mark.parametrize(
     ("option", "value"), [("steps", 0), ("sh_degree", 5), ("sh_degree", -1), ("strategy", "x"), ("max_gaussians", 0)]
 )
-def test_an_option_out_of_range_is_refused(option, value):
+def test_static_config_refuses_options_out_of_range(option, value):
     with pytest.raises(InvalidSetting, match=option):
         StaticConfig(**{option: value})
     with pytest.raises(InvalidSetting, match="adc"):
@@ -114,7 +114,7 @@ def test_an_option_out_of_range_is_refused(option, value):
 
 
 @pytest.mark.parametrize(("z", "is_refused"), [(9.0, False), (-9.0, True)])
-def test_points_that_no_image_shows_are_refused(tmp_path, z, is_refused):
+def test_read_points_refuses_points_outside_all_images(tmp_path, z, is_refused):
     camera = Camera(np.array([[50.0, 0, 20], [0, 50.0, 15], [0, 0, 1]]), 40, 30)
     # Only the last point can be inside the picture.
     points = [(float(x), 0.0, 2.0, 1, 2, 3) for x in (20, 21, 22)] + [(0.0, 0.0, z, 1, 2, 3)]

@@ -29,12 +29,12 @@ def observations(
     return made
 
 
-def test_still_and_evenly_changing_pictures_are_steady() -> None:
+def test_steadiness_of_still_or_linear_change_is_one() -> None:
     assert steadiness(observations([90] * 5)) == 1
     assert steadiness(observations(range(0, 200, 20))) == 1
 
 
-def test_times_between_frames_count() -> None:
+def test_steadiness_uses_frame_times() -> None:
     # Four seconds to a frame, one to the next: its level is where the time says.
     assert steadiness(observations([0, 80, 100], [0.0, 4.0, 5.0])) == 1
     assert steadiness(observations([0, 80, 100])) < 0.05
@@ -42,12 +42,12 @@ def test_times_between_frames_count() -> None:
 
 
 @pytest.mark.parametrize("off", [10, 20, 60])
-def test_it_falls_with_the_squared_difference(off: int) -> None:
+def test_steadiness_falls_with_squared_difference(off: int) -> None:
     levels = [100, 100 + off, 100]
     assert steadiness(observations(levels)) == pytest.approx(1.5 * NOISE_LEVELS**2 / off**2)
 
 
-def test_noise_alone_is_borne() -> None:
+def test_steadiness_tolerates_noise() -> None:
     random = np.random.default_rng(0)
     noisy = [
         Frame(n, n * 10**8, np.clip(random.normal(120, NOISE_LEVELS, (HEIGHT, WIDTH, 3)), 0, 255).astype(np.uint8))
@@ -56,7 +56,7 @@ def test_noise_alone_is_borne() -> None:
     assert steadiness([Observation.of(frame, CAMERA) for frame in noisy]) > 0.95
 
 
-def test_only_tissue_counts() -> None:
+def test_steadiness_ignores_masked_pixels() -> None:
     mask = np.ones((HEIGHT, WIDTH), np.uint8)
     mask[:, :12] = 0
     made = observations([50] * 4, mask=mask)
@@ -67,11 +67,11 @@ def test_only_tissue_counts() -> None:
     assert steadiness(hidden) == 1
 
 
-def test_fewer_than_three_frames_say_nothing() -> None:
+def test_steadiness_of_fewer_than_three_frames_is_one() -> None:
     assert steadiness(observations([0])) == 1
     assert steadiness(observations([0, 255])) == 1
 
 
-def test_a_long_recording_is_looked_at_all_along() -> None:
+def test_steadiness_samples_whole_recording() -> None:
     late = [100] * (5 * MOST_FRAMES) + [100, 200] * (5 * MOST_FRAMES)
     assert steadiness(observations(late)) < 0.05

@@ -40,7 +40,7 @@ def make_step(make_frame, camera):
 
 
 @pytest.mark.parametrize("field", ["basis", "hexplane"])
-def test_steps_lower_the_loss_and_report_the_one_before_the_update(make_step, make_frame, camera, field):
+def test_training_step_lowers_loss_and_returns_loss_before_update(make_step, make_frame, camera, field):
     step = make_step(field)
     seen = Observation.of(make_frame(4, shift_px=1), camera)
     expected = loss_and_gradients(step.at(seen.time_s), seen, LossWeights()).loss
@@ -50,7 +50,7 @@ def test_steps_lower_the_loss_and_report_the_one_before_the_update(make_step, ma
 
 
 @pytest.mark.parametrize("field", ["basis", "hexplane"])
-def test_no_rate_changes_nothing(make_step, make_frame, camera, field):
+def test_training_step_with_zero_rates_changes_nothing(make_step, make_frame, camera, field):
     step = make_step(field, rates=still(field))
     gaussians, module = step.copy()
     step(Observation.of(make_frame(4, shift_px=2), camera))
@@ -62,7 +62,7 @@ def test_no_rate_changes_nothing(make_step, make_frame, camera, field):
 
 
 @pytest.mark.parametrize("field", ["basis", "hexplane"])
-def test_the_field_alone_learns_when_the_gaussians_stand_still(make_step, make_frame, camera, field):
+def test_training_step_trains_field_with_fixed_gaussians(make_step, make_frame, camera, field):
     learning = {"basis": {"means_px": 0.1, "sh": 1e-2}, "hexplane": {"parameters": 5e-3}}
     step = make_step(field, rates=still(field, **learning[field]))
     before = step.gaussians.clone()
@@ -78,7 +78,7 @@ def test_the_field_alone_learns_when_the_gaussians_stand_still(make_step, make_f
         assert torch.equal(tensor, step.gaussians.tensors()[name])
 
 
-def test_rates_scale(make_step, make_frame, camera):
+def test_training_step_scales_rates(make_step, make_frame, camera):
     seen = Observation.of(make_frame(4, shift_px=2), camera)
     moves = []
     for scale in (1.0, 0.25):
@@ -92,7 +92,7 @@ def test_rates_scale(make_step, make_frame, camera):
 
 
 @pytest.mark.parametrize("field", ["basis", "hexplane"])
-def test_gaussians_that_join_are_trained_with_the_rest(make_step, make_frame, camera, field):
+def test_appended_gaussians_are_trained(make_step, make_frame, camera, field):
     step = make_step(field)
     seen = Observation.of(make_frame(4, shift_px=1), camera)
     step(seen)
@@ -106,7 +106,7 @@ def test_gaussians_that_join_are_trained_with_the_rest(make_step, make_frame, ca
     assert bool((step.gaussians.means[-5:] != before).any())
 
 
-def test_gaussians_that_join_start_still(make_step, make_frame, camera):
+def test_appended_gaussians_start_without_motion(make_step, make_frame, camera):
     step = make_step()
     seen = Observation.of(make_frame(4, shift_px=2), camera)
     for _ in range(5):
@@ -118,7 +118,7 @@ def test_gaussians_that_join_start_still(make_step, make_frame, camera):
 
 
 @pytest.mark.parametrize("field", ["basis", "hexplane"])
-def test_a_copy_does_not_follow_the_training(make_step, make_frame, camera, field):
+def test_step_copy_is_unchanged_by_training(make_step, make_frame, camera, field):
     step = make_step(field)
     gaussians, module = step.copy()
     means, state = gaussians.means.clone(), {name: tensor.clone() for name, tensor in module.state_dict().items()}
@@ -130,7 +130,7 @@ def test_a_copy_does_not_follow_the_training(make_step, make_frame, camera, fiel
 
 
 @pytest.mark.parametrize("field", ["basis", "hexplane"])
-def test_a_gaussian_that_is_not_finite_does_not_stop_the_others(make_step, make_frame, camera, field):
+def test_non_finite_gaussian_does_not_stop_training_of_others(make_step, make_frame, camera, field):
     step = make_step(field)
     step.gaussians.means[7] = float("nan")
     step.gaussians.sh[9] = float("inf")
@@ -145,7 +145,7 @@ def test_a_gaussian_that_is_not_finite_does_not_stop_the_others(make_step, make_
 
 
 @pytest.mark.parametrize("field", ["basis", "hexplane"])
-def test_a_frame_that_is_all_tool_teaches_nothing(make_step, make_frame, camera, field):
+def test_training_step_on_all_tool_frame_changes_nothing(make_step, make_frame, camera, field):
     step = make_step(field)
     before = step.gaussians.clone()
     assert step(Observation.of(make_frame(mask=np.zeros((40, 48), np.uint8)), camera)) == 0
@@ -153,7 +153,7 @@ def test_a_frame_that_is_all_tool_teaches_nothing(make_step, make_frame, camera,
         assert torch.equal(tensor, step.gaussians.tensors()[name])
 
 
-def test_corrected_colours_change_at_the_time_of_the_frame(make_step, make_frame, camera):
+def test_colour_relaxation_changes_colours_at_frame_time(make_step, make_frame, camera):
     step = make_step(rates=still("basis"), squared_error=True)
     canonical, far = step.gaussians.clone(), step.at(1.0)
     dark = make_frame(4)
@@ -169,7 +169,7 @@ def test_corrected_colours_change_at_the_time_of_the_frame(make_step, make_frame
     assert (later.sh - far.sh).abs().max() < 0.05 * (at_once.sh - canonical.sh).abs().max()
 
 
-def test_colours_of_all_times_are_corrected_in_a_field_without_temporal_colours(make_step, make_frame, camera):
+def test_colour_relaxation_changes_canonical_colours_of_hexplane(make_step, make_frame, camera):
     step = make_step("hexplane", rates=still("hexplane"), squared_error=True)
     canonical = step.gaussians.clone()
     dark = make_frame(4)
@@ -183,14 +183,14 @@ def test_colours_of_all_times_are_corrected_in_a_field_without_temporal_colours(
     assert torch.equal(step.at(1.0).sh, step.gaussians.sh)
 
 
-def test_correcting_a_frame_that_is_all_tool_changes_nothing(make_step, make_frame, camera):
+def test_colour_relaxation_on_all_tool_frame_changes_nothing(make_step, make_frame, camera):
     step = make_step(squared_error=True)
     before = step.at(0.2)
     step(Observation.of(make_frame(6, mask=np.zeros((40, 48), np.uint8)), camera), colour_relaxation=1.5)
     assert torch.equal(step.at(0.2).sh, before.sh)
 
 
-def test_correcting_leaves_a_gaussian_alone_that_is_not_finite(make_step, make_frame, camera):
+def test_colour_relaxation_tolerates_non_finite_gaussians(make_step, make_frame, camera):
     step = make_step(squared_error=True)
     step.gaussians.means[7] = float("nan")
     step.gaussians.sh[9] = float("inf")

@@ -47,7 +47,9 @@ def fitted(frames: list[Frame], steps: int = 60) -> Reconstructor:
     "count, wrong_in",
     [(2, (1,)), (3, (0,)), (3, (1,)), (5, (4,)), (5, (1, 3)), (8, (0,)), (8, (2, 5, 7))],
 )
-def test_nothing_comes_before_the_camera_at_any_time(count: int, wrong_in: tuple[int, ...], factor: float) -> None:
+def test_still_pair_with_wrong_depth_keeps_gaussians_in_depth_range(
+    count: int, wrong_in: tuple[int, ...], factor: float
+) -> None:
     frames = still_frames(count, wrong_in, factor)
     model = fitted(frames).snapshot()
     farthest_mm = 64.0 * max(factor, 1.0)
@@ -59,7 +61,7 @@ def test_nothing_comes_before_the_camera_at_any_time(count: int, wrong_in: tuple
 
 
 @pytest.mark.slow
-def test_between_its_frames_a_still_pair_looks_as_in_them() -> None:
+def test_still_pair_looks_same_between_frames() -> None:
     """Depth of one frame of seven is wrong; the frame that was held out, and all times between, show the same picture."""
     frames = still_frames(8, (3,), 0.25)
     held_out = frames.pop(1)
@@ -73,7 +75,7 @@ def test_between_its_frames_a_still_pair_looks_as_in_them() -> None:
 
 
 @pytest.mark.slow
-def test_a_pair_that_moves_in_one_frame_alone_stays_before_the_camera() -> None:
+def test_pair_moving_in_one_frame_keeps_gaussians_in_depth_range() -> None:
     frames = [stereo_frame(seq, with_depth=True) for seq in range(6)]
     moved = frames[3]
     frames[3] = moved.with_fields(
@@ -90,7 +92,7 @@ def test_a_pair_that_moves_in_one_frame_alone_stays_before_the_camera() -> None:
 TIMES = torch.arange(16.0) / 30
 
 
-def test_a_smooth_motion_is_kept() -> None:
+def test_steady_course_keeps_smooth_motion() -> None:
     course = 60 + 5 * torch.sin(2 * torch.pi * 1.5 * TIMES)[None]
     kept = steady_course(course, TIMES)
     torch.testing.assert_close(kept, course, rtol=0, atol=0.2)
@@ -106,12 +108,12 @@ def test_a_smooth_motion_is_kept() -> None:
         [50.0],
     ],
 )
-def test_changes_that_are_noise_are_none(course: list[float]) -> None:
+def test_steady_course_replaces_noise_by_median(course: list[float]) -> None:
     kept = steady_course(torch.tensor([course]), TIMES[: len(course)])
     torch.testing.assert_close(kept, torch.full_like(kept, float(torch.tensor(course).median())))
 
 
-def test_no_course_leaves_the_range_of_what_was_measured() -> None:
+def test_steady_course_stays_within_measured_range() -> None:
     random = torch.Generator().manual_seed(3)
     courses = torch.rand(200, 9, generator=random) ** 6 * 1000 + 1
     times = torch.rand(9, generator=random).cumsum(0)
@@ -121,7 +123,7 @@ def test_no_course_leaves_the_range_of_what_was_measured() -> None:
 
 
 @pytest.mark.parametrize("times_s", [(0.0, 0.07, 0.1, 0.13, 0.17, 0.2, 0.23), (0.0, 0.23), (0.1,), (0.0, 0.02, 0.23)])
-def test_what_a_field_follows_is_bounded_between_and_beyond_the_frames(times_s: tuple[float, ...]) -> None:
+def test_basis_field_follow_is_bounded_between_and_beyond_frames(times_s: tuple[float, ...]) -> None:
     random = torch.Generator().manual_seed(5)
     field = BasisField(50, (0.0, 0.23), bumps=8)
     offsets = torch.rand(50, len(times_s), 3, generator=random) ** 8 * 2000
@@ -134,7 +136,7 @@ def test_what_a_field_follows_is_bounded_between_and_beyond_the_frames(times_s: 
         assert (added >= torch.minimum(low, torch.zeros_like(low)) - beyond).all()
 
 
-def test_a_field_still_follows_a_smooth_course() -> None:
+def test_basis_field_follow_fits_smooth_course() -> None:
     field, times_s = BasisField(1, (0.0, 1.0), bumps=23), np.linspace(0, 1, 31)
     offsets = torch.from_numpy(4 * np.sin(2 * np.pi * 1.5 * times_s)).float()[None, :, None].repeat(1, 1, 3)
     field.follow(slice(0, 1), times_s.tolist(), offsets)

@@ -49,7 +49,7 @@ def picture(params, **options):
 
 
 @pytest.mark.parametrize("opacity", [0.005, 0.3, 0.9, 0.9999])
-def test_relocation_is_the_published_sum(opacity):
+def test_compute_relocation_equals_published_sum(opacity):
     getcontext().prec = 60
     counts = [1, 2, 3, 7, 20, 51]
     o = torch.full((len(counts),), opacity, dtype=torch.float64)
@@ -65,7 +65,7 @@ def test_relocation_is_the_published_sum(opacity):
         assert (sized[row] / scales[row]).tolist() == pytest.approx([float(Decimal(opacity) / total)] * 3, rel=1e-9)
 
 
-def test_relocation_clamps_ratios_and_keeps_the_shape_of_the_opacities():
+def test_compute_relocation_clamps_ratios_and_keeps_shape():
     o, s = torch.tensor([[0.5], [0.5], [0.0]]), torch.ones(3, 3)
     found, sized = compute_relocation(o, s, torch.tensor([0, 1000, 4]), binomials())
     expected, _ = compute_relocation(o[:2, 0], s[:2], torch.tensor([1, MOST_COPIES]), binomials())
@@ -75,7 +75,7 @@ def test_relocation_clamps_ratios_and_keeps_the_shape_of_the_opacities():
         compute_relocation(o, s, torch.ones(2), binomials())
 
 
-def test_copies_of_a_wide_splat_keep_its_picture():
+def test_sample_add_copies_keep_picture():
     params, optimizers = scene(1, frozen=False)
     with torch.no_grad():
         params["means"].copy_(torch.tensor([[0.0, 0, 4]]))
@@ -88,7 +88,7 @@ def test_copies_of_a_wide_splat_keep_its_picture():
     assert (after - before).abs().max() < 0.1 * before.max()
 
 
-def test_duplicate_split_and_remove_carry_rows_moments_and_statistics():
+def test_duplicate_split_and_remove_keep_moments_and_statistics_aligned():
     params, optimizers = scene()
     state = {"count": torch.arange(float(COUNT)), "scene_scale": 1.0}
     mask = torch.zeros(COUNT, dtype=torch.bool)
@@ -116,7 +116,7 @@ def test_duplicate_split_and_remove_carry_rows_moments_and_statistics():
     assert all(p.isfinite().all() for p in params.values())
 
 
-def test_samples_of_a_split_have_the_gaussians_covariance():
+def test_split_samples_have_covariance_of_gaussian():
     params, optimizers = scene(1, frozen=False)
     with torch.no_grad():
         params["quats"].copy_(torch.tensor([[0.9, 0.3, -0.2, 0.1]]))
@@ -130,7 +130,7 @@ def test_samples_of_a_split_have_the_gaussians_covariance():
     torch.testing.assert_close(params["means"].detach().T.cov(), expected.detach(), atol=0.02, rtol=0)
 
 
-def test_a_reset_limits_opacities_and_forgets_their_moments():
+def test_reset_opa_limits_opacities_and_clears_moments():
     params, optimizers = scene()
     before = params["opacities"].detach().sigmoid()
     ops.reset_opa(params, optimizers, {}, 0.4)
@@ -138,7 +138,7 @@ def test_a_reset_limits_opacities_and_forgets_their_moments():
     assert not moments(params, optimizers, "opacities").any() and moments(params, optimizers, "means").any()
 
 
-def test_relocation_moves_the_dead_and_shares_their_new_places():
+def test_relocate_moves_dead_gaussians_and_shares_opacity():
     params, optimizers = scene()
     with torch.no_grad():
         params["opacities"][:] = -8.0
@@ -151,7 +151,7 @@ def test_relocation_moves_the_dead_and_shares_their_new_places():
     assert together.item() == pytest.approx(torch.tensor(1.0).sigmoid().item(), rel=1e-5)
 
 
-def test_noise_follows_covariances_and_spares_visible_gaussians():
+def test_inject_noise_follows_covariance_and_spares_opaque_gaussians():
     params, optimizers = scene(2, frozen=False)
     with torch.no_grad():
         params["opacities"][:] = torch.tensor([-9.0, 3.0])
@@ -164,7 +164,7 @@ def test_noise_follows_covariances_and_spares_visible_gaussians():
 
 
 @pytest.mark.parametrize("absgrad", [False, True])
-def test_adc_multiplies_by_gradients_in_the_picture(absgrad):
+def test_adc_grows_by_screen_gradients(absgrad):
     params, optimizers = scene()
     strategy = DefaultStrategy(absgrad=absgrad, refine_start_iter=0, refine_every=2, prune_opa=0.0, grow_scale3d=0.08)
     strategy.check_sanity(params, optimizers)
@@ -215,7 +215,7 @@ def test_adc_counts_packed_splats_as_dense_ones():
 
 @pytest.mark.parametrize("stated", [False, True])
 @pytest.mark.parametrize("rendered", [{"packed": True}, {"packed": False}, {"packed": True, "with_ut": True}])
-def test_adc_finds_out_from_the_render_information_whether_rows_are_packed(stated, rendered):
+def test_adc_detects_packed_rows_from_render_info(stated, rendered):
     params, optimizers = scene()
     strategy = DefaultStrategy(refine_scale2d_stop_iter=10)
     state = strategy.initialize_state()
@@ -228,7 +228,7 @@ def test_adc_finds_out_from_the_render_information_whether_rows_are_packed(state
     assert state["grad2d"].any() and not state["grad2d"][state["count"] == 0].any()
 
 
-def test_adc_says_why_there_is_no_gradient():
+def test_adc_error_states_reason_of_missing_gradient():
     params, optimizers = scene()
 
     def train(strategy, **options):
@@ -342,7 +342,7 @@ def test_adc_refines_in_one_pass_as_its_row_operations_do(optimizer, options, co
         assert torch.equal(found[name], value) if isinstance(value, torch.Tensor) else found[name] == value
 
 
-def test_adc_replaces_every_tensor_once_unless_a_program_replaces_a_part(monkeypatch):
+def test_adc_replaces_tensors_once_unless_subclass_overrides_part(monkeypatch):
     replaced, calls = [], []
     own = ops.update_rows
     monkeypatch.setattr(ops, "update_rows", lambda *args: (replaced.append(1), own(*args)))
@@ -363,7 +363,7 @@ def test_adc_replaces_every_tensor_once_unless_a_program_replaces_a_part(monkeyp
     assert len(refined(strategy)["means"]) < 300 and calls == [40, 40]
 
 
-def test_adc_removes_transparent_and_after_the_first_reset_oversized_gaussians():
+def test_adc_prunes_transparent_and_oversized_gaussians():
     params, optimizers = scene()
     with torch.no_grad():
         params["opacities"][:] = 0.0
@@ -380,7 +380,7 @@ def test_adc_removes_transparent_and_after_the_first_reset_oversized_gaussians()
         assert gone == ({4} if step == 2 else {4, 9})
 
 
-def test_mcmc_grows_to_the_cap_and_the_same_seed_gives_the_same_gaussians():
+def test_mcmc_grows_to_cap_and_is_deterministic():
     ends = []
     for _ in range(2):
         params, optimizers = scene()
@@ -405,7 +405,7 @@ def test_mcmc_refuses_a_scene_without_live_gaussians():
         strategy.step_post_backward(params, optimizers, strategy.initialize_state(), 1, {}, lr=1e-3)
 
 
-def test_mcmc_moves_a_gaussian_whose_opacity_is_not_a_number():
+def test_mcmc_relocates_gaussian_with_nan_opacity():
     params, optimizers = scene()
     with torch.no_grad():
         params["opacities"][3] = float("nan")
@@ -419,7 +419,7 @@ def test_mcmc_moves_a_gaussian_whose_opacity_is_not_a_number():
     "mask", [torch.ones(COUNT, dtype=torch.uint8), torch.tensor([1, 2, 3]), torch.zeros(COUNT - 1, dtype=torch.bool)]
 )
 @pytest.mark.parametrize("operation", [ops.duplicate, ops.split, ops.remove, ops.relocate])
-def test_a_mask_that_is_no_bool_for_each_gaussian_changes_nothing(operation, mask):
+def test_strategy_operations_refuse_invalid_mask(operation, mask):
     params, optimizers = scene()
     before = {name: tensor.detach().clone() for name, tensor in params.items()}
     further = (binomials(),) if operation is ops.relocate else ()
@@ -428,7 +428,7 @@ def test_a_mask_that_is_no_bool_for_each_gaussian_changes_nothing(operation, mas
     assert all(torch.equal(params[name], before[name]) for name in before)
 
 
-def test_values_without_rows_stay_when_rows_change():
+def test_duplicate_keeps_state_values_without_rows():
     params, _ = scene(frozen=False)
     optimizers = {name: torch.optim.NAdam([p], lr=1e-3) for name, p in params.items()}
     for name, optimizer in optimizers.items():
@@ -441,7 +441,7 @@ def test_values_without_rows_stay_when_rows_change():
     assert kept["mu_product"].dim() == 0 and len(kept["exp_avg"]) == COUNT + 5
 
 
-def test_parameters_that_do_not_fit_are_refused():
+def test_strategies_refuse_inconsistent_parameters():
     params, optimizers = scene()
     with pytest.raises(AssertionError, match="one optimizer of the same name"):
         Strategy().check_sanity(params, {name: o for name, o in optimizers.items() if name != "quats"})
@@ -456,7 +456,7 @@ def test_parameters_that_do_not_fit_are_refused():
         DefaultStrategy().step_pre_backward(params, optimizers, {}, 0, {})
 
 
-def test_fields_are_gsplats_by_position_and_ours_by_name():
+def test_strategy_positional_parameters_equal_gsplat():
     positional = lambda kind: [
         f"{p.name}={p.default}" for p in inspect.signature(kind).parameters.values() if p.kind is not p.KEYWORD_ONLY
     ]

@@ -47,13 +47,13 @@ def compared(kind, scene: Gaussians, seen: Observation) -> torch.Tensor:
 
 @pytest.mark.parametrize("size", [SMALL, LARGE])
 @pytest.mark.parametrize("tilt_deg", [0.0, 30.0])
-def test_an_exact_wall_has_no_loss(size, tilt_deg):
+def test_surface_losses_of_exact_wall_are_zero(size, tilt_deg):
     scene = wall(tilt_deg)
     assert float(compared(RayDepth, scene, observation(size, tilt_deg))) < 5e-4
     assert float(compared(NormalConsistency, scene, observation(size, tilt_deg))) < 2e-3
 
 
-def test_a_displaced_wall_has_the_relative_difference_and_is_moved_back():
+def test_ray_depth_loss_of_displaced_wall_moves_wall_back():
     scene = wall(0.0, 44.0).requires_grad_()
     loss = compared(RayDepth, scene, observation(SMALL))
     loss.backward()
@@ -64,7 +64,7 @@ def test_a_displaced_wall_has_the_relative_difference_and_is_moved_back():
     assert float(compared(RayDepth, moved, observation(SMALL))) < float(loss)
 
 
-def test_turned_splats_are_turned_back():
+def test_normal_consistency_loss_turns_splats_back():
     scene = wall(0.0)
     turn = torch.tensor([math.cos(0.2), math.sin(0.2), 0.0, 0.0]).repeat(scene.count, 1)
     scene = replace(scene, quats=turn)
@@ -80,7 +80,7 @@ def test_turned_splats_are_turned_back():
     assert float(loss) < 0.4 * before
 
 
-def test_tools_and_unknown_depth_are_not_compared():
+def test_surface_losses_ignore_tools_and_unknown_depth():
     scene = wall(0.0, 44.0)
     seen = observation(SMALL)
     masked = replace(seen, mask=torch.zeros_like(seen.mask))
@@ -89,7 +89,7 @@ def test_tools_and_unknown_depth_are_not_compared():
     assert float(compared(RayDepth, scene, replace(seen, depth=torch.zeros_like(seen.depth)))) == 0
 
 
-def test_without_depth_only_losses_that_need_none_are_compared():
+def test_weighted_losses_without_depth_skip_depth_losses():
     scene, seen = wall(30.0), replace(observation(SMALL), depth=None)
     context = LossContext((), lambda _: scene)
     assert WeightedLosses({"ray_depth": 1.0})(scene, seen, context) is None
@@ -97,7 +97,7 @@ def test_without_depth_only_losses_that_need_none_are_compared():
     torch.testing.assert_close(both, EVERY * 0.5 * compared(NormalConsistency, scene, seen))
 
 
-def test_one_of_a_few_steps_compares_rays_and_counts_for_all():
+def test_weighted_losses_compare_rays_every_few_steps():
     losses, scene, seen = WeightedLosses({"ray_depth": 2.0}), wall(0.0, 44.0), observation(SMALL)
     values = [losses(scene, seen, LossContext((), lambda _: scene)) for _ in range(2 * EVERY)]
     assert [value is not None for value in values] == 2 * [True, *[False] * (EVERY - 1)]
@@ -105,7 +105,7 @@ def test_one_of_a_few_steps_compares_rays_and_counts_for_all():
 
 
 @pytest.mark.parametrize("size", [SMALL, LARGE])
-def test_lists_of_a_fixed_length_give_the_same_rays_and_gradients(size):
+def test_compared_rays_with_fixed_capacity_are_identical(size):
     """Tile lists of a captured step: equal values, and the required length."""
     seen = observation(size, 30.0)
     results = []
@@ -126,7 +126,7 @@ def test_lists_of_a_fixed_length_give_the_same_rays_and_gradients(size):
     assert torch.equal(needed_again, needed)
 
 
-def test_large_pictures_are_compared_at_half_size():
+def test_surface_losses_compare_large_pictures_at_half_size():
     seen = observation(LARGE, 30.0)
     rays = rays_of(wall(30.0), seen)
     assert rays.alphas.shape == (LARGE[1] // 2, LARGE[0] // 2)

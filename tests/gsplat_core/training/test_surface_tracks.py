@@ -62,7 +62,7 @@ def seen_throughout(recording, points: torch.Tensor) -> torch.Tensor:
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [0, 5, FRAMES - 1])
 @pytest.mark.parametrize("camera", ["fixed", "moving"])
-def test_points_go_where_the_tissue_goes(request, camera, number):
+def test_surface_tracks_follow_true_tissue_points(request, camera, number):
     recording, true = request.getfixturevalue(camera), points_of(ASKED if camera == "fixed" else MOVING)
     chosen = seen_throughout(recording, true)
     assert chosen.sum() > 12
@@ -73,7 +73,7 @@ def test_points_go_where_the_tissue_goes(request, camera, number):
     assert off.median() < 0.25 and off.quantile(0.9) < 0.8
 
 
-def test_behind_a_tool_tissue_goes_with_what_is_around_it(fixed):
+def test_surface_tracks_behind_tool_follow_surroundings(fixed):
     frames, true = list(fixed), points_of(ASKED)
     chosen = seen_throughout(fixed, true)
     # A tool that covers everything but the edges for half of the time.
@@ -104,7 +104,7 @@ def covered(mask: np.ndarray) -> np.ndarray:
     ],
     ids=["none", "light", "learned", "not believed"],
 )
-def test_without_depth_of_a_surface_points_move_across_the_picture_only(fixed, fields):
+def test_surface_tracks_without_depth_move_across_picture_only(fixed, fields):
     frames = [frame.with_fields(**fields) for frame in fixed]
     points = torch.tensor([[0.0, 0.0, 60.0], [10.0, -8.0, 60.0]])
     moved = SurfaceTracks(frames, [Observation.of(frame, fixed.camera) for frame in frames]).trajectories(points, 0)
@@ -112,11 +112,11 @@ def test_without_depth_of_a_surface_points_move_across_the_picture_only(fixed, f
     assert moves_before_the_first_step(fixed.camera, frames)
 
 
-def test_one_frame_tells_no_motion(fixed):
+def test_single_frame_gives_no_initial_motion(fixed):
     assert not moves_before_the_first_step(fixed.camera, list(fixed)[:1])
 
 
-def test_frames_with_depth_tell_the_motion_before_the_first_step(fixed):
+def test_frames_with_depth_give_initial_motion(fixed):
     assert moves_before_the_first_step(fixed.camera, list(fixed))
 
 
@@ -129,7 +129,7 @@ def moves_before_the_first_step(camera, frames: list[Frame], **shows) -> bool:
     return bool(field.weights.any())
 
 
-def test_between_what_is_known():
+def test_between_known_interpolates_known_values():
     values = torch.tensor([[0.0, 2, 0, 0, 8, 0], [0, 0, 0, 0, 0, 0], [5, 0, 0, 0, 0, 0]])
     otherwise = torch.full_like(values, 3.0)
     times = torch.tensor([0.0, 1, 2, 3, 4, 5])
@@ -138,7 +138,7 @@ def test_between_what_is_known():
 
 
 @pytest.mark.slow
-def test_a_model_has_the_motion_along_the_line_of_sight_after_few_steps(fixed):
+def test_offline_model_has_motion_along_line_of_sight_after_few_steps(fixed):
     """Steps alone would not learn this motion, since positions move by hundredths of a pixel in a step."""
     config = replace(ReconstructorConfig.offline(), gaussians=1500, max_gaussians=2000)
     learner = Reconstructor(config, fixed.camera)
@@ -158,7 +158,7 @@ def error_of(depth: np.ndarray, frame: Frame, where: np.ndarray) -> float:
     return float(np.sqrt(np.square(depth - frame.depth)[where].mean()))
 
 
-def test_depth_that_is_uncertain_from_frame_to_frame_does_not_move_tissue_at_rest(moving):
+def test_surface_tracks_at_rest_ignore_fluctuating_depth(moving):
     factors = torch.linspace(0.7, 1.4, FRAMES).tolist()
     uncertain = [frame.with_fields(depth=frame.depth * factors[frame.seq]) for frame in moving]
     seen = [Observation.of(frame, moving.camera) for frame in uncertain]
@@ -173,7 +173,7 @@ def test_depth_that_is_uncertain_from_frame_to_frame_does_not_move_tissue_at_res
     )
 
 
-def test_a_course_is_shrunk_by_the_share_of_noise_of_its_uneven_samples():
+def test_steady_course_equals_wiener_filter_reference():
     """Compared with a scalar computation in float64 of a Wiener filter towards the median."""
     times = torch.tensor([0.0, 1.0, 1.5, 4.0, 5.0, 9.0, 9.5], dtype=torch.float64)
     random = torch.Generator().manual_seed(0)
@@ -191,7 +191,7 @@ def test_a_course_is_shrunk_by_the_share_of_noise_of_its_uneven_samples():
         assert out == pytest.approx([middle + kept * (value - middle) for value in row])
 
 
-def test_depth_is_read_between_pixels_and_not_beside_a_hole():
+def test_surface_depth_interpolates_except_beside_holes():
     depth = np.tile(np.linspace(40, 60, 21, dtype=np.float32), (15, 1))
     depth[7, 10] = 0
     found = SurfaceDepth.of(depth, torch.device("cpu"))

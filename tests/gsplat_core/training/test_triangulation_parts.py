@@ -38,7 +38,7 @@ def seen(angle_deg: float, seq: int = 0, shape: tuple[int, int] = (90, 120)):
     )
 
 
-def test_views_are_1_5_to_15_degrees_apart_and_of_one_size():
+def test_chosen_views_are_1_5_to_15_degrees_apart():
     angles = [1.45, 1.55, 14.9, 15.1, 0.0]
     others = [seen(angle, seq) for seq, angle in enumerate(angles)]
     others.append(seen(5.0, 5, (45, 60)))
@@ -47,14 +47,14 @@ def test_views_are_1_5_to_15_degrees_apart_and_of_one_size():
     assert [one.seq for one in chosen_views(seen(0.0), others, 20.0)] == [0, 1], "twice the angle at half the distance"
 
 
-def test_eight_views_evenly_spaced_in_angle_are_chosen():
+def test_chosen_views_are_eight_evenly_spaced():
     others = [seen(2 + 0.5 * number, number) for number in (5, 3, 8, 1, 0, 14, 9, 2, 12, 4, 6, 7, 13, 11, 10)]
     assert [one.seq for one in chosen_views(seen(0.0), others, 40.0)] == [0, 2, 4, 6, 8, 10, 12, 14]
     assert len(chosen_views(seen(0.0), others[:8], 40.0)) == 8
 
 
 @pytest.mark.parametrize("off", [0.0, 0.005, 0.02, 0.5])
-def test_the_loss_is_robust_beyond_one_per_cent_of_the_depth_with_a_quarter_of_a_logarithm(off):
+def test_consensus_loss_value_is_robust_beyond_one_percent(off):
     depth = torch.full((90, 120), 50.0)
     pixels = torch.tensor([[60.0, 45.0], [80.0, 25.0]])
     z = 50.0 / (1 + off)
@@ -75,7 +75,7 @@ def matched(cameras, points: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("angle_deg", "reliable"), [(1.45, False), (1.55, True)])
-def test_two_other_views_must_be_1_5_degrees_apart(angle_deg, reliable):
+def test_triangulate_requires_views_1_5_degrees_apart(angle_deg, reliable):
     far = 40 * np.tan(np.radians(angle_deg))
     cameras = [at(), at(3.0), at(0.0, far)]
     points, found = triangulate(matched(cameras, np.array([[0.0, 0, 40]])), cameras)
@@ -84,7 +84,7 @@ def test_two_other_views_must_be_1_5_degrees_apart(angle_deg, reliable):
 
 
 @pytest.mark.parametrize(("off_px", "reliable"), [(1.7, True), (1.8, False)])
-def test_points_are_within_a_pixel_of_their_matches(off_px, reliable):
+def test_triangulate_reliability_requires_reprojection_within_one_pixel(off_px, reliable):
     """Matches are off up and down. The distance of the middle of all views to them is 0.566 of the error."""
     cameras = [at(-3.0), at(-1.0), at(1.0), at(3.0)]
     pixels = matched(cameras, np.array([[0.0, 0, 40]]))
@@ -92,7 +92,7 @@ def test_points_are_within_a_pixel_of_their_matches(off_px, reliable):
     assert triangulate(pixels, cameras)[1].tolist() == [reliable]
 
 
-def test_no_points_are_triangulated_to_none_and_each_view_has_a_camera():
+def test_triangulate_of_no_points_and_wrong_camera_count():
     cameras = [at(-3.0), at(0.0), at(3.0)]
     points, found = triangulate(np.zeros((0, 3, 2)), cameras)
     assert points.shape == (0, 3) and found.shape == (0,)
@@ -102,7 +102,7 @@ def test_no_points_are_triangulated_to_none_and_each_view_has_a_camera():
             triangulate(wrong, given)
 
 
-def test_points_behind_a_view_are_not_reliable():
+def test_triangulate_rejects_points_behind_view():
     cameras = [at(), at(4.0), at(0.0, 4.0), at(0.0, 2.0, 60.0)]
     points = np.array([[1.0, 1, 40], [1, 1, 90]])
     _, reliable = triangulate(matched(cameras, points), cameras)
@@ -111,7 +111,7 @@ def test_points_behind_a_view_are_not_reliable():
     assert reliable.all()
 
 
-def test_pixels_are_compared_every_four(monkeypatch):
+def test_triangulated_samples_every_fourth_pixel(monkeypatch):
     def flow(image, other, mask, of_other):
         return np.full((90, 120, 2), [-5.0 if other[0, 0, 0] < 0.5 else -10.0, 0.0])
 
@@ -127,7 +127,7 @@ def test_pixels_are_compared_every_four(monkeypatch):
     assert triangulated(first, [second]) is None
 
 
-def test_points_of_512_frames_are_kept_and_frames_without_any_are_tried_with_more_views(monkeypatch):
+def test_triangulation_loss_caches_512_frames_and_retries_with_more_views(monkeypatch):
     tried = []
     monkeypatch.setattr(measured_losses, "render_depth", lambda scene, camera: torch.full((4, 4), 40.0))
     monkeypatch.setattr(measured_losses, "consensus_loss", lambda depth, target, camera: target)
@@ -166,14 +166,14 @@ def test_points_of_512_frames_are_kept_and_frames_without_any_are_tried_with_mor
         ("semantics", 1), ("opacity", 0.01), ("scale", 0.01),
     ],
 )  # fmt: skip
-def test_a_loss_without_a_weight_has_its_default_one_which_the_refusal_of_two_names(name, weight):
+def test_default_loss_weight_is_named_in_duplicate_loss_error(name, weight):
     assert loss_weights((name,)) == {name: weight}
     with pytest.raises(InvalidSetting, match=f"twice; name it once, as {name}:{weight}$"):
         loss_weights((name, f"{name}:3"))
 
 
 @pytest.mark.parametrize("sigma_px", [0.8, 1.0, 2.3])
-def test_a_picture_is_blurred_over_three_standard_deviations(sigma_px):
+def test_blurred_kernel_reaches_three_standard_deviations(sigma_px):
     picture = torch.zeros(1, 31, 41)
     picture[0, 15, 20] = 1.0
     found = initialisation._blurred(picture, sigma_px)
@@ -188,7 +188,7 @@ def test_a_picture_is_blurred_over_three_standard_deviations(sigma_px):
     np.testing.assert_allclose(found[0], found[0].flip(0), atol=1e-7)
 
 
-def test_a_match_that_lacks_a_coordinate_is_none():
+def test_triangulate_ignores_match_with_nan_coordinate():
     cameras = [at(), at(3.0), at(-3.0), at(6.0)]
     point = np.array([2.0, 1.0, 40.0])
     pixels = [

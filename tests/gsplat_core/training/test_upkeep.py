@@ -46,7 +46,7 @@ def with_room(most):
     return dataclasses.replace(CONFIG, gaussians=300, max_gaussians=most)
 
 
-def test_a_rotation_of_length_one_turns_as_the_longer_one_did_at_all_times(make_frame, camera):
+def test_shorten_rotations_keeps_picture_at_all_times(make_frame, camera):
     step, _ = trained(make_frame, camera)
     step.gaussians.quats.mul_(torch.linspace(0.5, 4, step.gaussians.count)[:, None])
     times = [0.0, 0.1, 0.17]
@@ -57,7 +57,7 @@ def test_a_rotation_of_length_one_turns_as_the_longer_one_did_at_all_times(make_
         torch.testing.assert_close(render(step.at(time_s), camera).image, image, atol=2e-5, rtol=0)
 
 
-def test_a_field_that_cannot_follow_keeps_its_rotations(make_frame, camera):
+def test_shorten_rotations_is_skipped_for_hexplane(make_frame, camera):
     config = dataclasses.replace(CONFIG, field="hexplane", history_s=None)
     made = Reconstructor(config, camera, live=LiveTraining())
     made.observe(make_frame(0), budget=Budget.of_steps(2))
@@ -66,7 +66,7 @@ def test_a_field_that_cannot_follow_keeps_its_rotations(make_frame, camera):
     assert float(made._step.gaussians.quats.norm(dim=1).min()) > 2
 
 
-def test_only_what_the_picture_shows_falls_back_to_usual_values(make_frame, camera):
+def test_upkeep_relaxes_only_visible_gaussians(make_frame, camera):
     mask = np.ones((40, 48), np.uint8)
     mask[:, 24:] = 0
     step, observation = trained(make_frame, camera, mask=mask)
@@ -85,7 +85,7 @@ def test_only_what_the_picture_shows_falls_back_to_usual_values(make_frame, came
 
 
 @pytest.mark.parametrize("every", [128, 400])
-def test_what_is_not_held_by_training_falls_to_a_third_within_3600_steps(make_frame, camera, every):
+def test_upkeep_relaxation_time_is_3600_steps(make_frame, camera, every):
     """The pace is one per step, however often the scene is looked after."""
     step, observation = trained(make_frame, camera)
     scene = step.gaussians
@@ -109,7 +109,7 @@ def test_what_is_not_held_by_training_falls_to_a_third_within_3600_steps(make_fr
     assert bool((scene.logit_opacities[~seen.shown] == 3).all())
 
 
-def test_needles_and_sheets_are_no_thinner_and_wider_than_a_picture_shows(make_frame, camera):
+def test_upkeep_limits_scale_of_needles_and_sheets(make_frame, camera):
     step, observation = trained(make_frame, camera)
     step.gaussians.log_scales[:20, 0] = -20
     step.gaussians.log_scales[20:40, 1] = 20
@@ -119,7 +119,7 @@ def test_needles_and_sheets_are_no_thinner_and_wider_than_a_picture_shows(make_f
     assert float(step.gaussians.log_scales.max()) < math.log(10 * SPACING_PX * pixel)
 
 
-def test_idle_gaussians_leave_where_others_hide_beside_them_or_nobody_will_see_them(make_frame, camera):
+def test_upkeep_removes_idle_duplicate_and_unreachable_gaussians(make_frame, camera):
     step, observation = trained(make_frame, camera)
     moments = step._adam.second_moments["logit_opacities"]
     moments[: step.gaussians.count] = 1.0
@@ -141,7 +141,7 @@ def test_idle_gaussians_leave_where_others_hide_beside_them_or_nobody_will_see_t
     assert float(step.gaussians.means[:, 0].max()) < 1000
 
 
-def test_tissue_with_too_few_gaussians_gets_halves_of_the_busiest(make_frame, camera):
+def test_upkeep_splits_busiest_gaussians_of_sparse_tissue(make_frame, camera):
     step, observation = trained(make_frame, camera)
     seen = step.at(observation.time_s)
     inside = pixels_of(seen.means, camera)[1]
@@ -166,7 +166,7 @@ def test_tissue_with_too_few_gaussians_gets_halves_of_the_busiest(make_frame, ca
 
 
 @pytest.mark.slow
-def test_a_stream_that_has_gone_on_for_days_learns_what_one_that_begins_learns(make_frame, camera, monkeypatch):
+def test_training_is_identical_after_100_hours_of_stream_time(make_frame, camera, monkeypatch):
     """Bit for bit: 100 hours and all frame times, bump spacings and the history are multiples of 1/32 s, which float64 adds without rounding."""
     monkeypatch.setattr("gsplat_core.training.upkeep.RELAX_EVERY", 16)
     monkeypatch.setattr("gsplat_core.training.upkeep.RENEW_EVERY", 32)
@@ -187,7 +187,7 @@ def test_a_stream_that_has_gone_on_for_days_learns_what_one_that_begins_learns(m
 
 
 @pytest.mark.parametrize("every", [RELAX_EVERY, 3 * RELAX_EVERY])
-def test_within_3600_steps_shown_gaussians_relax_by_1_minus_1_over_e_and_hidden_ones_do_not(make_frame, camera, every):
+def test_relaxation_time_is_3600_steps_for_shown_gaussians_only(make_frame, camera, every):
     """Independent of the interval between rounds. Mutants of the rate and disabled upkeep fail here."""
     mask = np.ones((40, 48), np.uint8)
     mask[:, 24:] = 0
@@ -218,7 +218,7 @@ def test_within_3600_steps_shown_gaussians_relax_by_1_minus_1_over_e_and_hidden_
     assert bool((scene.logit_opacities[hidden] == 3).all()) and bool((scene.sh[hidden] == 0.4).all())
 
 
-def test_between_two_renewals_it_only_relaxes(make_frame, camera):
+def test_upkeep_between_renewals_only_relaxes(make_frame, camera):
     step, observation = trained(make_frame, camera)
     seen = step.at(observation.time_s)
     step.remove(pixels_of(seen.means, camera)[1] & (torch.arange(seen.count) % 3 == 0))
@@ -244,7 +244,7 @@ def spread_of(depth, pixels):
 
 
 @pytest.mark.slow
-def test_depths_come_back_to_a_surface_that_keeps_its_slope_and_its_picture(make_frame, camera):
+def test_upkeep_pulls_depths_to_surface_and_keeps_slope_and_picture(make_frame, camera):
     mask = np.ones((40, 48), np.uint8)
     mask[:, 24:] = 0
     step, observation = trained(make_frame, camera, mask=mask)
@@ -269,7 +269,7 @@ def test_depths_come_back_to_a_surface_that_keeps_its_slope_and_its_picture(make
 
 
 @pytest.mark.parametrize("told_by", ["nothing", "depth", "moved"])
-def test_where_nothing_tells_distances_what_is_shown_keeps_its_own(make_frame, camera, told_by):
+def test_upkeep_restores_distance_only_without_depth_and_camera_motion(make_frame, camera, told_by):
     step, observation = trained(make_frame, camera)
     upkeep, distance = Upkeep(camera, CONFIG), step.distance(camera)
     upkeep._has_moved = told_by == "moved"
@@ -290,7 +290,7 @@ def test_where_nothing_tells_distances_what_is_shown_keeps_its_own(make_frame, c
     assert float((render(step.at(observation.time_s), camera).image - before)[inner].abs().mean()) < 2e-3
 
 
-def test_everything_can_be_done_once_before_it_is_time(make_frame, camera):
+def test_upkeep_once_runs_relaxation_and_renewal(make_frame, camera):
     step, observation = trained(make_frame, camera)
     last_seen = LastSeen(CONFIG.max_gaussians, torch.device("cpu"))
     first, count = step.gaussians.means[0].clone(), step.gaussians.count
@@ -303,7 +303,7 @@ def test_everything_can_be_done_once_before_it_is_time(make_frame, camera):
     assert not torch.equal(step.gaussians.log_scales, sizes)
 
 
-def test_a_scene_is_relaxed_every_128_steps_and_renewed_every_512(make_frame, camera, monkeypatch):
+def test_upkeep_relaxes_every_128_and_renews_every_512_steps(make_frame, camera, monkeypatch):
     step, observation = trained(make_frame, camera)
     done = []
     monkeypatch.setattr(Upkeep, "_relax", lambda *_: done.append("relax"))
@@ -316,7 +316,7 @@ def test_a_scene_is_relaxed_every_128_steps_and_renewed_every_512(make_frame, ca
         assert done == expected
 
 
-def test_a_gaussian_is_no_thinner_than_a_fifth_of_a_pixel_and_no_wider_than_eight_usual_ones(make_frame, camera):
+def test_upkeep_scale_limits_are_fifth_of_pixel_and_eight_usual_sizes(make_frame, camera):
     step, observation = trained(make_frame, camera)
     pixel = step.distance(camera) / float(camera.K[0, 0])
     step.gaussians.log_scales[:, 0], step.gaussians.log_scales[:, 1] = -20.0, 20.0
@@ -329,7 +329,7 @@ def test_a_gaussian_is_no_thinner_than_a_fifth_of_a_pixel_and_no_wider_than_eigh
 
 
 @pytest.mark.parametrize(("part", "are_idle"), [(2e-3, False), (0.5e-3, True)])
-def test_idle_is_what_no_picture_showed_for_7000_steps(make_frame, camera, part, are_idle):
+def test_upkeep_treats_gaussians_unseen_for_7000_steps_as_idle(make_frame, camera, part, are_idle):
     """The mean of squared gradients falls by 0.999 per step, to a thousandth of the usual one in 7,000."""
     step, observation = trained(make_frame, camera)
     step.gaussians.means[:20] += 1000.0  # out of the picture
@@ -340,7 +340,7 @@ def test_idle_is_what_no_picture_showed_for_7000_steps(make_frame, camera, part,
     assert bool(upkeep._useless(step, upkeep._examine(step, observation))[:20].any()) == are_idle
 
 
-def test_depths_come_two_thirds_of_the_way_back_within_100000_steps(make_frame, camera):
+def test_upkeep_depth_relaxation_time_is_100000_steps(make_frame, camera):
     step, observation = trained(make_frame, camera)
     upkeep = Upkeep(camera, CONFIG)
     upkeep._has_moved = True  # distances are left to training
@@ -351,7 +351,7 @@ def test_depths_come_two_thirds_of_the_way_back_within_100000_steps(make_frame, 
     assert float((some / whole).nanmedian()) == pytest.approx(1 - math.exp(-1), rel=0.01)
 
 
-def test_a_fiftieth_of_the_gaussians_is_split_in_one_round(make_frame, camera):
+def test_upkeep_splits_at_most_a_fiftieth_per_round(make_frame, camera):
     step, observation = trained(make_frame, camera)
     inside = pixels_of(step.at(observation.time_s).means, camera)[1]
     step.remove(inside & (torch.arange(len(inside)) % 3 == 0))

@@ -24,7 +24,7 @@ class Training:
         return self.now_s
 
 
-def test_steps_double_until_validation_frames_stop_improving():
+def test_choose_steps_doubles_until_validation_stops_improving():
     training = Training([30.0, 32.0, 33.0, 33.01, 40.0])
     chosen = choose_steps(training, 60, training.clock)
     assert training.steps == [500, 1000, 2000, 4000]
@@ -32,7 +32,7 @@ def test_steps_double_until_validation_frames_stop_improving():
     assert "4000 steps 33.01 dB" in chosen.sentence
 
 
-def test_a_worse_trial_is_not_chosen():
+def test_choose_steps_does_not_choose_worse_trial():
     training = Training([30.0, 32.0, 31.0])
     assert choose_steps(training, 60, training.clock).steps == 1000
 
@@ -40,7 +40,7 @@ def test_a_worse_trial_is_not_chosen():
 @pytest.mark.parametrize("setup_s", [0.0, 3.0])
 @pytest.mark.parametrize("growth_s", [0.0, 2.0])
 @pytest.mark.parametrize("limit_s", [20.0, 60.0, 300.0])
-def test_search_and_training_stay_within_the_time_limit(limit_s, setup_s, growth_s):
+def test_choose_steps_stays_within_time_limit(limit_s, setup_s, growth_s):
     training = Training([30.0 + k for k in range(20)], 0.01, setup_s, growth_s)
     chosen = choose_steps(training, limit_s, training.clock)
     assert chosen.reason == "limit" and "--minutes" in chosen.sentence
@@ -48,25 +48,25 @@ def test_search_and_training_stay_within_the_time_limit(limit_s, setup_s, growth
     assert chosen.steps >= training.steps[-1]
 
 
-def test_without_time_for_a_second_training_the_trial_is_the_result():
+def test_choose_steps_keeps_trial_without_time_for_second_training():
     training = Training([30.0], step_s=1.0)
     chosen = choose_steps(training, 60, training.clock)
     assert training.steps == [500]
     assert (chosen.steps, chosen.reason, chosen.keeps_trial) == (500, "limit", True)
 
 
-def test_time_before_the_first_step_does_not_count_as_steps():
+def test_choose_steps_excludes_setup_time_from_step_time():
     training = Training([30.0 + k for k in range(20)], step_s=0.002, setup_s=6.0)
     assert choose_steps(training, 60, training.clock).steps >= 4000
 
 
-def test_time_of_growth_does_not_count_as_steps():
+def test_choose_steps_excludes_growth_time_from_step_time():
     training = Training([30.0 + k for k in range(20)], step_s=0.0005, growth_s=6.0)
     chosen = choose_steps(training, 45, training.clock)
     assert training.steps == [500, 1000, 2000, 4000] and chosen.steps == 8000
 
 
-def test_first_trial_slower_than_the_second_does_not_make_steps_free():
+def test_choose_steps_after_slower_first_trial_stays_within_limit():
     """As on a GPU, on which the first trial loads the kernels: the time of more steps is unknown, and the search stays within the limit."""
     training = Training([30.0 + k for k in range(20)], step_s=0.002, growth_s=10.0)
 
@@ -80,14 +80,14 @@ def test_first_trial_slower_than_the_second_does_not_make_steps_free():
     assert training.now_s + chosen.steps * training.step_s <= 60
 
 
-def test_time_that_was_spent_before_counts():
+def test_choose_steps_counts_time_spent_before():
     training = Training([30.0 + k for k in range(20)], step_s=0.01)
     late = choose_steps(training, 60, training.clock, spent_s=40.0)
     assert not late.keeps_trial
     assert training.now_s + 40 + late.steps * training.step_s <= 60
 
 
-def test_the_ends_of_a_recording_never_validate():
+def test_validating_excludes_first_and_last_frame():
     assert validating(5) == []
     for count in range(6, 60):
         assert min(validating(count)) > 0 and max(validating(count)) < count - 1

@@ -52,7 +52,7 @@ def unit(quats: torch.Tensor) -> np.ndarray:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
-def test_ply_has_unit_rotations_and_everything_else_as_it_was(tmp_path, degree):
+def test_ply_export_has_unit_rotations_and_equal_other_parameters(tmp_path, degree):
     model = random_model(degree=degree)
     exported(tmp_path, model, "ply")
     back, was = load_ply(tmp_path / "out.ply"), model.gaussians
@@ -62,7 +62,7 @@ def test_ply_has_unit_rotations_and_everything_else_as_it_was(tmp_path, degree):
     assert back.sh_degree == degree
 
 
-def test_splat_has_its_32_bytes_the_most_important_first(tmp_path):
+def test_splat_export_has_32_bytes_per_gaussian_by_importance(tmp_path):
     model = random_model()
     data = exported(tmp_path, model, "splat")
     assert len(data) == 32 * 50
@@ -81,7 +81,7 @@ def test_splat_has_its_32_bytes_the_most_important_first(tmp_path):
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_glb_is_what_the_extension_asks_for(tmp_path, degree):
+def test_glb_export_matches_gaussian_splatting_extension(tmp_path, degree):
     model = random_model(degree=degree)
     document, values = read_glb(exported(tmp_path, model, "glb"))
     g = model.gaussians
@@ -100,7 +100,7 @@ def test_glb_is_what_the_extension_asks_for(tmp_path, degree):
     assert document["accessors"][0]["count"] == 50
 
 
-def test_glb_turns_the_models_axes_into_gltfs(tmp_path):
+def test_glb_node_converts_axes_and_millimetres_to_gltf(tmp_path):
     """x right, y down, z forward becomes x right, y up, z backward, right-handed both; millimetres become metres."""
     document, _ = read_glb(exported(tmp_path, random_model(), "glb"))
     (node,) = document["nodes"]
@@ -117,7 +117,7 @@ def test_glb_turns_the_models_axes_into_gltfs(tmp_path):
     assert node["scale"] == [0.001] * 3
 
 
-def test_our_harmonics_are_the_extensions():
+def test_spherical_harmonics_equal_gltf_extension_definition():
     """The degree 1 functions of the extension's text: -y, z, -x with the constant 0.4886."""
     direction = torch.tensor([[0.36, -0.48, 0.8]])
     for n, factor in enumerate((-direction[0, 1], direction[0, 2], -direction[0, 0])):
@@ -127,7 +127,7 @@ def test_our_harmonics_are_the_extensions():
         assert seen[0, 0].item() == pytest.approx(0.4886025119029199 * factor.item(), abs=1e-6)
 
 
-def test_an_export_is_of_the_models_time(tmp_path):
+def test_export_evaluates_model_at_given_time(tmp_path):
     model = random_model(field=True)
     for time_s in (None, 1.0, 1.75):
         exported(tmp_path, model, "ply", time_s=time_s)
@@ -136,7 +136,7 @@ def test_an_export_is_of_the_models_time(tmp_path):
     assert not torch.equal(model.at(1.0).means, model.at(3.0).means)
 
 
-def test_a_sequence_has_each_of_its_times(tmp_path):
+def test_ply_sequence_export_has_one_file_per_time(tmp_path):
     model = random_model(field=True)
     exported(tmp_path, model, "ply-sequence", times=5)
     with zipfile.ZipFile(tmp_path / "out.zip") as archive:
@@ -151,12 +151,12 @@ def test_a_sequence_has_each_of_its_times(tmp_path):
 
 
 @pytest.mark.parametrize("name", list(FORMATS))
-def test_the_same_model_gives_the_same_bytes(tmp_path, name):
+def test_export_of_same_model_gives_same_bytes(tmp_path, name):
     assert exported(tmp_path, random_model(field=True), name) == exported(tmp_path, random_model(field=True), name)
 
 
 @pytest.mark.parametrize("name", list(FORMATS))
-def test_hostile_models_are_refused_and_nothing_is_left(tmp_path, name):
+def test_export_refuses_invalid_model_and_leaves_no_file(tmp_path, name):
     model = random_model()
     broken = model.gaussians.clone()
     broken.means[7, 1] = math.nan
@@ -168,7 +168,7 @@ def test_hostile_models_are_refused_and_nothing_is_left(tmp_path, name):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_rotation_of_length_nothing_is_none(tmp_path):
+def test_export_writes_zero_quaternion_as_identity(tmp_path):
     gaussians = random_model().gaussians.clone()
     gaussians.quats[0] = 0
     gaussians.quats[1] = 1e-30
@@ -179,18 +179,18 @@ def test_a_rotation_of_length_nothing_is_none(tmp_path):
     np.testing.assert_allclose(quats[1], [0.5] * 4)
 
 
-def test_one_gaussian_is_enough(tmp_path):
+def test_export_of_one_gaussian(tmp_path):
     for name in (name for name, each in FORMATS.items() if not each.is_surface):
         assert exported(tmp_path, random_model(count=1), name)
 
 
-def test_harmonics_that_gltf_does_not_hold_are_refused(tmp_path):
+def test_glb_export_refuses_sh_degree_4(tmp_path):
     with pytest.raises(ExportError, match="degree 4"):
         exported(tmp_path, random_model(degree=4), "glb")
 
 
 @pytest.mark.parametrize("wrong", [{"time_s": 0.5}, {"time_s": 3.1}])
-def test_a_time_that_the_model_has_not_seen_is_refused(tmp_path, wrong):
+def test_export_refuses_time_outside_model_window(tmp_path, wrong):
     with pytest.raises(InvalidSetting, match="window"):
         exported(tmp_path, random_model(), "ply", **wrong)
 
@@ -205,12 +205,12 @@ def test_a_time_that_the_model_has_not_seen_is_refused(tmp_path, wrong):
         ("glb", {"time_s": math.nan}),
     ],
 )
-def test_a_wish_that_makes_no_sense_is_refused(name, wrong):
+def test_export_wish_refuses_invalid_times(name, wrong):
     with pytest.raises(InvalidSetting):
         ExportWish(FORMATS[name], **wrong)
 
 
-def test_formats_are_found_by_name_and_by_ending(tmp_path):
+def test_export_format_by_name_and_file_suffix(tmp_path):
     assert format_named("glb") is format_of(tmp_path / "a.GLB")
     for wrong in (lambda: format_named("obj"), lambda: format_of(tmp_path / "a.obj")):
         with pytest.raises(InvalidSetting, match=r"ply"):
@@ -227,7 +227,7 @@ def wall(source: DepthSource | None = None) -> Model:
     return Model(1, gaussians, None, Camera.from_focal(20.0, 32, 24), WINDOW_S, depth_source=source)
 
 
-def test_a_mesh_as_glb_is_the_surface_that_the_camera_sees(tmp_path):
+def test_mesh_glb_export_is_surface_visible_to_camera(tmp_path):
     data = exported(tmp_path, wall(DepthSource(DEPTH_ORIGINS["measured"], metric=True)), "mesh-glb", time_s=2.0)
     document, values, indices = read_mesh_glb(data)
     assert document["asset"]["extras"] == {"time_s": 2.0, "unit": "millimetre"}
@@ -239,7 +239,7 @@ def test_a_mesh_as_glb_is_the_surface_that_the_camera_sees(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["mesh-ply", "points-ply"])
-def test_a_mesh_as_ply_has_its_vertices_and_triangles(tmp_path, name):
+def test_mesh_ply_export_has_vertices_and_triangles(tmp_path, name):
     data = exported(tmp_path, wall(), name)
     head, body = data.split(b"end_header\n", 1)
     assert b"comment unit relative\nelement vertex 768\n" in head
@@ -253,7 +253,7 @@ def test_a_mesh_as_ply_has_its_vertices_and_triangles(tmp_path, name):
     assert not len(faces) or (faces["v"].min(), faces["v"].max()) == (0, 767)
 
 
-def test_a_model_that_its_camera_does_not_see_has_no_surface(tmp_path):
+def test_mesh_export_of_invisible_model_is_refused(tmp_path):
     model = wall()
     behind = replace(model, gaussians=replace(model.gaussians, means=-model.gaussians.means))
     with pytest.raises(ExportError, match="no surface"):

@@ -20,16 +20,16 @@ def reading_threads() -> list[threading.Thread]:
     return [thread for thread in threading.enumerate() if thread.name.startswith(("read ahead", "read what lies"))]
 
 
-def test_items_come_in_order_and_the_thread_ends_with_the_last():
+def test_read_ahead_yields_items_in_order_and_ends_thread():
     assert list(read_ahead((number for number in range(100)), NAME)) == list(range(100))
     assert not reading_threads()
 
 
-def test_no_items():
+def test_read_ahead_of_empty_iterator():
     assert list(read_ahead((number for number in ()), NAME)) == []
 
 
-def test_at_most_so_many_items_are_made_and_not_taken():
+def test_read_ahead_limits_items_in_advance():
     third, made = threading.Event(), []
 
     def items():
@@ -47,7 +47,7 @@ def test_at_most_so_many_items_are_made_and_not_taken():
     reader.close()
 
 
-def test_an_error_comes_after_the_items_before_it():
+def test_read_ahead_raises_error_after_earlier_items():
     def items():
         yield 1
         yield 2
@@ -60,7 +60,7 @@ def test_an_error_comes_after_the_items_before_it():
     assert not reading_threads()
 
 
-def test_closing_ends_the_thread_and_closes_the_items():
+def test_read_ahead_close_ends_thread_and_closes_iterator():
     closed_in: list[str] = []
 
     def items():
@@ -77,7 +77,7 @@ def test_closing_ends_the_thread_and_closes_the_items():
     assert not reading_threads()
 
 
-def test_a_broken_mask_is_raised_after_the_frames_before_it_and_leaves_no_thread(endonerf_folder):
+def test_recording_raises_broken_mask_after_earlier_frames_and_ends_thread(endonerf_folder):
     masks = sorted((endonerf_folder / "masks").iterdir())
     recording = open_recording(endonerf_folder)
     masks[4].write_bytes(b"no picture")
@@ -89,14 +89,14 @@ def test_a_broken_mask_is_raised_after_the_frames_before_it_and_leaves_no_thread
     assert not reading_threads()
 
 
-def test_leaving_a_recording_early_leaves_no_thread(endonerf_folder):
+def test_closing_recording_iterator_early_ends_thread(endonerf_folder):
     frames = iter(open_recording(endonerf_folder))
     assert np.all(next(frames).mask <= 1)
     frames.close()
     assert not reading_threads()
 
 
-def test_opencv_logs_again_when_the_last_of_two_threads_has_decoded():
+def test_quiet_decoder_restores_opencv_log_level_after_last_thread():
     before = cv2.utils.logging.getLogLevel()
     first, second = quiet_decoder(), quiet_decoder()
     first.__enter__()

@@ -22,7 +22,7 @@ def lift(breathing: Breathing) -> np.ndarray:
 
 
 @pytest.mark.parametrize("ratio", [0.5, 1.0, 2.0, 3.5])
-def test_expiration_takes_so_many_times_as_long_as_inspiration(ratio: float) -> None:
+def test_breathing_ratio_is_expiration_to_inspiration_time(ratio: float) -> None:
     rises = np.diff(lift(Breathing(0.7, ratio))) > 0
     assert (~rises).sum() / rises.sum() == pytest.approx(ratio, rel=0.02)
     assert np.count_nonzero(rises[1:] & ~rises[:-1]) in (19, 20, 21)
@@ -30,13 +30,13 @@ def test_expiration_takes_so_many_times_as_long_as_inspiration(ratio: float) -> 
 
 @pytest.mark.parametrize("ratio", [0.5, 1.0, 2.0])
 @pytest.mark.parametrize("wander", [0.0, 0.3])
-def test_a_phase_advances_without_a_jump(ratio: float, wander: float) -> None:
+def test_breathing_phase_is_smooth_and_increasing(ratio: float, wander: float) -> None:
     phases = np.array([Breathing(-5.0, ratio, wander, (1.0, 4.0)).phase(float(t)) for t in TIMES])
     assert (np.diff(phases) > 0).all() and np.diff(phases).max() < 0.05
     assert np.abs(np.diff(phases, n=2)).max() < 5e-4
 
 
-def test_the_rate_wanders_as_far_as_asked_and_keeps_its_mean() -> None:
+def test_breathing_rate_wander_has_given_amplitude_and_mean() -> None:
     phases = np.array([Breathing(0.0, 1.0, 0.15, (0.3, 2.0)).phase(float(t)) for t in TIMES])
     rates = np.gradient(phases, TIMES) * PERIOD_S / (2 * np.pi)
     assert 0.10 < rates.max() - 1 <= 0.1501 and 0.10 < 1 - rates.min() <= 0.1501
@@ -44,7 +44,7 @@ def test_the_rate_wanders_as_far_as_asked_and_keeps_its_mean() -> None:
 
 
 @pytest.mark.slow
-def test_the_tissue_breathes_as_asked() -> None:
+def test_breathing_ratio_changes_rendered_depth() -> None:
     asked = RenderSettings(frames=3, width_px=48, height_px=40, fps=1, seed=2)
     usual, other = (
         render_recording(each)
@@ -58,7 +58,7 @@ def test_the_tissue_breathes_as_asked() -> None:
 
 
 @pytest.mark.parametrize("ratio", [1.0, 2.0])
-def test_a_point_of_the_tissue_rises_and_falls_as_asked(ratio: float) -> None:
+def test_tissue_point_follows_breathing_phase(ratio: float) -> None:
     tissue = SyntheticScene.from_seed(2, 48, 40, 5, False, Extras(breathing_ratio=ratio)).tissue
     times = np.arange(0, 3 * 3.4 * 9, 0.17)  # whole breaths and whole pulses
     z = np.array([tissue.position((0.0, 0.0), float(t), NO_TUG)[2] for t in times])
@@ -70,7 +70,7 @@ def test_a_point_of_the_tissue_rises_and_falls_as_asked(ratio: float) -> None:
 
 
 @pytest.mark.slow
-def test_seeds_have_ways_of_their_own_where_that_is_asked_for() -> None:
+def test_seeded_scope_path_depends_on_seed() -> None:
     def way(seed: int, path: str) -> np.ndarray:
         scene = SyntheticScene.from_seed(seed, 48, 40, 5, True, Extras(scope_path=path))
         return np.stack([scene.camera_at(t / 10).world_to_camera for t in range(50)])
@@ -83,7 +83,7 @@ def test_seeds_have_ways_of_their_own_where_that_is_asked_for() -> None:
         assert 2 < np.linalg.norm(each[:, :3, 3], axis=1).max() < 40
 
 
-def test_a_description_states_what_was_asked_for_alone(tmp_path: Path) -> None:
+def test_synthesize_description_lists_only_requested_extras(tmp_path: Path) -> None:
     folder = synthesize(
         tmp_path / "a", frames=2, width_px=48, height_px=40, seed=4, camera="moving", extras=Extras(smoke=0.5)
     )
@@ -100,6 +100,6 @@ def test_a_description_states_what_was_asked_for_alone(tmp_path: Path) -> None:
     "wrong",
     [{"breathing_ratio": 0.0}, {"breathing_ratio": 9.0}, {"breathing_ratio": float("nan")}, {"rate_wander": -0.1}, {"rate_wander": 0.9}, {"rate_wander": float("nan")}, {"scope_path": "other"}],
 )  # fmt: skip
-def test_what_no_breathing_has_is_refused(wrong: dict[str, float]) -> None:
+def test_extras_refuse_invalid_breathing_values(wrong: dict[str, float]) -> None:
     with pytest.raises(InvalidSetting, match=next(iter(wrong))):
         Extras(**wrong)

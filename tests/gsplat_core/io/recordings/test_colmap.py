@@ -31,7 +31,7 @@ def cameras(count=5):
 @pytest.mark.parametrize("text", [True, False])
 @pytest.mark.parametrize("model", ["PINHOLE", "SIMPLE_PINHOLE"])
 @pytest.mark.parametrize("place", ["sparse/0", "sparse", "."])
-def test_cameras_poses_and_points_are_read_in_the_order_of_names(tmp_path, text, model, place):
+def test_read_colmap_returns_cameras_and_points_in_name_order(tmp_path, text, model, place):
     written = list(cameras())
     write_scene(tmp_path / "scene" / place, written, text=text, points=POINTS, model=model)
     scene = read_colmap(tmp_path / "scene")
@@ -46,13 +46,13 @@ def test_cameras_poses_and_points_are_read_in_the_order_of_names(tmp_path, text,
 
 
 @pytest.mark.parametrize("text", [True, False])
-def test_a_distorted_lens_is_refused_by_name(tmp_path, text):
+def test_read_colmap_refuses_distorted_lens_model(tmp_path, text):
     write_scene(tmp_path / "sparse", cameras(), text=text, model="OPENCV")
     with pytest.raises(RecordingInvalid, match=r"lens model OPENCV.*image_undistorter"):
         read_colmap(tmp_path)
 
 
-def test_no_scene(tmp_path):
+def test_read_colmap_refuses_missing_or_empty_scene(tmp_path):
     with pytest.raises(RecordingMissing, match="no scene of COLMAP"):
         read_colmap(tmp_path)
     (tmp_path / "cameras.txt").write_text("")
@@ -79,7 +79,7 @@ def test_no_scene(tmp_path):
         ("images.bin", lambda b: b[:72] + b"x" * 10_000, "cut short"),
     ],
 )
-def test_a_malformed_binary_scene_is_refused_with_its_reason(tmp_path, file, change, reason):
+def test_read_colmap_refuses_malformed_binary_scene(tmp_path, file, change, reason):
     write_scene(tmp_path / "sparse", cameras(), text=False)
     path = tmp_path / "sparse" / file
     path.write_bytes(change(path.read_bytes()))
@@ -101,7 +101,7 @@ def test_a_malformed_binary_scene_is_refused_with_its_reason(tmp_path, file, cha
         ("images.txt", "set/001.png", "set/002.png", "has the image 'set/002.png' twice"),
     ],
 )
-def test_a_malformed_text_scene_is_refused_with_its_line(tmp_path, file, old, new, reason):
+def test_read_colmap_refuses_malformed_text_scene_with_line(tmp_path, file, old, new, reason):
     write_scene(tmp_path / "sparse", cameras(), text=True)
     path = tmp_path / "sparse" / file
     assert old in path.read_text()
@@ -110,14 +110,14 @@ def test_a_malformed_text_scene_is_refused_with_its_line(tmp_path, file, old, ne
         read_colmap(tmp_path)
 
 
-def test_points_that_no_model_can_have_are_refused(tmp_path):
+def test_read_colmap_refuses_points_out_of_range(tmp_path):
     write_scene(tmp_path / "sparse", cameras(), text=True, points=[(1.0, 2.0, 1.1e9, 255, 0, 7)])
     with pytest.raises(RecordingInvalid, match=r"points3D.* beyond 1e\+09"):
         read_colmap(tmp_path).points()
 
 
 @pytest.mark.parametrize("text", [True, False])
-def test_broken_points_are_refused(tmp_path, text):
+def test_read_colmap_refuses_truncated_points_file(tmp_path, text):
     write_scene(tmp_path / "sparse", cameras(), text=text, points=POINTS)
     path = tmp_path / "sparse" / f"points3D.{'txt' if text else 'bin'}"
     path.write_bytes(path.read_bytes()[:12])
@@ -126,7 +126,7 @@ def test_broken_points_are_refused(tmp_path, text):
 
 
 @pytest.mark.parametrize("text", [True, False])
-def test_damaged_bytes_give_a_scene_or_an_error_of_the_recording(tmp_path, text):
+def test_read_colmap_of_damaged_bytes_raises_only_recording_error(tmp_path, text):
     write_scene(tmp_path / "sparse", cameras(), text=text, points=POINTS)
     generator = np.random.default_rng(0)
     refused = 0

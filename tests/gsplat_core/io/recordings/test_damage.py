@@ -68,7 +68,7 @@ def video(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
     return SimpleNamespace(codec=request.param, path=path, frames=frames, data=path.read_bytes())
 
 
-def test_an_intact_video_is_read_as_opencv_reads_it(video: SimpleNamespace) -> None:
+def test_intact_video_frames_equal_opencv(video: SimpleNamespace) -> None:
     capture = cv2.VideoCapture(str(video.path), cv2.CAP_FFMPEG)
     for frame in video.frames:
         decoded, image = capture.read()
@@ -85,7 +85,7 @@ def _places(video: SimpleNamespace, count: int, length: int) -> list[int]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["flip", "hole"])
-def test_damage_is_seen(video: SimpleNamespace, tmp_path: Path, kind: str) -> None:
+def test_damaged_video_frames_are_marked_or_refused(video: SimpleNamespace, tmp_path: Path, kind: str) -> None:
     """Each changed frame is marked or the file refused, as often as the codec lets a decoder know."""
     bounds, count = (UNSEEN_FLIPS, FLIPS) if kind == "flip" else (UNSEEN_HOLES, HOLES)
     path = tmp_path / video.path.name
@@ -103,7 +103,7 @@ def test_damage_is_seen(video: SimpleNamespace, tmp_path: Path, kind: str) -> No
 
 
 @pytest.mark.parametrize("codec", ["ffv1_avi", "vp9_mp4"])
-def test_every_changed_frame_is_marked(codec: str, tmp_path: Path) -> None:
+def test_every_frame_changed_by_damage_is_marked(codec: str, tmp_path: Path) -> None:
     path = videos.encode(tmp_path / videos.name_of(codec), codec)
     intact, data = _read(path)[0], path.read_bytes()
     begin, end = videos.payload(path)[4]
@@ -118,7 +118,7 @@ def test_every_changed_frame_is_marked(codec: str, tmp_path: Path) -> None:
             assert frame.seq in marked or np.array_equal(frame.image, intact[frame.seq].image)
 
 
-def test_a_damaged_frame_has_no_tissue_and_says_why(tmp_path: Path) -> None:
+def test_damaged_frame_has_empty_mask_and_reason(tmp_path: Path) -> None:
     path = videos.encode(tmp_path / "v.avi", "ffv1_avi")
     begin, end = videos.payload(path)[3]
     path.write_bytes(videos.flipped(path.read_bytes(), (begin + end) // 2, 0))
@@ -131,7 +131,7 @@ def test_a_damaged_frame_has_no_tissue_and_says_why(tmp_path: Path) -> None:
     assert any(f.file.endswith("frame 3") and str(frames[3].damage) in f.message for f in report.warnings)
 
 
-def test_a_damaged_first_frame_is_refused(tmp_path: Path, refused: Refused) -> None:
+def test_video_with_damaged_first_frame_is_refused(tmp_path: Path, refused: Refused) -> None:
     path = videos.encode(tmp_path / "v.mp4", "h264")
     begin, _ = videos.payload(path)[0]
     path.write_bytes(videos.with_hole(path.read_bytes(), begin + 900, 100))
@@ -140,13 +140,13 @@ def test_a_damaged_first_frame_is_refused(tmp_path: Path, refused: Refused) -> N
 
 @pytest.mark.parametrize("codec", ["h264_mkv", "vp9", "ffv1", "mjpeg", "ffv1_avi"])
 @pytest.mark.parametrize("kept", [0.5, 0.9, 0.99])
-def test_a_cut_container_is_refused(codec: str, kept: float, tmp_path: Path, refused: Refused) -> None:
+def test_truncated_video_container_is_refused(codec: str, kept: float, tmp_path: Path, refused: Refused) -> None:
     path = videos.encode(tmp_path / videos.name_of(codec), codec)
     path.write_bytes(path.read_bytes()[: int(path.stat().st_size * kept)])
     refused(path, RecordingInvalid, "cut off")
 
 
-def test_a_picture_size_that_changes_midway_is_refused(tmp_path: Path) -> None:
+def test_video_with_changing_picture_size_is_refused_or_marked(tmp_path: Path) -> None:
     """Two JPEGs of different size in one video."""
     small, large = videos.pictures(1)[0], videos.pictures(1, (videos.WIDTH * 2, videos.HEIGHT))[0]
     path = videos.encode(tmp_path / "v.avi", "mjpeg", [small] * 6)
@@ -168,7 +168,7 @@ def _with_edit(data: bytes, media_time: int) -> bytes:
     return data[:at] + media_time.to_bytes(4, "big") + data[at + 4 :]
 
 
-def test_an_edit_list_is_honoured(tmp_path: Path) -> None:
+def test_mp4_edit_list_is_applied(tmp_path: Path) -> None:
     path = videos.encode(tmp_path / "v.mp4", "mpeg4")
     intact = list(open_recording(path))
     ticks = 512  # of 12800 in a second: one frame
@@ -182,7 +182,7 @@ def test_an_edit_list_is_honoured(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("degrees", [90, 180, 270])
 @pytest.mark.parametrize("codec", ["h264", "vp9_mp4"])
-def test_rotation_is_applied_as_opencv_does(codec: str, degrees: int, tmp_path: Path) -> None:
+def test_video_rotation_equals_opencv(codec: str, degrees: int, tmp_path: Path) -> None:
     path = videos.encode(tmp_path / "v.mp4", codec, set_display_rotation=degrees)
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     for frame in open_recording(path):
@@ -206,7 +206,7 @@ def _with_matrix(data: bytes, entries: tuple[float, float, float, float]) -> byt
         ((-1, 0, 0, -1), lambda image: np.rot90(image, 2)),
     ],
 )
-def test_a_mirrored_video_is_shown_as_players_do(
+def test_mp4_mirror_matrix_is_applied(
     tmp_path: Path, entries: tuple[float, float, float, float], upright: Callable[[np.ndarray], np.ndarray]
 ) -> None:
     path = videos.encode(tmp_path / "v.mp4", "mpeg4")
@@ -215,7 +215,7 @@ def test_a_mirrored_video_is_shown_as_players_do(
     assert np.array_equal(next(iter(open_recording(path))).image, upright(stored))
 
 
-def test_a_rotation_that_is_no_quarter_turn_is_noted(tmp_path: Path) -> None:
+def test_video_rotation_off_quarter_turn_is_noted(tmp_path: Path) -> None:
     path = videos.encode(tmp_path / "v.mp4", "mpeg4")
     stored = next(iter(open_recording(path))).image
     path.write_bytes(_with_matrix(path.read_bytes(), (0.5, 0.75**0.5, -(0.75**0.5), 0.5)))
@@ -224,7 +224,7 @@ def test_a_rotation_that_is_no_quarter_turn_is_noted(tmp_path: Path) -> None:
     assert np.array_equal(next(iter(recording)).image, np.rot90(stored, 3))
 
 
-def test_a_damaged_jpeg_is_marked_and_a_damaged_png_refused(tmp_path: Path, refused: Refused) -> None:
+def test_damaged_jpeg_is_marked_and_damaged_png_is_refused(tmp_path: Path, refused: Refused) -> None:
     for index, image in enumerate(videos.pictures(4)):
         assert cv2.imwrite(str(tmp_path / f"{index}.jpg"), image)
     intact = list(open_recording(tmp_path))
@@ -241,7 +241,7 @@ def test_a_damaged_jpeg_is_marked_and_a_damaged_png_refused(tmp_path: Path, refu
         refused(tmp_path, RecordingInvalid, "4.png")
 
 
-def test_image_numbers_that_skip_are_a_gap_in_time(tmp_path: Path) -> None:
+def test_skipped_image_numbers_become_time_gap(tmp_path: Path) -> None:
     for number in (10, 12, 14, 18, 20):
         assert cv2.imwrite(str(tmp_path / f"f{number:04d}.png"), videos.pictures(1)[0])
     recording = open_recording(tmp_path)
@@ -249,7 +249,7 @@ def test_image_numbers_that_skip_are_a_gap_in_time(tmp_path: Path) -> None:
     assert any("skip" in note and "f0014.png" in note and "f0018.png" in note for note in recording.notes)
 
 
-def test_image_numbers_that_repeat_are_refused(tmp_path: Path, refused: Refused) -> None:
+def test_repeated_image_numbers_are_refused(tmp_path: Path, refused: Refused) -> None:
     for name in ("f1.png", "f2.png", "f2.jpg", "f3.png"):
         assert cv2.imwrite(str(tmp_path / name), videos.pictures(1)[0])
     refused(tmp_path, RecordingInvalid, "number 2")
@@ -257,7 +257,7 @@ def test_image_numbers_that_repeat_are_refused(tmp_path: Path, refused: Refused)
 
 @pytest.mark.parametrize("codec", ["h264", "h264_mkv", "vp9", "mjpeg", "mpeg4"])
 @pytest.mark.parametrize("part", ["beginning", "end"])
-def test_damage_to_the_container_never_ends_in_anything_but_findings(codec: str, part: str, tmp_path: Path) -> None:
+def test_validate_recording_of_damaged_container_raises_nothing(codec: str, part: str, tmp_path: Path) -> None:
     path = videos.encode(tmp_path / videos.name_of(codec), codec, videos.pictures(6))
     data = path.read_bytes()
     region = (0, 1500) if part == "beginning" else (len(data) - 1500, len(data))

@@ -28,7 +28,7 @@ def names(*texts):
         ("000001_left.jpg", "000001_right.jpg"),
     ],
 )
-def test_names_say_which_eye(files):
+def test_split_eyes_by_file_names(files):
     eyes = split_eyes(names(*files, "notes.png"))
     assert (eyes.left, eyes.right, eyes.others) == ((Path(files[0]),), (Path(files[1]),), (Path("notes.png"),))
 
@@ -43,7 +43,7 @@ def test_names_say_which_eye(files):
         ("bladder.png", "colr.png"),
     ],
 )
-def test_what_is_no_pair_is_none(files):
+def test_split_eyes_is_none_without_pairs(files):
     assert split_eyes(names(*files)) is None
 
 
@@ -53,7 +53,7 @@ def picture(path, value=120, size=(320, 256)):
     cv2.imwrite(str(path), image)
 
 
-def test_images_of_two_eyes_are_a_stereo_recording(tmp_path):
+def test_left_and_right_images_open_as_stereo_recording(tmp_path):
     for k in range(2):
         picture(tmp_path / f"{k}_left.png", 100 + k)
         picture(tmp_path / f"{k}_right.png", 200 + k)
@@ -67,7 +67,7 @@ def test_images_of_two_eyes_are_a_stereo_recording(tmp_path):
 
 
 @pytest.mark.parametrize(("baseline_mm", "is_noted"), [(0.0044, True), (0.5, False), (100.0, False), (4400.0, True)])
-def test_a_baseline_in_another_unit_is_noted(tmp_path, baseline_mm, is_noted):
+def test_implausible_stereo_baseline_is_noted(tmp_path, baseline_mm, is_noted):
     picture(tmp_path / "left.png")
     picture(tmp_path / "right.png")
     content = {"format": "intrasplat-recording", "version": 1, "stereo_baseline_mm": baseline_mm}
@@ -76,7 +76,7 @@ def test_a_baseline_in_another_unit_is_noted(tmp_path, baseline_mm, is_noted):
     assert [f"the two eyes are {baseline_mm:.3g} mm apart" in note for note in notes] == [True] * is_noted
 
 
-def test_a_calibration_rectifies_them_and_gives_the_right_eyes_camera(tmp_path):
+def test_stereo_calibration_rectifies_images_and_sets_right_camera(tmp_path):
     picture(tmp_path / "left.png")
     picture(tmp_path / "right.png")
     without = open_recording(tmp_path).digest
@@ -90,7 +90,7 @@ def test_a_calibration_rectifies_them_and_gives_the_right_eyes_camera(tmp_path):
     assert recording.digest != without
 
 
-def test_depth_of_pictures_that_are_not_rectified_is_refused(tmp_path):
+def test_depth_of_unrectified_pictures_is_refused(tmp_path):
     picture(tmp_path / "left.png")
     picture(tmp_path / "right.png")
     scared_json(tmp_path)
@@ -100,7 +100,7 @@ def test_depth_of_pictures_that_are_not_rectified_is_refused(tmp_path):
         open_recording(tmp_path)
 
 
-def test_a_calibration_for_another_size_is_refused(tmp_path):
+def test_stereo_calibration_of_other_size_is_refused(tmp_path):
     picture(tmp_path / "left.png", size=(100, 80))
     picture(tmp_path / "right.png", size=(100, 80))
     scared_json(tmp_path)
@@ -109,7 +109,7 @@ def test_a_calibration_for_another_size_is_refused(tmp_path):
 
 
 @pytest.mark.recordings
-def test_videos_of_two_eyes_are_a_stereo_recording(recordings_dir):
+def test_left_and_right_videos_open_as_stereo_recording(recordings_dir):
     recording = open_recording(recordings_dir / "heart", max_frames=2)
     frames = list(recording)
     assert len(frames) == 2 and all(frame.right_image is not None for frame in frames)
@@ -118,7 +118,7 @@ def test_videos_of_two_eyes_are_a_stereo_recording(recordings_dir):
 
 @pytest.mark.slow
 @pytest.mark.recordings
-def test_scared_raw_is_rectified_to_half_a_pixel(recordings_dir):
+def test_scared_raw_rectification_error_is_at_most_half_a_pixel(recordings_dir):
     frame = next(iter(open_recording(recordings_dir / "scared_raw")))
     grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (frame.image, frame.right_image)]
     finder = cv2.SIFT.create(2000)

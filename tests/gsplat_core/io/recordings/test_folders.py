@@ -19,7 +19,7 @@ from gsplat_core.io.recordings import open_recording, validate_recording
 Refused = Callable[..., str]
 
 
-def test_endonerf(endonerf_folder: Path, make: SimpleNamespace) -> None:
+def test_endonerf_folder_fields_and_frames(endonerf_folder: Path, make: SimpleNamespace) -> None:
     recording = open_recording(endonerf_folder)
     assert recording.fields == {"mask", "pose", "depth", "right_image"}
     assert recording.camera.K[0, 0] == 50
@@ -47,7 +47,7 @@ def test_validation_report_of_a_good_recording(endonerf_folder: Path) -> None:
     json.dumps(facts)
 
 
-def test_cameras_json(cameras_folder: Path, make: SimpleNamespace) -> None:
+def test_cameras_json_intrinsics_poses_and_valid_mask(cameras_folder: Path, make: SimpleNamespace) -> None:
     recording = open_recording(cameras_folder)
     assert recording.frame_count == 5 and recording.fps == 20
     assert recording.camera.K.tolist() == [[50, 0, 23], [0, 51, 21], [0, 0, 1]]
@@ -85,7 +85,7 @@ def test_images_alone_sort_by_number(tmp_path: Path, make: SimpleNamespace) -> N
     assert any("no calibration" in note and "no camera motion" in note for note in recording.notes)
 
 
-def test_nothing_is_assumed_of_what_is_stated(tmp_path: Path, make: SimpleNamespace) -> None:
+def test_assumed_camera_note_excludes_stated_poses_and_camera(tmp_path: Path, make: SimpleNamespace) -> None:
     make.images(tmp_path, 3, "{}.png")
     np.save(tmp_path / "poses.npy", np.tile(np.eye(4), (3, 1, 1)))
     (note,) = (note for note in open_recording(tmp_path).notes if "no calibration" in note)
@@ -115,13 +115,13 @@ def test_scale_keeps_masks_binary_and_depth_unmixed(endonerf_folder: Path) -> No
     assert frame.depth is not None and set(np.unique(frame.depth)) <= {0.0, 40.0}
 
 
-def test_one_unreadable_image_is_named(endonerf_folder: Path, refused: Refused) -> None:
+def test_truncated_png_is_refused_with_file_name(endonerf_folder: Path, refused: Refused) -> None:
     path = endonerf_folder / "images" / "frame-000003.color.png"
     path.write_bytes(path.read_bytes()[:-40])
     refused(endonerf_folder, RecordingInvalid, path.name, "ends too early")
 
 
-def test_truncated_jpeg_is_not_read_as_grey(tmp_path: Path, make: SimpleNamespace, refused: Refused) -> None:
+def test_truncated_jpeg_is_refused(tmp_path: Path, make: SimpleNamespace, refused: Refused) -> None:
     rng = np.random.default_rng(0)
     make.image(tmp_path / "0.jpg", rng.integers(0, 255, (64, 64, 3), dtype=np.uint8))
     data = (tmp_path / "0.jpg").read_bytes()
@@ -129,7 +129,7 @@ def test_truncated_jpeg_is_not_read_as_grey(tmp_path: Path, make: SimpleNamespac
     refused(tmp_path, RecordingInvalid, "0.jpg", "ends too early")
 
 
-def test_damaged_png(tmp_path: Path, make: SimpleNamespace, refused: Refused) -> None:
+def test_damaged_png_is_refused(tmp_path: Path, make: SimpleNamespace, refused: Refused) -> None:
     make.images(tmp_path, 2)
     data = bytearray((tmp_path / "000001.png").read_bytes())
     data[60:80] = bytes(20)
@@ -137,14 +137,14 @@ def test_damaged_png(tmp_path: Path, make: SimpleNamespace, refused: Refused) ->
     refused(tmp_path, RecordingInvalid, "000001.png", "damaged")
 
 
-def test_images_of_two_sizes(tmp_path: Path, make: SimpleNamespace, refused: Refused) -> None:
+def test_images_of_different_sizes_are_refused(tmp_path: Path, make: SimpleNamespace, refused: Refused) -> None:
     make.images(tmp_path, 4)
     make.image(tmp_path / "000002.png", make.frame_image(2, 30, 20))
     refused(tmp_path, RecordingInvalid, "000002.png", "30x20", "48x40")
 
 
 @pytest.mark.parametrize("last", [2 + 30 * 86_400, 10**20])
-def test_image_numbers_that_span_more_than_a_day(
+def test_image_numbers_spanning_more_than_a_day_are_refused(
     tmp_path: Path, make: SimpleNamespace, refused: Refused, last: int
 ) -> None:
     make.images(tmp_path, 3)
@@ -152,7 +152,9 @@ def test_image_numbers_that_span_more_than_a_day(
     refused(tmp_path, RecordingInvalid, "after the first one, at 30 frames/s", "up to 86400 s")
 
 
-def test_right_eye_of_another_size_or_count(endonerf_folder: Path, make: SimpleNamespace, refused: Refused) -> None:
+def test_right_images_of_other_size_or_count_are_refused(
+    endonerf_folder: Path, make: SimpleNamespace, refused: Refused
+) -> None:
     make.image(endonerf_folder / "images_right" / "frame-000001.color.png", make.frame_image(1, 24, 20))
     refused(endonerf_folder, RecordingInvalid, "images_right", "24x20")
     (endonerf_folder / "images_right" / "frame-000005.color.png").unlink()
@@ -175,13 +177,15 @@ def test_right_eye_of_another_size_or_count(endonerf_folder: Path, make: SimpleN
         ({"fps_assumed": "fast"}, ["frame rate", "fast"]),
     ],
 )
-def test_wrong_cameras_json(cameras_folder: Path, refused: Refused, change: dict, fragments: list[str]) -> None:
+def test_invalid_cameras_json_is_refused(
+    cameras_folder: Path, refused: Refused, change: dict, fragments: list[str]
+) -> None:
     path = cameras_folder / "cameras.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
     refused(cameras_folder, RecordingInvalid, *fragments)
 
 
-def test_cameras_json_key_or_file_missing(cameras_folder: Path, refused: Refused) -> None:
+def test_cameras_json_missing_key_or_file_is_refused(cameras_folder: Path, refused: Refused) -> None:
     path = cameras_folder / "cameras.json"
     content = json.loads(path.read_text())
     (cameras_folder / "images" / "000003.png").unlink()
@@ -193,7 +197,7 @@ def test_cameras_json_key_or_file_missing(cameras_folder: Path, refused: Refused
     refused(cameras_folder, RecordingInvalid, "cameras.json", "not JSON")
 
 
-def test_mirrored_pose_is_not_a_rotation(cameras_folder: Path, refused: Refused) -> None:
+def test_mirrored_pose_in_cameras_json_is_refused(cameras_folder: Path, refused: Refused) -> None:
     path = cameras_folder / "cameras.json"
     content = json.loads(path.read_text())
     content["frames"][2]["camera_to_world"] = np.diag([1.0, 1, -1, 1]).tolist()
@@ -234,7 +238,7 @@ def test_exif_rotation_is_not_applied_and_noted(
         ({"fy": 1e6}, "across the height"),
     ],
 )
-def test_an_unusual_camera_is_noted(cameras_folder: Path, change: dict[str, float], said: str | None) -> None:
+def test_unusual_camera_intrinsics_are_noted(cameras_folder: Path, change: dict[str, float], said: str | None) -> None:
     path = cameras_folder / "cameras.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | change))
     notes = [note for note in open_recording(cameras_folder).notes if "cameras.json" in note]

@@ -36,7 +36,7 @@ def same(one, other) -> None:
             np.testing.assert_array_equal(getattr(a, name), getattr(b, name), strict=True)
 
 
-def test_the_second_time_it_comes_from_the_file_and_is_the_same(tmp_path, rendered):
+def test_kept_recording_is_read_from_cache_on_second_call(tmp_path, rendered):
     first, second = (kept_recording(SMALL, tmp_path / "kept") for _ in range(2))
     assert rendered == [SMALL]
     same(first, second)
@@ -50,14 +50,14 @@ def test_the_second_time_it_comes_from_the_file_and_is_the_same(tmp_path, render
 @pytest.mark.parametrize(
     "other", [{"seed": 1}, {"frames": 3}, {"stereo": False}, {"camera": "fixed"}, {"fps": 25.0}, {"width_px": 48}]
 )
-def test_each_argument_makes_another_file(tmp_path, rendered, other):
+def test_kept_recording_cache_key_includes_every_argument(tmp_path, rendered, other):
     wanted = RenderSettings(**{**SMALL.__dict__, **other})
     kept_recording(SMALL, tmp_path / "kept")
     assert kept_recording(wanted, tmp_path / "kept").frame_count == wanted.frames
     assert rendered == [SMALL, wanted]
 
 
-def test_another_renderer_makes_another_file(tmp_path, rendered, monkeypatch):
+def test_kept_recording_cache_key_includes_renderer(tmp_path, rendered, monkeypatch):
     kept_recording(SMALL, tmp_path / "kept")
     monkeypatch.setattr(module, "_renderer", lambda: "changed")
     kept_recording(SMALL, tmp_path / "kept")
@@ -65,7 +65,7 @@ def test_another_renderer_makes_another_file(tmp_path, rendered, monkeypatch):
 
 
 @pytest.mark.parametrize("damage", [b"", b"no safetensors", None])
-def test_a_damaged_file_is_rendered_again(tmp_path, rendered, damage):
+def test_kept_recording_renders_again_if_cache_file_is_damaged(tmp_path, rendered, damage):
     first = kept_recording(SMALL, tmp_path / "kept")
     (file,) = (tmp_path / "kept").iterdir()
     file.write_bytes(file.read_bytes()[:-100] if damage is None else damage)
@@ -75,7 +75,7 @@ def test_a_damaged_file_is_rendered_again(tmp_path, rendered, damage):
 
 
 @pytest.mark.slow
-def test_what_was_not_used_for_longest_is_removed(tmp_path, rendered):
+def test_kept_recording_cache_removes_least_recently_used(tmp_path, rendered):
     folder = tmp_path / "kept"
     others = [RenderSettings(**{**SMALL.__dict__, "seed": seed}) for seed in range(1, 4)]
     for age, asked in enumerate([SMALL, *others]):
@@ -93,13 +93,13 @@ def test_what_was_not_used_for_longest_is_removed(tmp_path, rendered):
     assert rendered == [others[0]]
 
 
-def test_one_that_is_larger_than_all_may_be_is_not_kept(tmp_path, rendered):
+def test_kept_recording_larger_than_cache_is_not_stored(tmp_path, rendered):
     kept_recording(SMALL, tmp_path / "kept", most_bytes=ONE - 1)
     assert not (tmp_path / "kept").exists()
 
 
 @pytest.mark.slow
-def test_a_folder_that_others_may_write_to_is_not_used(tmp_path, rendered):
+def test_kept_recording_ignores_world_writable_cache_folder(tmp_path, rendered):
     folder = tmp_path / "kept"
     kept_recording(SMALL, folder)
     folder.chmod(0o777)
@@ -107,11 +107,11 @@ def test_a_folder_that_others_may_write_to_is_not_used(tmp_path, rendered):
     assert len(rendered) == 2
 
 
-def test_a_folder_that_cannot_be_made_is_no_error(tmp_path, rendered):
+def test_kept_recording_without_cache_folder_still_renders(tmp_path, rendered):
     (tmp_path / "file").write_text("")
     same(kept_recording(SMALL, tmp_path / "file" / "kept"), render_recording(SMALL))
 
 
-def test_wrong_arguments_are_refused(tmp_path):
+def test_kept_recording_refuses_invalid_arguments(tmp_path):
     with pytest.raises(InvalidSetting, match="frames must be"):
         kept_recording(RenderSettings(frames=0), tmp_path / "kept")

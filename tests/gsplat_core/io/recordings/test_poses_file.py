@@ -26,7 +26,7 @@ def turned(count: int = 3) -> np.ndarray:
     return poses
 
 
-def test_what_is_written_is_read_and_wins(folder):
+def test_poses_file_overrides_recorded_poses(folder):
     before = open_recording(folder)
     write_poses(folder / "poses.npy", turned())
     recording = open_recording(folder)
@@ -47,7 +47,7 @@ def test_what_is_written_is_read_and_wins(folder):
         (turned() * np.array([1, 1, -1, 1])[:, None], "not a rotation"),
     ],
 )
-def test_what_is_no_pose_is_refused(folder, poses, said):
+def test_invalid_poses_file_is_refused(folder, poses, said):
     np.save(folder / "poses.npy", poses)
     with pytest.raises(RecordingInvalid, match=said):
         open_recording(folder)

@@ -20,7 +20,7 @@ from gsplat_core.io.recordings.synthetic.synthesize import projected
 SMALL = {"frames": 2, "width_px": 48, "height_px": 40, "fps": 2}
 
 
-def test_a_fixed_property_leaves_the_others() -> None:
+def test_draw_scene_fixed_property_keeps_other_draws() -> None:
     free = draw_scene(3)
     fixed = draw_scene(3, moving=not free.moving, smoke=0.7, breathing_ratio=2.5)
     assert (fixed.moving, fixed.smoke, fixed.breathing.ratio) == (not free.moving, 0.7, 2.5)
@@ -33,7 +33,7 @@ def test_a_fixed_property_leaves_the_others() -> None:
     assert draw_scene(3) == free
 
 
-def test_draws_cover_their_ranges() -> None:
+def test_draw_scene_covers_value_ranges() -> None:
     scenes = [draw_scene(seed) for seed in range(200)]
     focal = [scene.focal for scene in scenes]
     assert min(focal) < 0.55 and max(focal) > 1.15 and all(0.5 <= each <= 1.2 for each in focal)
@@ -48,7 +48,7 @@ def test_draws_cover_their_ranges() -> None:
 
 
 @pytest.mark.slow
-def test_same_seed_same_bytes(tmp_path: Path) -> None:
+def test_random_scene_of_same_seed_gives_same_bytes(tmp_path: Path) -> None:
     folders = [synthesize(tmp_path / name, drawn=draw_scene(seed), **SMALL) for name, seed in (("a", 1), ("b", 1))]
     first, second = (
         {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
@@ -58,7 +58,7 @@ def test_same_seed_same_bytes(tmp_path: Path) -> None:
     assert json.loads(first["recording.json"])["random"]["organ"] == draw_scene(1).organ
 
 
-def test_distortion_is_removed_while_reading(tmp_path: Path) -> None:
+def test_random_scene_lens_distortion_is_removed_when_read(tmp_path: Path) -> None:
     drawn = replace(draw_scene(4, moving=True, stereo=False, distorted=True), lens=(-0.12, 0.01))
     drawn = replace(drawn, sensor=replace(drawn.sensor, field=Field()))
     recording = open_recording(synthesize(tmp_path / "x", drawn=drawn, **SMALL))
@@ -74,7 +74,7 @@ def test_distortion_is_removed_while_reading(tmp_path: Path) -> None:
     assert np.median(np.abs(frame.depth - expected)[seen] / expected[seen]) < 0.005
 
 
-def test_the_lens_is_that_of_opencv() -> None:
+def test_radial_lens_equals_opencv() -> None:
     camera = SyntheticScene.from_seed(0, 48, 40, 1.0, False, drawn=draw_scene(0)).camera
     lens = RadialLens.from_corner(camera, -0.1, 0.02)
     x, y = lens.rays(camera)
@@ -87,7 +87,7 @@ def test_the_lens_is_that_of_opencv() -> None:
     np.testing.assert_allclose(pixels, np.stack([columns, rows], -1).reshape(-1, 2), atol=1e-3)
 
 
-def test_outside_of_the_field_nothing_is_known(tmp_path: Path) -> None:
+def test_random_scene_has_no_depth_or_tissue_outside_field_of_view(tmp_path: Path) -> None:
     drawn = draw_scene(5, stereo=False, distorted=False)
     drawn = replace(drawn, sensor=replace(drawn.sensor, field=Field("circle", 0.4)))
     frame = next(iter(open_recording(synthesize(tmp_path / "x", drawn=drawn, **SMALL))))
@@ -98,7 +98,7 @@ def test_outside_of_the_field_nothing_is_known(tmp_path: Path) -> None:
     assert not frame.mask[~inside].any()
 
 
-def test_refuses_flow_of_a_distorted_lens(tmp_path: Path) -> None:
+def test_synthesize_refuses_flow_of_distorted_lens(tmp_path: Path) -> None:
     drawn = draw_scene(2, stereo=False, distorted=True)
     with pytest.raises(InvalidSetting, match="distorted lens"):
         synthesize(tmp_path / "x", drawn=drawn, extras=Extras(flow=True), **SMALL)

@@ -14,7 +14,7 @@ from gsplat_core.io.recordings import open_recording, validate_recording
 pytestmark = pytest.mark.recordings
 
 
-def test_cutting(recordings_dir: Path) -> None:
+def test_cutting_recording_facts(recordings_dir: Path) -> None:
     recording = open_recording(recordings_dir / "cutting")
     assert (recording.frame_count, recording.width_px, recording.height_px, recording.fps) == (156, 640, 512, 30)
     assert recording.camera.K[0, 0] == pytest.approx(569.46820041)
@@ -38,13 +38,13 @@ def test_cutting_previous_frame_baseline(recordings_dir: Path) -> None:
     assert 33 < np.mean(scores) < 42
 
 
-def test_cutting_cut_in_half(recordings_dir: Path, tmp_path: Path, refused: Callable[..., str]) -> None:
+def test_truncated_cutting_video_is_refused(recordings_dir: Path, tmp_path: Path, refused: Callable[..., str]) -> None:
     data = (recordings_dir / "cutting" / "video.mp4").read_bytes()
     (tmp_path / "video.mp4").write_bytes(data[: len(data) // 2])
     refused(tmp_path, RecordingInvalid, "cut off")
 
 
-def test_sinus(recordings_dir: Path) -> None:
+def test_sinus_recording_facts(recordings_dir: Path) -> None:
     recording = open_recording(recordings_dir / "sinus")
     assert (recording.frame_count, recording.width_px, recording.height_px, recording.fps) == (35, 540, 540, 30)
     assert recording.camera.K[0, 0] == pytest.approx(338.5855)

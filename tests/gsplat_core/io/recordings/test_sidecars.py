@@ -18,18 +18,18 @@ from gsplat_core.io.recordings import open_recording, validate_recording
 Refused = Callable[..., str]
 
 
-def test_too_few_masks(video_folder: Path, refused: Refused) -> None:
+def test_too_few_masks_are_refused(video_folder: Path, refused: Refused) -> None:
     (video_folder / "masks" / "000007.png").unlink()
     refused(video_folder, RecordingInvalid, "masks", "7 masks for 8 frames")
 
 
-def test_an_empty_mask_folder(video_folder: Path, refused: Refused) -> None:
+def test_empty_mask_folder_is_refused(video_folder: Path, refused: Refused) -> None:
     for path in (video_folder / "masks").iterdir():
         path.unlink()
     refused(video_folder, RecordingInvalid, "0 masks for 8 frames")
 
 
-def test_a_mask_missing_in_the_middle(video_folder: Path, refused: Refused) -> None:
+def test_gap_in_mask_numbers_is_refused(video_folder: Path, refused: Refused) -> None:
     """The count is right, the pairing is not."""
     (video_folder / "masks" / "000003.png").rename(video_folder / "masks" / "000008.png")
     refused(video_folder, RecordingInvalid, "000004.png", "number 4", "expected 3")
@@ -41,38 +41,36 @@ def test_masks_numbered_from_one_are_accepted(video_folder: Path) -> None:
     assert validate_recording(video_folder).ok
 
 
-def test_masks_of_another_size(video_folder: Path, make: SimpleNamespace, refused: Refused) -> None:
+def test_masks_of_other_size_are_refused(video_folder: Path, make: SimpleNamespace, refused: Refused) -> None:
     make.masks(video_folder / "masks", 8, size=(24, 20), tool_columns=4)
     refused(video_folder, RecordingInvalid, "masks/000000.png", "24x20", "48x40", "8 such files")
 
 
-def test_inverted_masks(video_folder: Path, make: SimpleNamespace, refused: Refused) -> None:
+def test_inverted_masks_are_refused(video_folder: Path, make: SimpleNamespace, refused: Refused) -> None:
     make.masks(video_folder / "masks", 8, tool_columns=36)
     refused(video_folder, RecordingInvalid, "masks", "75%", "inverted")
 
 
-def test_a_tool_that_fills_some_frames_is_no_inversion(video_folder: Path, make: SimpleNamespace) -> None:
+def test_tool_filling_some_frames_is_not_reported_as_inverted(video_folder: Path, make: SimpleNamespace) -> None:
     for index in (2, 5):
         make.image(video_folder / "masks" / f"{index:06d}.png", np.full((make.height, make.width), 255, np.uint8))
     report = validate_recording(video_folder)
     assert report.ok and report.facts["tool_share"] == pytest.approx((6 * 0.25 + 2) / 8)
 
 
-def test_masks_that_are_not_binary(video_folder: Path, make: SimpleNamespace, refused: Refused) -> None:
+def test_non_binary_mask_is_refused(video_folder: Path, make: SimpleNamespace, refused: Refused) -> None:
     ramp = np.tile(np.arange(make.width, dtype=np.uint8), (make.height, 1))
     make.image(video_folder / "masks" / "000005.png", ramp)
     refused(video_folder, RecordingInvalid, "000005.png", "48 different values")
 
 
-def test_a_colour_picture_as_mask(video_folder: Path, make: SimpleNamespace, refused: Refused) -> None:
+def test_colour_picture_as_mask_is_refused(video_folder: Path, make: SimpleNamespace, refused: Refused) -> None:
     make.image(video_folder / "masks" / "000005.png", make.frame_image(5))
     refused(video_folder, RecordingInvalid, "000005.png", "colour picture")
 
 
 @pytest.mark.parametrize("tool", [1, 255])
-def test_masks_of_zero_and_one_or_255_in_three_equal_channels(
-    video_folder: Path, make: SimpleNamespace, tool: int
-) -> None:
+def test_masks_of_three_equal_channels_are_accepted(video_folder: Path, make: SimpleNamespace, tool: int) -> None:
     mask = np.zeros((make.height, make.width, 3), np.uint8)
     mask[:, :12] = tool
     for index in range(8):
@@ -102,7 +100,7 @@ def _edit(table: np.ndarray, row: int, column: int, value: float) -> np.ndarray:
         (lambda t: t * np.where(np.arange(17) == 14, -1, 1), ["-50 px"]),
     ],
 )
-def test_wrong_poses_bounds(
+def test_invalid_poses_bounds_are_refused(
     video_folder: Path, refused: Refused, wrong: Callable[[np.ndarray], np.ndarray], fragments: list[str]
 ) -> None:
     path = video_folder / "poses_bounds.npy"
@@ -123,13 +121,13 @@ def test_poses_bounds_are_camera_to_world_without_permutation(video_folder: Path
     assert ahead == pytest.approx([0, 0, 1, 1])  # the camera looks along +z
 
 
-def test_a_cut_off_poses_file(video_folder: Path, refused: Refused) -> None:
+def test_truncated_poses_bounds_file_is_refused(video_folder: Path, refused: Refused) -> None:
     path = video_folder / "poses_bounds.npy"
     path.write_bytes(path.read_bytes()[:300])
     refused(video_folder, RecordingInvalid, "poses_bounds.npy", "not a plain NumPy array")
 
 
-def test_a_mask_in_the_alpha_channel(video_folder: Path, make: SimpleNamespace, refused: Refused) -> None:
+def test_mask_in_alpha_channel_is_refused(video_folder: Path, make: SimpleNamespace, refused: Refused) -> None:
     mask = np.zeros((make.height, make.width, 4), np.uint8)
     mask[:, :12, 3] = 255
     assert cv2.imwrite(str(video_folder / "masks" / "000003.png"), mask)
@@ -139,12 +137,12 @@ def test_a_mask_in_the_alpha_channel(video_folder: Path, make: SimpleNamespace, 
     assert validate_recording(video_folder).ok
 
 
-def test_depth_of_another_size(endonerf_folder: Path, make: SimpleNamespace, refused: Refused) -> None:
+def test_depth_map_of_other_size_is_refused(endonerf_folder: Path, make: SimpleNamespace, refused: Refused) -> None:
     make.image(endonerf_folder / "depth" / "frame-000004.depth.png", np.ones((20, 24), np.uint8))
     refused(endonerf_folder, RecordingInvalid, "frame-000004.depth.png", "24x20", "48x40")
 
 
-def test_a_coloured_depth_map(endonerf_folder: Path, make: SimpleNamespace, refused: Refused) -> None:
+def test_coloured_depth_map_is_refused(endonerf_folder: Path, make: SimpleNamespace, refused: Refused) -> None:
     make.image(endonerf_folder / "depth" / "frame-000004.depth.png", make.frame_image(4))
     refused(endonerf_folder, RecordingInvalid, "frame-000004.depth.png", "colour picture")
 
@@ -157,7 +155,7 @@ def _npy_depths(folder: Path, depths: list[np.ndarray]) -> None:
 
 
 @pytest.mark.parametrize(("value", "shown"), [(1e10, "1e+10"), (3e38, "3e+38"), (1e-9, "1e-09")])
-def test_depth_beyond_what_training_can_compute_with(
+def test_depth_outside_supported_range_is_refused(
     endonerf_folder: Path, refused: Refused, value: float, shown: str
 ) -> None:
     depths = [np.full((40, 48), 40.0, np.float32) for _ in range(6)]
@@ -166,7 +164,7 @@ def test_depth_beyond_what_training_can_compute_with(
     refused(endonerf_folder, RecordingInvalid, "000003.npy", "1e-06 to 1e+09 mm", shown, "row 7, column 9")
 
 
-def test_float_depth(endonerf_folder: Path) -> None:
+def test_float64_npy_depth_is_read_as_float32(endonerf_folder: Path) -> None:
     depths = [np.full((40, 48), 40.125 + index, np.float64) for index in range(6)]
     _npy_depths(endonerf_folder, depths)
     for frame, depth in zip(open_recording(endonerf_folder), depths, strict=True):
@@ -174,7 +172,7 @@ def test_float_depth(endonerf_folder: Path) -> None:
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -1.0])
-def test_depth_that_is_no_distance(endonerf_folder: Path, refused: Refused, value: float) -> None:
+def test_nan_infinite_or_negative_depth_is_refused(endonerf_folder: Path, refused: Refused, value: float) -> None:
     depths = [np.full((40, 48), 40.0, np.float32) for _ in range(6)]
     depths[3][7, 9] = value
     _npy_depths(endonerf_folder, depths)
@@ -216,12 +214,14 @@ def test_validation_lists_every_bad_frame(endonerf_folder: Path) -> None:
         ),
     ],
 )
-def test_wrong_description(endonerf_folder: Path, refused: Refused, content: dict, fragments: list[str]) -> None:
+def test_invalid_recording_json_is_refused(
+    endonerf_folder: Path, refused: Refused, content: dict, fragments: list[str]
+) -> None:
     (endonerf_folder / "recording.json").write_text(json.dumps(content))
     refused(endonerf_folder, RecordingInvalid, "recording.json", *fragments)
 
 
-def test_description_gives_rate_unit_and_camera(endonerf_folder: Path) -> None:
+def test_recording_json_sets_rate_depth_unit_and_camera(endonerf_folder: Path) -> None:
     camera = {"width": 48, "height": 40, "fx": 60, "fy": 61, "cx": 22, "cy": 19}
     content = {"format": "intrasplat-recording", "version": 1, "fps": 10, "depth_unit_mm": 0.5, "camera": camera}
     (endonerf_folder / "recording.json").write_text(json.dumps(content))
@@ -233,7 +233,7 @@ def test_description_gives_rate_unit_and_camera(endonerf_folder: Path) -> None:
     assert frame.depth is not None and frame.depth[1, 1] == 20.5
 
 
-def test_description_may_begin_with_a_byte_order_mark(endonerf_folder: Path) -> None:
+def test_recording_json_may_start_with_byte_order_mark(endonerf_folder: Path) -> None:
     text = json.dumps({"format": "intrasplat-recording", "version": 1, "fps": 10})
     (endonerf_folder / "recording.json").write_text(text, "utf-8-sig")
     assert open_recording(endonerf_folder).fps == 10

@@ -32,7 +32,7 @@ def folder(endonerf_folder):
     return endonerf_folder
 
 
-def test_labels_and_scans_are_those_of_their_frames(folder):
+def test_labels_and_scans_belong_to_numbered_frames(folder):
     recording = open_recording(folder)
     assert {"labels", "ranges"} <= recording.fields
     frames = list(recording)
@@ -43,14 +43,14 @@ def test_labels_and_scans_are_those_of_their_frames(folder):
     assert scan.sensor == StructuredLight(40.0, 90.0, 8) and scan.counts.shape == (recording.width_px, 8)
 
 
-def test_they_belong_to_the_digest(folder):
+def test_recording_digest_includes_labels_and_scans(folder):
     before = open_recording(folder).digest
     (folder / "scans" / "sensor.json").write_text(json.dumps({**SENSOR, "farthest": 91}))
     assert open_recording(folder).digest != before
 
 
 @pytest.mark.parametrize("scale", [0.5, 2.0])
-def test_a_scaled_recording_has_scaled_labels_and_scans(folder, scale):
+def test_scaled_recording_scales_labels_and_scans(folder, scale):
     whole, scaled = (list(open_recording(folder, scale=each)) for each in (1.0, scale))
     assert scaled[1].labels.shape == scaled[1].image.shape[:2] and set(np.unique(scaled[1].labels)) == {2, 255}
     counts, wanted = scaled[2].ranges.counts, whole[2].ranges.counts
@@ -60,7 +60,7 @@ def test_a_scaled_recording_has_scaled_labels_and_scans(folder, scale):
         assert np.allclose(counts[0], wanted[:2].mean(0))
 
 
-def test_an_oct_line_keeps_its_share_of_the_picture(folder):
+def test_scaled_oct_line_keeps_relative_row_and_thickness(folder):
     content = {"sensor": "oct_line", "nearest": 0, "farthest": 90, "bins": 8, "row": 0.25, "thickness_px": 4}
     (folder / "scans" / "sensor.json").write_text(json.dumps(content))
     sensor = list(open_recording(folder, scale=0.5))[2].ranges.sensor
@@ -99,7 +99,7 @@ def scan(folder, counts):
         (lambda f: scan(f, np.full((48, 8), -1.0)), "in place of|negative"),
     ],
 )
-def test_a_file_that_cannot_be_used_is_named(folder, change, reason):
+def test_invalid_label_or_scan_files_are_refused(folder, change, reason):
     change(folder)
     with pytest.raises(RecordingInvalid, match=reason):
         list(open_recording(folder))

@@ -76,7 +76,7 @@ def opencv_yaml(folder):
 
 
 @pytest.mark.parametrize("write", [matlab, scared_json, ini, hamlyn, opencv_yaml])
-def test_every_layout_gives_the_same_numbers(tmp_path, write):
+def test_every_calibration_layout_reads_same_values(tmp_path, write):
     write(tmp_path)
     calibration, paths = read_stereo_calibration(tmp_path, Findings(strict=True))
     assert {path.name for path in paths} == {path.name for path in tmp_path.iterdir()}
@@ -89,7 +89,7 @@ def test_every_layout_gives_the_same_numbers(tmp_path, write):
     assert calibration.size in (None, (320, 256))
 
 
-def test_without_a_file_there_is_none(tmp_path):
+def test_stereo_calibration_is_none_without_file(tmp_path):
     assert read_stereo_calibration(tmp_path, Findings(strict=True)) is None
 
 
@@ -107,13 +107,13 @@ def test_without_a_file_there_is_none(tmp_path):
         ("stereo_calibration.yaml", "M1: 3", "there is no M1"),
     ],
 )
-def test_a_file_without_a_calibration_is_a_problem(tmp_path, name, text, sentence):
+def test_invalid_stereo_calibration_file_is_refused(tmp_path, name, text, sentence):
     (tmp_path / name).write_text(text)
     with pytest.raises(RecordingInvalid, match=sentence):
         read_stereo_calibration(tmp_path, Findings(strict=True))
 
 
-def test_swapped_eyes_in_a_calibration_are_said(tmp_path):
+def test_stereo_calibration_with_swapped_eyes_is_refused(tmp_path):
     scared_json(tmp_path)
     path = tmp_path / "calibration.json"
     content = json.loads(path.read_text())
@@ -123,7 +123,7 @@ def test_swapped_eyes_in_a_calibration_are_said(tmp_path):
         read_stereo_calibration(tmp_path, Findings(strict=True))
 
 
-def test_a_file_of_any_length_is_not_read(tmp_path):
+def test_oversized_stereo_calibration_file_is_refused(tmp_path):
     (tmp_path / "calibration.m").write_bytes(b" " * (2 << 20))
     with pytest.raises(RecordingInvalid, match="more than"):
         read_stereo_calibration(tmp_path, Findings(strict=True))

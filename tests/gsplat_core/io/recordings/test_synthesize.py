@@ -17,7 +17,7 @@ def _bytes(folder: Path) -> dict[str, bytes]:
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def test_reads_back_without_a_note(synthetic_folder: Path) -> None:
+def test_synthesized_recording_opens_without_notes(synthetic_folder: Path) -> None:
     recording = open_recording(synthetic_folder)
     assert recording.notes == ()
     assert (recording.frame_count, recording.width_px, recording.height_px, recording.fps) == (4, 96, 80, 3)
@@ -31,7 +31,7 @@ def test_reads_back_without_a_note(synthetic_folder: Path) -> None:
 
 
 @pytest.mark.slow
-def test_same_arguments_same_bytes(tmp_path: Path) -> None:
+def test_synthesize_with_same_arguments_gives_same_bytes(tmp_path: Path) -> None:
     arguments = {"frames": 2, "width_px": 48, "height_px": 40, "fps": 2, "seed": 11}
     first = _bytes(synthesize(tmp_path / "a", **arguments))
     assert first == _bytes(synthesize(tmp_path / "b", **arguments))
@@ -40,7 +40,7 @@ def test_same_arguments_same_bytes(tmp_path: Path) -> None:
     assert first["images/frame-000000.color.png"] != other["images/frame-000000.color.png"]
 
 
-def test_fixed_camera_without_stereo(tmp_path: Path) -> None:
+def test_synthesize_fixed_camera_without_stereo(tmp_path: Path) -> None:
     done: list[tuple[int, int]] = []
     folder = synthesize(
         tmp_path / "x", frames=2, width_px=48, height_px=40, stereo=False, progress=lambda *at: done.append(at)
@@ -52,7 +52,7 @@ def test_fixed_camera_without_stereo(tmp_path: Path) -> None:
     assert [entry.name for entry in tmp_path.iterdir()] == ["x"]  # nothing half-written stays
 
 
-def test_description_states_the_ground_truth(synthetic_folder: Path) -> None:
+def test_synthesize_description_lists_ground_truth(synthetic_folder: Path) -> None:
     content = json.loads((synthetic_folder / "recording.json").read_text())
     assert content["depth_unit_mm"] == 0.01 and content["units"] == "mm" and content["seed"] == 5
     assert set(content["ground_truth"]) == {
@@ -66,7 +66,7 @@ def test_description_states_the_ground_truth(synthetic_folder: Path) -> None:
 
 
 @pytest.mark.slow
-def test_replaces_its_own_work_and_nothing_else(tmp_path: Path) -> None:
+def test_synthesize_overwrites_only_own_folder(tmp_path: Path) -> None:
     arguments = {"width_px": 48, "height_px": 40, "stereo": False}
     folder = synthesize(tmp_path / "x", frames=2, **arguments)
     assert open_recording(synthesize(folder, frames=1, **arguments)).frame_count == 1
@@ -78,7 +78,7 @@ def test_replaces_its_own_work_and_nothing_else(tmp_path: Path) -> None:
         synthesize(folder / "thesis.txt", frames=1, **arguments)
 
 
-def test_replaces_a_recording_with_every_extra(tmp_path: Path) -> None:
+def test_synthesize_overwrites_recording_with_every_extra(tmp_path: Path) -> None:
     extras = Extras(third=True, flow=True, tracks=True, behind=True, depth_noise_mm=0.1)
     arguments = {"frames": 1, "width_px": 32, "height_px": 32, "extras": extras}
     first = _bytes(synthesize(tmp_path / "x", **arguments))
@@ -86,7 +86,7 @@ def test_replaces_a_recording_with_every_extra(tmp_path: Path) -> None:
     assert _bytes(synthesize(tmp_path / "x", **arguments)) == first
 
 
-def test_a_failure_leaves_nothing_behind(tmp_path: Path) -> None:
+def test_interrupted_synthesize_leaves_no_files(tmp_path: Path) -> None:
     def stop(done: int, frames: int) -> None:
         raise KeyboardInterrupt
 
@@ -98,7 +98,7 @@ def test_a_failure_leaves_nothing_behind(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "arguments", [{"frames": 0}, {"width_px": 8}, {"fps": 0}, {"seed": -1}, {"camera": "flying"}, {"height_px": 10**6}]
 )
-def test_arguments_out_of_range(tmp_path: Path, arguments: dict) -> None:
+def test_synthesize_refuses_arguments_out_of_range(tmp_path: Path, arguments: dict) -> None:
     with pytest.raises(InvalidSetting, match=str(next(iter(arguments.values())))):
         synthesize(tmp_path / "x", **arguments)
     assert list(tmp_path.iterdir()) == []

@@ -44,7 +44,7 @@ def _within(pixels: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("time_s", [0.0, 1.2])
-def test_the_third_depth_agrees_with_the_first_where_both_see(scene: SyntheticScene, time_s: float) -> None:
+def test_third_view_depth_agrees_with_first_view(scene: SyntheticScene, time_s: float) -> None:
     first, third = scene.render(time_s), scene.render(time_s, "third")
     cameras = scene.camera_at(time_s), scene.camera_at(time_s, "third")
     assert np.linalg.norm(cameras[1].position - cameras[0].position) > 5
@@ -59,7 +59,7 @@ def test_the_third_depth_agrees_with_the_first_where_both_see(scene: SyntheticSc
 
 
 @pytest.mark.parametrize("view", ["left", "third"])
-def test_a_ray_into_the_tube_meets_it_once(view: View) -> None:
+def test_ray_into_colon_meets_surface_once(view: View) -> None:
     tube = SyntheticScene.from_seed(3, 128, 96, 4.0, True, COLON)
     for time_s in (0.0, 1.1, 2.6):
         camera = tube.camera_at(time_s, view)
@@ -72,7 +72,7 @@ def test_a_ray_into_the_tube_meets_it_once(view: View) -> None:
         assert z.min() < 1.5 * COLON_RADIUS_MM and z.max() > 0.8 * COLON_LENGTH_MM
 
 
-def test_derivatives_of_the_tube() -> None:
+def test_colon_surface_derivatives_equal_finite_differences() -> None:
     tissue = Colon(np.random.default_rng(1), 1.0)
     u, v = np.meshgrid(np.linspace(-38, 38, 11), np.linspace(-31, 31, 9))
     step = 1e-3
@@ -83,7 +83,7 @@ def test_derivatives_of_the_tube() -> None:
             assert along[axis] == pytest.approx((ahead.position[axis] - behind.position[axis]) / (2 * step), abs=2e-3)
 
 
-def test_near_light_dominates_in_the_tube() -> None:
+def test_colon_brightness_falls_with_distance() -> None:
     """Brightness falls with the square of the distance and with the cosine: the end of the tube is dark."""
     tube = SyntheticScene.from_seed(0, 128, 96, 2.4, False, COLON)
     eye = tube.render(0.0)
@@ -92,7 +92,7 @@ def test_near_light_dominates_in_the_tube() -> None:
     assert not eye.tool.any()
 
 
-def test_light_falls_with_the_square_of_the_distance() -> None:
+def test_lamp_light_falls_with_square_of_distance() -> None:
     lamp = Lamp.of_eye(0.0)
     ahead = np.array([[0, 0, 50.0], [0, 0, 100.0]], np.float32)
     arriving = sum(power for _, power in lamp.rays_to(ahead))
@@ -104,7 +104,7 @@ def test_light_falls_with_the_square_of_the_distance() -> None:
     assert np.linalg.norm(turned.axis) == pytest.approx(1) and not np.allclose(turned.axis, lamp.axis)
 
 
-def test_flow_carries_a_frame_onto_the_next(scene: SyntheticScene) -> None:
+def test_true_flow_maps_material_points_to_next_frame(scene: SyntheticScene) -> None:
     now_s, next_s = 0.9, 0.9 + 1 / 12
     now, then = scene.render(now_s), scene.render(next_s)
     motion = motion_to(scene, now, now_s, next_s)
@@ -124,7 +124,7 @@ def test_flow_carries_a_frame_onto_the_next(scene: SyntheticScene) -> None:
     assert np.quantile(np.abs(_lookup(then.tissue_depth, pixels) - z) / z, 0.99) < 0.01
 
 
-def test_points_are_seen_where_nothing_is_before_them() -> None:
+def test_seen_points_excludes_points_behind_tool() -> None:
     scene = SyntheticScene.from_seed(3, 128, 96, 2.4, False)
     hidden = 0
     for time_s in (0.0, 1.2):
@@ -148,7 +148,7 @@ def everything(tmp_path_factory) -> Path:
 
 
 @pytest.mark.slow
-def test_it_reads_back(everything: Path) -> None:
+def test_synthetic_extras_read_back(everything: Path) -> None:
     recording = open_recording(everything)
     assert recording.notes == () and validate_recording(everything).ok
     truth = open_truth(everything, recording.frame_count)
@@ -172,7 +172,7 @@ def test_it_reads_back(everything: Path) -> None:
     assert half.read(0).image.shape == (48, 64, 3) and half.camera.width_px == 64
 
 
-def test_training_does_not_get_what_is_for_evaluation(everything: Path, tmp_path: Path) -> None:
+def test_evaluation_files_do_not_change_training_data(everything: Path, tmp_path: Path) -> None:
     extras = Extras(smoke=0.5, depth_noise_mm=0.8, exposure_changes=True, scene="colon")
     plain = synthesize(tmp_path / "plain", frames=3, fps=3, seed=5, extras=extras, **SIZE)
     for name in ("images", "images_right", "masks", "depth"):
@@ -185,7 +185,7 @@ def test_training_does_not_get_what_is_for_evaluation(everything: Path, tmp_path
 
 
 @pytest.mark.slow
-def test_smoke_and_exposure_change_pictures_alone() -> None:
+def test_smoke_and_exposure_change_only_pictures() -> None:
     clear = SyntheticScene.from_seed(3, 64, 48, 2.0, False)
     smoky = SyntheticScene.from_seed(3, 64, 48, 2.0, False, Extras(smoke=1.0))
     bright = SyntheticScene.from_seed(3, 64, 48, 2.0, False, Extras(exposure_changes=True))
@@ -200,7 +200,7 @@ def test_smoke_and_exposure_change_pictures_alone() -> None:
 
 
 @pytest.mark.slow
-def test_the_same_arguments_give_the_same_bytes(everything: Path, tmp_path: Path) -> None:
+def test_synthesize_with_extras_gives_same_bytes(everything: Path, tmp_path: Path) -> None:
     again = synthesize(
         tmp_path / "again",
         frames=3,
@@ -220,6 +220,6 @@ def test_the_same_arguments_give_the_same_bytes(everything: Path, tmp_path: Path
 
 
 @pytest.mark.parametrize("wrong", [{"scene": "bladder"}, {"smoke": -1.0}, {"depth_noise_mm": float("nan")}])
-def test_extras_out_of_range(wrong: dict) -> None:
+def test_extras_refuse_values_out_of_range(wrong: dict) -> None:
     with pytest.raises(InvalidSetting, match=str(next(iter(wrong.values())))):
         Extras(**wrong)

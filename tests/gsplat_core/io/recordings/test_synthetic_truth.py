@@ -41,7 +41,7 @@ def _project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 @pytest.mark.parametrize("time_s", TIMES_S)
-def test_rays_meet_the_surface(scene: SyntheticScene, time_s: float) -> None:
+def test_cast_tissue_hits_project_to_pixel_centres(scene: SyntheticScene, time_s: float) -> None:
     """Newton's method has converged: the material point found projects to the centre of the pixel."""
     camera, tug = scene.camera_at(time_s), scene.motion.tug(time_s)
     _, _, points = cast_tissue(scene.tissue, tug, camera, *pixel_rays(camera), time_s)
@@ -51,7 +51,7 @@ def test_rays_meet_the_surface(scene: SyntheticScene, time_s: float) -> None:
 
 
 @pytest.mark.parametrize("time_s", TIMES_S)
-def test_tissue_never_folds_over(scene: SyntheticScene, time_s: float) -> None:
+def test_rendered_tissue_does_not_fold(scene: SyntheticScene, time_s: float) -> None:
     """Each ray meets the sheet once: seen from the camera, (u, v) keeps its orientation everywhere in view."""
     eye = scene.render(time_s)
     u_column, u_row = np.gradient(eye.u, axis=1), np.gradient(eye.u, axis=0)
@@ -60,7 +60,7 @@ def test_tissue_never_folds_over(scene: SyntheticScene, time_s: float) -> None:
     assert area.min() > 0.1 * np.median(area)
 
 
-def test_derivatives_of_the_surface(scene: SyntheticScene) -> None:
+def test_tissue_derivatives_equal_finite_differences(scene: SyntheticScene) -> None:
     u, v = np.meshgrid(np.linspace(-30, 30, 13), np.linspace(-25, 25, 11))
     tug = scene.motion.tug(1.2)
     assert np.linalg.norm(tug.pull) > 5
@@ -76,7 +76,7 @@ def test_derivatives_of_the_surface(scene: SyntheticScene) -> None:
 
 
 @pytest.mark.parametrize("time_s", TIMES_S)
-def test_depth_carries_the_left_image_onto_the_right_one(scene: SyntheticScene, time_s: float) -> None:
+def test_depth_maps_left_image_to_right_image(scene: SyntheticScene, time_s: float) -> None:
     left, right = scene.render(time_s), scene.render(time_s, "right")
     camera = scene.camera_at(time_s)
     pose = camera.world_to_camera.copy()
@@ -101,7 +101,7 @@ def test_depth_carries_the_left_image_onto_the_right_one(scene: SyntheticScene, 
 
 
 @pytest.mark.parametrize("time_s", TIMES_S)
-def test_mask_and_depth_of_the_tool(scene: SyntheticScene, time_s: float) -> None:
+def test_tool_mask_and_depth_match_tool_surface(scene: SyntheticScene, time_s: float) -> None:
     eye = scene.render(time_s)
     camera = scene.camera_at(time_s)
     gap, _ = distance(scene.motion.parts(scene.tissue, time_s), _backproject(camera, eye.depth).astype(np.float32))
@@ -116,7 +116,7 @@ def test_mask_and_depth_of_the_tool(scene: SyntheticScene, time_s: float) -> Non
     assert (grown | ~eye.tool).all()
 
 
-def test_the_tool_holds_the_tissue_while_it_pulls(scene: SyntheticScene) -> None:
+def test_tool_touches_tissue_while_pulling(scene: SyntheticScene) -> None:
     moved = 0.0
     rest = scene.tissue.position(scene.motion.tug(0.7).grasp, 0.0, scene.motion.tug(0.0))
     for time_s in np.linspace(0.65, 1.75, 12):
@@ -149,7 +149,7 @@ def test_texture_moves_with_the_tissue(scene: SyntheticScene) -> None:
     assert stayed > 3 * followed
 
 
-def test_the_same_scene_at_another_size() -> None:
+def test_scene_at_other_size_shows_same_depth() -> None:
     small = SyntheticScene.from_seed(3, 64, 48, 2.4, moving=False).render(1.0)
     large = SyntheticScene.from_seed(3, 192, 144, 2.4, moving=False).render(1.0)
     # The centre pixel of each 3 x 3 block is the same ray.
@@ -159,7 +159,7 @@ def test_the_same_scene_at_another_size() -> None:
     assert np.median(difference) < 8
 
 
-def test_files_hold_what_was_rendered(synthetic_folder: Path) -> None:
+def test_synthesized_files_equal_rendered_frames(synthetic_folder: Path) -> None:
     scene = SyntheticScene.from_seed(5, 96, 80, 4 / 3, moving=True)
     recording = open_recording(synthetic_folder)
     tracks = np.load(synthetic_folder / "tracks.npy", allow_pickle=False)

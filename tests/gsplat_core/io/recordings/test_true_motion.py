@@ -25,7 +25,7 @@ def frame(seq: int, width: int, height: int) -> Frame:
     return Frame(seq=seq, pts_ns=0, image=np.zeros((height, width, 3), np.uint8))
 
 
-def test_flow_is_as_long_as_the_picture_is_large(tmp_path):
+def test_flow_is_scaled_to_frame_size(tmp_path):
     flow = np.full((2, 20, 30, 2), (6.0, -4.0), np.float32)
     flow[0, 10:, 15:] = np.nan
     motion = open_motion(written(tmp_path, flow, np.full((2, 20, 30, 3), 5.0)), 3)
@@ -38,19 +38,19 @@ def test_flow_is_as_long_as_the_picture_is_large(tmp_path):
     assert motion.of(frame(2, 30, 20)) is None  # nothing leads on from the last frame
 
 
-def test_what_is_not_there_is_none(tmp_path):
+def test_missing_flow_or_scene_flow_is_none(tmp_path):
     assert open_motion(tmp_path, 3) is None
     motion = open_motion(written(tmp_path, np.zeros((3, 8, 8, 2))), 3)
     assert motion.of(frame(0, 8, 8)).scene_flow is None
 
 
 @pytest.mark.parametrize("shape", [(20, 30), (20, 30, 3), (30, 20, 2), (0, 30, 2), (20, 20, 2)])
-def test_another_shape_is_refused(tmp_path, shape):
+def test_flow_file_of_wrong_shape_is_refused(tmp_path, shape):
     motion = open_motion(written(tmp_path, np.zeros((1, *shape), np.float32)), 2)
     with pytest.raises(RecordingInvalid, match=r"000000\.npy"):
         motion.of(frame(0, 30, 20))
 
 
-def test_too_few_files_are_refused(tmp_path):
+def test_too_few_flow_files_are_refused(tmp_path):
     with pytest.raises(RecordingInvalid, match="2 files for 4 frames"):
         open_motion(written(tmp_path, np.zeros((2, 8, 8, 2))), 4)

@@ -62,7 +62,7 @@ def write_recording(folder: Path, model: str, make: SimpleNamespace, changes: di
 
 
 @pytest.mark.parametrize("model", LENSES)
-def test_frames_are_those_of_the_camera_without_distortion(tmp_path: Path, make: SimpleNamespace, model: str) -> None:
+def test_undistorted_frames_match_ideal_camera(tmp_path: Path, make: SimpleNamespace, model: str) -> None:
     recording = open_recording(write_recording(tmp_path, model, make))
     frame = next(iter(recording))
     camera = recording.camera
@@ -80,7 +80,7 @@ def test_frames_are_those_of_the_camera_without_distortion(tmp_path: Path, make:
     assert validate_recording(tmp_path).ok
 
 
-def test_recording_json_states_distortion_too(tmp_path: Path, make: SimpleNamespace) -> None:
+def test_distortion_in_recording_json_is_applied(tmp_path: Path, make: SimpleNamespace) -> None:
     write_recording(tmp_path, "pinhole", make)
     expected = next(iter(open_recording(tmp_path))).image
     content = json.loads((tmp_path / "cameras.json").read_text())
@@ -91,7 +91,7 @@ def test_recording_json_states_distortion_too(tmp_path: Path, make: SimpleNamesp
     assert np.array_equal(next(iter(open_recording(tmp_path))).image, expected)
 
 
-def test_the_valid_mask_is_undistorted_once(tmp_path: Path, make: SimpleNamespace) -> None:
+def test_valid_mask_is_undistorted_once(tmp_path: Path, make: SimpleNamespace) -> None:
     write_recording(tmp_path, "pinhole", make)
     make.image(tmp_path / "valid_mask.png", np.where(grid()[..., 0] < 80, 255, 0).astype(np.uint8))
     with_valid = next(iter(open_recording(tmp_path))).mask
@@ -116,14 +116,16 @@ def test_impossible_distortion_is_refused(
     refused(write_recording(tmp_path, "pinhole", make, changes), RecordingInvalid, "cameras.json", words)
 
 
-def test_two_eyes_need_a_stereo_calibration(tmp_path: Path, make: SimpleNamespace, refused: Callable[..., str]) -> None:
+def test_distortion_with_right_images_requires_stereo_calibration(
+    tmp_path: Path, make: SimpleNamespace, refused: Callable[..., str]
+) -> None:
     write_recording(tmp_path, "pinhole", make)
     for index in range(2):
         make.image(tmp_path / "images_right" / f"{index}.png", np.zeros((H, W, 3), np.uint8))
     refused(tmp_path, RecordingInvalid, "distortion of one eye", "stereo calibration file")
 
 
-def test_a_picture_full_of_content_has_no_mask_and_an_ortho_camera_no_distortion() -> None:
+def test_undistortion_has_no_mask_for_full_picture_and_refuses_ortho() -> None:
     assert Undistortion(Camera(K, W, H), LENSES["pinhole"]).inside is None
     with pytest.raises(InvalidInput, match="ortho has no distortion"):
         Undistortion(Camera(K, W, H, model="ortho"), [0.1] * 4)

@@ -29,13 +29,13 @@ def take(folder, mask):
     ],
     ids=["gradient", "noise", "two greys", "one grey", "three values"],
 )
-def test_a_picture_that_is_no_mask_is_refused(tmp_path, mask):
+def test_valid_mask_of_other_values_is_refused(tmp_path, mask):
     with pytest.raises(RecordingInvalid, match="different values"):
         open_recording(take(tmp_path, mask))
 
 
 @pytest.mark.parametrize("white", [1, 255])
-def test_masks_of_two_values_are_read(tmp_path, white):
+def test_valid_mask_of_two_values_is_read(tmp_path, white):
     mask = np.zeros((32, 48), np.uint8)
     mask[4:28, 4:44] = white
     assert open_recording(take(tmp_path, mask)).frame_count == 2

@@ -24,7 +24,7 @@ from tests.gsplat_core.io.recordings import videos
 Refused = Callable[..., str]
 
 
-def test_reads_frames_masks_and_poses(video_folder: Path, make: SimpleNamespace) -> None:
+def test_video_folder_frames_masks_and_poses(video_folder: Path, make: SimpleNamespace) -> None:
     recording = open_recording(video_folder)
     assert isinstance(recording, Recording)
     assert (recording.name, recording.frame_count, recording.width_px, recording.height_px) == ("rec", 8, 48, 40)
@@ -44,7 +44,7 @@ def test_reads_frames_masks_and_poses(video_folder: Path, make: SimpleNamespace)
         assert frame.status is FrameStatus.REPLAY
 
 
-def test_iterates_again_and_in_parallel(video_folder: Path) -> None:
+def test_recording_supports_parallel_iterators(video_folder: Path) -> None:
     recording = open_recording(video_folder)
     first, second = iter(recording), iter(recording)
     for a in first:
@@ -83,14 +83,14 @@ def times_ms(recording: Recording) -> list[float]:
 
 
 @pytest.mark.parametrize(("ticks", "is_noted"), [([0, 1, 2, 50, 51, 900], True), ([0, 3, 6, 9, 12, 15], False)])
-def test_frames_keep_their_times_in_the_file(tmp_path: Path, ticks: list[int], is_noted: bool) -> None:
+def test_video_frames_keep_timestamps_of_file(tmp_path: Path, ticks: list[int], is_noted: bool) -> None:
     videos.write_timed(tmp_path / "v.mkv", ticks)
     recording = open_recording(tmp_path / "v.mkv")
     assert [frame.pts_ns for frame in recording] == [tick * 40_000_000 for tick in ticks]
     assert any("0.04 to 34 s apart" in note for note in recording.notes) == is_noted
 
 
-def test_even_times_are_multiples_of_the_frame_duration(tmp_path: Path) -> None:
+def test_even_timestamps_are_multiples_of_frame_duration(tmp_path: Path) -> None:
     """Matroska rounds times to milliseconds."""
     videos.write_timed(tmp_path / "v.mkv", [0, 1, 2, 3, 4, 5])
     recording = open_recording(tmp_path / "v.mkv")
@@ -103,9 +103,7 @@ VARIABLE_MS = [0, 33, 99, 132, 232, 265, 331, 364, 464]
 
 @pytest.mark.parametrize("suffix", [".mkv", ".mp4"])
 @pytest.mark.parametrize("start_ms", [0, 5000])
-def test_a_variable_frame_rate_gives_the_files_times_and_the_mean_rate(
-    tmp_path: Path, suffix: str, start_ms: int
-) -> None:
+def test_variable_frame_rate_keeps_timestamps_and_mean_rate(tmp_path: Path, suffix: str, start_ms: int) -> None:
     path = tmp_path / f"v{suffix}"
     videos.write_timed(path, [start_ms + time for time in VARIABLE_MS], 30, Fraction(1, 1000))
     recording = open_recording(path)
@@ -117,7 +115,7 @@ def test_a_variable_frame_rate_gives_the_files_times_and_the_mean_rate(
 
 @pytest.mark.parametrize("suffix", [".mkv", ".mp4"])
 @pytest.mark.parametrize(("off_ms", "is_kept"), [(8, True), (1, False)])
-def test_times_within_half_a_frame_are_kept_unless_the_container_rounded_them(
+def test_uneven_timestamps_are_kept_unless_rounded_by_container(
     tmp_path: Path, suffix: str, off_ms: int, is_kept: bool
 ) -> None:
     even = [40 * index for index in range(9)]
@@ -127,7 +125,7 @@ def test_times_within_half_a_frame_are_kept_unless_the_container_rounded_them(
     assert any("apart" in note for note in recording.notes) == is_kept
 
 
-def test_a_constant_rate_has_the_times_of_its_rate_in_a_file_that_rounds_them(tmp_path: Path) -> None:
+def test_constant_rate_timestamps_are_restored_from_rounded_ones(tmp_path: Path) -> None:
     path = videos.write_timed(
         tmp_path / "v.mkv", [round(index * 1000 / 30) for index in range(12)], 30, Fraction(1, 1000)
     )
@@ -136,7 +134,7 @@ def test_a_constant_rate_has_the_times_of_its_rate_in_a_file_that_rounds_them(tm
     assert not any("apart" in note for note in recording.notes)
 
 
-def test_evenly_spaced_times_replace_a_stated_rate_that_is_wrong(tmp_path: Path) -> None:
+def test_even_timestamps_override_wrong_stated_rate(tmp_path: Path) -> None:
     path = videos.write_timed(tmp_path / "v.mkv", [20 * index for index in range(12)], 25, Fraction(1, 1000))
     recording = open_recording(path)
     assert recording.fps == pytest.approx(50)
@@ -151,7 +149,7 @@ def test_evenly_spaced_times_replace_a_stated_rate_that_is_wrong(tmp_path: Path)
         ([0, 40, 120, 80, 160, 200], "its frame times go backwards 1 times"),
     ],
 )
-def test_times_that_do_not_increase_are_replaced_by_the_rate(tmp_path: Path, changed: list[int], said: str) -> None:
+def test_non_increasing_timestamps_are_replaced_by_frame_rate(tmp_path: Path, changed: list[int], said: str) -> None:
     path = videos.write_timed(tmp_path / "v.mkv", list(range(6)))
     videos.set_times(path, changed)
     recording = open_recording(path)
@@ -161,7 +159,7 @@ def test_times_that_do_not_increase_are_replaced_by_the_rate(tmp_path: Path, cha
     assert any(f"{said}. Its frames are taken as evenly spaced, at 25 frames/s" in note for note in recording.notes)
 
 
-def test_a_stated_rate_does_not_change_the_times_of_a_variable_rate(tmp_path: Path) -> None:
+def test_stated_rate_does_not_change_variable_frame_times(tmp_path: Path) -> None:
     videos.write_timed(tmp_path / "video.mkv", VARIABLE_MS, 30, Fraction(1, 1000))
     (tmp_path / "recording.json").write_text(
         '{"format": "intrasplat-recording", "version": 1, "fps": 60}', encoding="utf-8"
@@ -176,7 +174,7 @@ def test_a_video_longer_than_a_day_is_refused(tmp_path: Path, refused: Refused) 
     refused(tmp_path / "v.mkv", RecordingInvalid, "86401 s after the first one", "25 frames/s")
 
 
-def test_a_path_that_is_neither_file_nor_folder_is_named(tmp_path: Path, refused: Refused) -> None:
+def test_pipe_and_broken_symlink_are_refused(tmp_path: Path, refused: Refused) -> None:
     os.mkfifo(tmp_path / "pipe.mp4")
     refused(tmp_path / "pipe.mp4", RecordingMissing, "not a plain file")
     (tmp_path / "loop.mp4").symlink_to(tmp_path / "loop.mp4")
@@ -185,7 +183,7 @@ def test_a_path_that_is_neither_file_nor_folder_is_named(tmp_path: Path, refused
     refused(tmp_path / "lost.mp4", RecordingMissing, "leads to nothing")
 
 
-def test_max_frames_and_scale(video_folder: Path) -> None:
+def test_open_recording_with_max_frames_and_scale(video_folder: Path) -> None:
     recording = open_recording(video_folder, scale=0.5, max_frames=3)
     frames = list(recording)
     assert len(frames) == recording.frame_count == 3
@@ -198,31 +196,31 @@ def test_max_frames_and_scale(video_folder: Path) -> None:
     assert np.abs(frames[0].image - means).max() <= 1  # the area filter is the mean of 2 x 2 pixels
 
 
-def test_missing(tmp_path: Path, refused: Refused) -> None:
+def test_open_recording_of_missing_path_is_refused(tmp_path: Path, refused: Refused) -> None:
     refused(tmp_path / "nowhere", RecordingMissing, "nowhere", "no such file or folder")
 
 
-def test_empty_folder(tmp_path: Path, refused: Refused) -> None:
+def test_open_recording_of_empty_folder_is_refused(tmp_path: Path, refused: Refused) -> None:
     refused(tmp_path, RecordingMissing, str(tmp_path), "the folder is empty")
 
 
-def test_folder_with_something_else(tmp_path: Path, refused: Refused) -> None:
+def test_folder_without_recording_is_refused(tmp_path: Path, refused: Refused) -> None:
     (tmp_path / "notes.txt").write_text("hello")
     refused(tmp_path, RecordingMissing, "notes.txt")
 
 
-def test_text_file_named_mp4(tmp_path: Path, refused: Refused, capfd: pytest.CaptureFixture[str]) -> None:
+def test_text_file_named_mp4_is_refused(tmp_path: Path, refused: Refused, capfd: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "video.mp4").write_text("this is no video\n" * 50)
     refused(tmp_path, RecordingInvalid, "video.mp4", "is not a video", "this is no v")
     assert capfd.readouterr().err == ""
 
 
-def test_empty_file_named_mp4(tmp_path: Path, refused: Refused) -> None:
+def test_empty_file_named_mp4_is_refused(tmp_path: Path, refused: Refused) -> None:
     (tmp_path / "video.mp4").touch()
     refused(tmp_path / "video.mp4", RecordingInvalid, "empty (0 bytes)")
 
 
-def test_video_cut_in_half(video_folder: Path, refused: Refused, capfd: pytest.CaptureFixture[str]) -> None:
+def test_mp4_cut_in_half_is_refused(video_folder: Path, refused: Refused, capfd: pytest.CaptureFixture[str]) -> None:
     video = video_folder / "video.mp4"
     size = video.stat().st_size
     os.truncate(video, size // 2)
@@ -230,19 +228,19 @@ def test_video_cut_in_half(video_folder: Path, refused: Refused, capfd: pytest.C
     assert capfd.readouterr().err == ""
 
 
-def test_video_cut_between_its_parts(video_folder: Path, refused: Refused) -> None:
+def test_mp4_without_index_is_refused(video_folder: Path, refused: Refused) -> None:
     video = video_folder / "video.mp4"
     os.truncate(video, video.read_bytes().index(b"moov") - 4)
     refused(video_folder, RecordingInvalid, "cut off", "index", "missing")
 
 
-def test_avi_cut_in_half(tmp_path: Path, make: SimpleNamespace, refused: Refused) -> None:
+def test_avi_cut_in_half_is_refused(tmp_path: Path, make: SimpleNamespace, refused: Refused) -> None:
     make.video(tmp_path / "v.avi", 7, codec="MJPG")
     os.truncate(tmp_path / "v.avi", (tmp_path / "v.avi").stat().st_size // 2)
     refused(tmp_path / "v.avi", RecordingInvalid, "cut off")
 
 
-def test_frames_that_end_early(video_folder: Path) -> None:
+def test_video_with_fewer_frames_than_announced_is_refused(video_folder: Path) -> None:
     """The container is complete and announces 8 frames, but its data stops making sense after some."""
     video = video_folder / "video.mp4"
     data = bytearray(video.read_bytes())
@@ -261,7 +259,7 @@ def test_frames_that_end_early(video_folder: Path) -> None:
     assert len(list(open_recording(video_folder, max_frames=len(seen)))) == len(seen)
 
 
-def test_digest_tells_recordings_apart(video_folder: Path, tmp_path: Path) -> None:
+def test_recording_digest_changes_with_content(video_folder: Path, tmp_path: Path) -> None:
     digest = open_recording(video_folder).digest
     assert len(digest) == 64
     shutil.copytree(video_folder, tmp_path / "copy")
@@ -272,7 +270,7 @@ def test_digest_tells_recordings_apart(video_folder: Path, tmp_path: Path) -> No
     assert open_recording(tmp_path / "copy").digest != digest
 
 
-def test_one_frame_is_accepted_with_a_note(tmp_path: Path, make: SimpleNamespace) -> None:
+def test_video_of_one_frame_is_accepted_with_note(tmp_path: Path, make: SimpleNamespace) -> None:
     make.video(tmp_path / "one.mp4", 1)
     recording = open_recording(tmp_path / "one.mp4")
     assert len(list(recording)) == 1
@@ -283,17 +281,17 @@ def test_one_frame_is_accepted_with_a_note(tmp_path: Path, make: SimpleNamespace
 @pytest.mark.parametrize(
     "arguments", [{"scale": 0}, {"scale": float("nan")}, {"scale": float("inf")}, {"max_frames": 0}]
 )
-def test_bad_arguments(video_folder: Path, arguments: dict[str, float]) -> None:
+def test_open_recording_refuses_invalid_arguments(video_folder: Path, arguments: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=next(iter(arguments))):
         open_recording(video_folder, **arguments)
 
 
-def test_camera_of_a_frame_that_is_not_there(video_folder: Path) -> None:
+def test_camera_at_refuses_frame_out_of_range(video_folder: Path) -> None:
     with pytest.raises(ValueError, match="frame 8 is not in the recording"):
         open_recording(video_folder).camera_at(8)
 
 
-def test_one_conversion_for_frames_of_changing_size_and_format_gives_the_bytes_of_one_for_each(
+def test_picture_converter_reuse_equals_separate_conversions(
     rng: np.random.Generator,
 ) -> None:
     shared = PictureConverter()
@@ -330,9 +328,7 @@ def _video_with(path: Path, streams: int = 1, pixel_shape: Fraction | None = Non
         ({"streams": 2}, "holds 2 videos"),
     ],
 )
-def test_a_format_that_changes_the_picture_is_noted(
-    tmp_path: Path, settings: dict[str, Any], noted: str | None
-) -> None:
+def test_unusual_video_format_is_noted(tmp_path: Path, settings: dict[str, Any], noted: str | None) -> None:
     notes = open_recording(_video_with(tmp_path / "v.mkv", **settings)).notes
     for fragment in ("not square", "interlaced", "videos"):
         assert any(fragment in note for note in notes) == (noted is not None and fragment in noted)

@@ -28,7 +28,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_pictures_alone_are_a_view(folder: Path) -> None:
+def test_view_requires_only_pictures(folder: Path) -> None:
     (folder / "views.json").write_text(json.dumps(described()))
     (view,) = open_views(folder, 3)
     frame = view.read(2)
@@ -56,7 +56,7 @@ def test_pictures_alone_are_a_view(folder: Path) -> None:
         ({"left_to_view": [["a"] * 4] * 4}, "is no pose"),
     ],
 )
-def test_what_is_wrong_is_said(folder: Path, changes: dict[str, Any], said: str) -> None:
+def test_open_views_refuses_invalid_view(folder: Path, changes: dict[str, Any], said: str) -> None:
     (folder / "views.json").write_text(json.dumps(described(**changes)))
     with pytest.raises(RecordingError, match=said):
         open_views(folder, 3)
@@ -72,13 +72,13 @@ def test_what_is_wrong_is_said(folder: Path, changes: dict[str, Any], said: str)
         ({**described(), "depth_unit_mm": "wide"}, "depth_unit_mm is 'wide'"),
     ],
 )
-def test_a_description_that_is_none(folder: Path, content: Any, said: str) -> None:
+def test_open_views_refuses_invalid_description(folder: Path, content: Any, said: str) -> None:
     (folder / "views.json").write_text(json.dumps(content))
     with pytest.raises(RecordingError, match=said):
         open_views(folder, 3)
 
 
-def test_links_do_not_lead_out(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_open_views_refuses_link_out_of_folder(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
     elsewhere = tmp_path_factory.mktemp("elsewhere")
     write_images(elsewhere / "images", 3)
     (folder / "views" / "far").symlink_to(elsewhere)
@@ -88,7 +88,7 @@ def test_links_do_not_lead_out(folder: Path, tmp_path_factory: pytest.TempPathFa
 
 
 @pytest.mark.parametrize("name", ["tracks.npy", "tracks_seen.npy"])
-def test_tracks_that_fit_nothing(folder: Path, name: str) -> None:
+def test_open_truth_refuses_tracks_of_wrong_shape(folder: Path, name: str) -> None:
     fits: dict[str, Callable[[], np.ndarray]] = {
         "tracks.npy": lambda: np.zeros((3, 5, 3), np.float32),
         "tracks_seen.npy": lambda: np.ones((3, 5), np.uint8),

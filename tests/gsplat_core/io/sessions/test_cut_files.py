@@ -57,7 +57,7 @@ def whole_before(path: Path, at: int) -> int:
         )
 
 
-def test_the_session_is_as_the_tests_below_expect(session, frames):
+def test_session_fixture_has_expected_files_and_segments(session, frames):
     assert sorted(str(path.relative_to(session)) for path in session.rglob("*.*") if path.is_file()) == sorted(
         [*FILES, "session.json"]
     )
@@ -68,7 +68,7 @@ def test_the_session_is_as_the_tests_below_expect(session, frames):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", FILES)
-def test_cut_anywhere_it_plays_up_to_there(name, session, frames, tmp_path):
+def test_session_file_cut_anywhere_plays_up_to_cut(name, session, frames, tmp_path):
     size = (session / name).stat().st_size
     rng = np.random.default_rng(len(name))
     ends = {0, 1, size - 1, *map(int, rng.integers(0, size, POSITIONS))}
@@ -90,7 +90,7 @@ def test_cut_anywhere_it_plays_up_to_there(name, session, frames, tmp_path):
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_a_hole_of_zeros_at_the_end_is_as_a_cut(name, session, frames, tmp_path):
+def test_session_file_ending_in_zeros_plays_up_to_zeros(name, session, frames, tmp_path):
     """After a power failure a file may have its length and not its last bytes."""
     folder = tmp_path / "session"
     shutil.copytree(session, folder)
@@ -106,7 +106,7 @@ def test_a_hole_of_zeros_at_the_end_is_as_a_cut(name, session, frames, tmp_path)
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_a_file_that_is_not_there_is_as_one_that_is_cut_at_its_first_byte(name, session, frames, tmp_path):
+def test_missing_session_file_drops_frames_of_segment(name, session, frames, tmp_path):
     folder = tmp_path / "session"
     shutil.copytree(session, folder)
     (folder / name).unlink()
@@ -114,7 +114,7 @@ def test_a_file_that_is_not_there_is_as_one_that_is_cut_at_its_first_byte(name, 
     assert len(seqs) == (FRAMES - PER_SEGMENT if name in OF_FRAMES else FRAMES)
 
 
-def test_a_session_file_that_is_cut_is_refused_with_a_sentence(session, tmp_path):
+def test_truncated_session_json_is_refused(session, tmp_path):
     folder = tmp_path / "session"
     shutil.copytree(session, folder)
     data = (folder / "session.json").read_bytes()
@@ -128,7 +128,7 @@ def test_a_session_file_that_is_cut_is_refused_with_a_sentence(session, tmp_path
         assert not validate_recording(folder).ok
 
 
-def test_a_cut_recording_is_opened_and_says_what_is_missing(session, tmp_path):
+def test_truncated_session_opens_with_note(session, tmp_path):
     folder = tmp_path / "session"
     shutil.copytree(session, folder)
     path = folder / "segments/000001/mask_24x16.mkv"
@@ -142,7 +142,7 @@ def test_a_cut_recording_is_opened_and_says_what_is_missing(session, tmp_path):
     assert validate_recording(folder).ok
 
 
-def test_a_recording_that_is_being_written_can_be_read(record, frames):
+def test_unfinished_session_can_be_read(record, frames):
     folder = record(frames, close=False)
     seqs = plays(folder, frames)
     assert seqs in (list(range(FRAMES)), list(range(FRAMES - 1)))  # FFmpeg keeps the newest picture until the next one

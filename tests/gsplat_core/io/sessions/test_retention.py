@@ -53,7 +53,7 @@ def left(recordings: Path) -> list[str]:
     return sorted(path.name for path in recordings.iterdir())
 
 
-def test_sessions_that_are_too_old_are_removed_when_the_next_one_begins(three):
+def test_new_session_removes_expired_sessions(three):
     options = WriterOptions(keep_s=3 * HOUR_S, with_earlier=True)
     writer = SessionWriter(three / name(15), session_info(), options)
     writer.close("end")
@@ -63,7 +63,7 @@ def test_sessions_that_are_too_old_are_removed_when_the_next_one_begins(three):
     assert name(10) in note and "removed" in note
 
 
-def test_the_oldest_sessions_make_room_and_the_present_one_is_whole(three):
+def test_keep_bytes_removes_oldest_sessions_before_own_segments(three):
     one = size_of(three / name(10))
     options = WriterOptions(segment_bytes=one, keep_bytes=int(3.5 * one), with_earlier=True)
     writer = SessionWriter(three / name(15), session_info(), options)
@@ -77,7 +77,7 @@ def test_the_oldest_sessions_make_room_and_the_present_one_is_whole(three):
     assert SessionReader(three / name(15)).frame_count == 9, "earlier sessions go before its own segments"
 
 
-def test_own_segments_go_when_nothing_earlier_is_left(three):
+def test_keep_bytes_removes_own_segments_after_earlier_sessions(three):
     one = size_of(three / name(10))
     options = WriterOptions(segment_bytes=one // 2, keep_bytes=2 * one, with_earlier=True)
     writer = SessionWriter(three / name(15), session_info(), options)
@@ -90,12 +90,12 @@ def test_own_segments_go_when_nothing_earlier_is_left(three):
     assert seqs == list(range(seqs[0], 24))
 
 
-def test_a_bound_of_this_session_alone_leaves_the_others(three):
+def test_limits_without_with_earlier_keep_other_sessions(three):
     SessionWriter(three / name(15), session_info(), WriterOptions(keep_bytes=1, keep_s=0.0)).close("end")
     assert left(three) == [name(10), name(13), name(14), name(15)]
 
 
-def test_what_is_not_ours_stays(three):
+def test_retention_keeps_foreign_folders_and_links(three):
     (three / name(13)).rename(three / "the one with the bleeding")
     (three / name(11)).mkdir()
     (three / name(11) / "notes.txt").write_text("mine")
@@ -109,7 +109,7 @@ def test_what_is_not_ours_stays(three):
     shutil.rmtree(elsewhere)
 
 
-def test_a_removal_that_was_cut_off_is_finished_by_the_next_session(three, monkeypatch):
+def test_interrupted_removal_is_finished_by_next_session(three, monkeypatch):
     def killed(folder: Path) -> None:
         raise KeyboardInterrupt
 
@@ -122,7 +122,7 @@ def test_a_removal_that_was_cut_off_is_finished_by_the_next_session(three, monke
     assert left(three) == [name(13), name(14), name(15)]
 
 
-def test_an_earlier_session_that_cannot_be_removed_is_said_and_the_recording_goes_on(three, monkeypatch):
+def test_failed_session_removal_is_noted_and_recording_continues(three, monkeypatch):
     def locked(folder: Path) -> None:
         raise PermissionError(13, "Permission denied")
 
@@ -139,7 +139,7 @@ def test_an_earlier_session_that_cannot_be_removed_is_said_and_the_recording_goe
     assert [why for _, why in finish_removals(three)] == ["Permission denied"]
 
 
-def test_an_earlier_session_grows_too_old_while_the_present_one_is_recorded(three):
+def test_session_expiring_during_recording_is_removed(three):
     clock = Clock()
     options = WriterOptions(segment_s=60, keep_s=3 * HOUR_S, clock=clock, with_earlier=True)
     writer = SessionWriter(three / name(15), session_info(), options)

@@ -23,7 +23,7 @@ def frames_of(folder) -> list[Frame]:
     return [frame for _, frame in SessionReader(folder).frames() if frame is not None]
 
 
-def test_every_field_comes_back_to_the_bit(session, frames):
+def test_session_frames_round_trip_bit_for_bit(session, frames):
     found = frames_of(session)
     assert all(same_frame(a, b) for a, b in zip(found, frames, strict=True))
     assert {frame.status for frame in found} == {FrameStatus.REPLAY}
@@ -31,7 +31,7 @@ def test_every_field_comes_back_to_the_bit(session, frames):
     assert [line.arrived_ns for line in lines] == [frame.arrived_ns for frame in frames]
 
 
-def test_what_training_was_given_comes_back_to_the_bit(session, frames):
+def test_prepared_frames_round_trip_bit_for_bit(session, frames):
     arrived = {frame.seq: frame for frame in frames_of(session)}
     seen = 0
     for segment in SessionReader(session).segments:
@@ -47,7 +47,7 @@ def test_what_training_was_given_comes_back_to_the_bit(session, frames):
     assert seen == len(frames)
 
 
-def test_depth_that_came_late_comes_back_in_its_place(tmp_path):
+def test_late_depth_round_trips_in_schedule_order(tmp_path):
     frames = [new_frame(seq, depth=None, depth_confidence=None, depth_origin=None) for seq in range(3)]
     late = new_frame(1, depth_origin=DEPTH_ORIGINS["stereo"])
     bare = new_frame(0, depth_confidence=None, depth_origin=DEPTH_ORIGINS["light"])
@@ -68,7 +68,7 @@ def test_depth_that_came_late_comes_back_in_its_place(tmp_path):
     assert (first["depth_origin"], second["depth_origin"]) == (DEPTH_ORIGINS["light"], DEPTH_ORIGINS["stereo"])
 
 
-def test_late_depth_whose_pictures_are_gone_is_none_and_the_next_one_is_there(tmp_path):
+def test_late_depth_with_missing_picture_is_none(tmp_path):
     writer = SessionWriter(tmp_path / "s", session_info())
     for seq in range(3):
         writer.frame(new_frame(seq))
@@ -85,7 +85,7 @@ def test_late_depth_whose_pictures_are_gone_is_none_and_the_next_one_is_there(tm
     assert found[1] is None and found[2]["depth"].tobytes() == new_frame(2).depth.tobytes()
 
 
-def test_the_digest_of_a_shown_picture_is_that_of_its_bytes(session, frames):
+def test_shown_line_sha256_is_digest_of_picture_bytes(session, frames):
     lines = [line for _, line in SessionReader(session).lines() if isinstance(line, ShownLine)]
     for line, frame in zip(lines, frames, strict=True):
         assert line.sha256 == sha256(np.ascontiguousarray(frame.image[::-1])).hexdigest()
@@ -110,7 +110,7 @@ def test_shown_pictures_are_kept_as_lossy_video(tmp_path):
     assert 0 < np.abs(found["shown"].astype(int) - smooth).mean() < 6
 
 
-def test_segments_end_when_they_are_large_and_no_frame_is_lost_between_them(record):
+def test_segment_bytes_limit_starts_new_segment_without_frame_loss(record):
     frames = [new_frame(seq) for seq in range(20)]
     folder = record(frames, WriterOptions(segment_bytes=20_000))
     reader = SessionReader(folder)
@@ -119,7 +119,7 @@ def test_segments_end_when_they_are_large_and_no_frame_is_lost_between_them(reco
     assert {segment.ends.why for segment in reader.segments if segment.ends} == {"bytes", "end"}
 
 
-def test_the_oldest_segments_are_removed_and_the_recording_says_so(record):
+def test_keep_bytes_removes_oldest_segments_with_note(record):
     frames = [new_frame(seq) for seq in range(40)]
     folder = record(frames, WriterOptions(segment_bytes=20_000, keep_bytes=60_000))
     reader = SessionReader(folder)
@@ -133,7 +133,7 @@ def test_the_oldest_segments_are_removed_and_the_recording_says_so(record):
     assert any("those before it were removed" in note for note in open_recording(folder).notes)
 
 
-def test_old_segments_are_removed_by_age(tmp_path):
+def test_keep_s_removes_old_segments(tmp_path):
     clock = Clock()
     writer = SessionWriter(tmp_path / "s", session_info(), WriterOptions(segment_s=1, keep_s=3.5, clock=clock))
     for seq in range(10):
@@ -143,13 +143,13 @@ def test_old_segments_are_removed_by_age(tmp_path):
     assert [frame.seq for frame in frames_of(tmp_path / "s")] == [5, 6, 7, 8, 9]
 
 
-def test_a_second_recording_does_not_go_into_the_folder_of_the_first(tmp_path):
+def test_session_writer_refuses_used_folder(tmp_path):
     SessionWriter(tmp_path / "s", session_info()).close("end")
     with pytest.raises(FileExistsError):
         SessionWriter(tmp_path / "s", session_info())
 
 
-def test_frames_may_change_their_size_back_and_forth(tmp_path):
+def test_session_frames_of_changing_size_round_trip(tmp_path):
     sizes = [(16, 24), (16, 24), (33, 17), (16, 24), (9, 8), (33, 17), (3, 1), (1, 1), (1, 5)]
     frames = [new_frame(seq, *size) for seq, size in enumerate(sizes)]
     writer = SessionWriter(tmp_path / "s", session_info())
@@ -163,7 +163,7 @@ def test_frames_may_change_their_size_back_and_forth(tmp_path):
     assert any("6 of 9 frames have another size" in note for note in recording.notes)
 
 
-def test_a_frame_of_every_size_does_not_open_files_without_end(tmp_path):
+def test_many_frame_sizes_start_new_segments(tmp_path):
     writer = SessionWriter(tmp_path / "s", session_info())
     frames = [new_frame(seq, 8 + seq, 8) for seq in range(40)]
     for frame in frames:
@@ -183,7 +183,7 @@ def test_a_frame_of_every_size_does_not_open_files_without_end(tmp_path):
     ],
     ids=["nanoseconds", "backwards", "years ahead", "negative"],
 )
-def test_times_come_back_whatever_the_clock_does(tmp_path, times_ns):
+def test_session_timestamps_round_trip_for_any_clock(tmp_path, times_ns):
     frames = [new_frame(seq, pts_ns=time_ns) for seq, time_ns in enumerate(times_ns)]
     writer = SessionWriter(tmp_path / "s", session_info())
     for frame in frames:
@@ -192,7 +192,7 @@ def test_times_come_back_whatever_the_clock_does(tmp_path, times_ns):
     assert all(same_frame(a, b) for a, b in zip(frames_of(tmp_path / "s"), frames, strict=True))
 
 
-def test_a_line_of_a_later_version_is_left_out(session, tmp_path, frames):
+def test_session_reader_ignores_unknown_event(session, tmp_path, frames):
 
     folder = tmp_path / "session"
     shutil.copytree(session, folder)
@@ -203,7 +203,7 @@ def test_a_line_of_a_later_version_is_left_out(session, tmp_path, frames):
     assert sum(isinstance(line, Observed) for _, line in SessionReader(folder).lines()) == len(frames)
 
 
-def test_a_track_that_is_no_longer_used_is_ignored(session, tmp_path, frames):
+def test_session_reader_ignores_obsolete_track(session, tmp_path, frames):
     folder = tmp_path / "session"
     shutil.copytree(session, folder)
     log = folder / "segments/000000/log.jsonl"
@@ -217,7 +217,7 @@ def test_a_track_that_is_no_longer_used_is_ignored(session, tmp_path, frames):
     assert prepared and all("rehearsal_mask" not in line.same for line in prepared)
 
 
-def test_a_log_is_plain_json(session):
+def test_session_log_lines_are_json_with_event(session):
     for line in (session / "segments/000000/log.jsonl").read_text().splitlines():
         assert next(iter(json.loads(line))) == "event"
 
@@ -225,6 +225,6 @@ def test_a_log_is_plain_json(session):
 @pytest.mark.parametrize(
     "options", [{"segment_bytes": 0}, {"segment_s": -1}, {"keep_bytes": -1}, {"keep_s": float("nan")}]
 )
-def test_options_out_of_their_range_are_refused(options):
+def test_writer_options_refuse_values_out_of_range(options):
     with pytest.raises(InvalidInput, match=next(iter(options))):
         WriterOptions(**options)
