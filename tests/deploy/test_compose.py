@@ -36,7 +36,7 @@ def composed(tool, tmp_path):
     return configuration
 
 
-def test_every_profile_has_services(services):
+def test_every_compose_profile_has_services(services):
     assert {profile for each in services.values() for profile in each["profiles"]} == set(PROFILES)
 
 

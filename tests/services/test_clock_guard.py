@@ -44,7 +44,7 @@ def test_clock_is_trusted_if_service_runs_daily(tmp_path, clock):
 
 
 @pytest.mark.parametrize("days", [400, 30, 1.1])
-def test_clock_jump_between_runs_is_not_trusted_for_a_day(tmp_path, clock, days):
+def test_clock_jump_between_runs_is_not_trusted_for_one_day(tmp_path, clock, days):
     assert clock.guard(tmp_path).trusts_ages()
     clock.wall_s += days * DAY_S
     for _ in range(3):  # to start again makes it no truer

@@ -49,7 +49,7 @@ LENGTHS: list[tuple[str, Callable[[int], Any], int, int, type[Exception]]] = [
 
 
 @pytest.mark.parametrize(("act", "least", "most", "refusal"), [each[1:] for each in LENGTHS], ids=[each[0] for each in LENGTHS])  # fmt: skip
-def test_lengths_up_to_the_limit_are_accepted(
+def test_lengths_up_to_limit_are_accepted_and_longer_refused(
     act: Callable[[int], Any], least: int, most: int, refusal: type[Exception]
 ) -> None:
     act(least)

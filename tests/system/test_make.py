@@ -51,7 +51,7 @@ def test_make_cuda_builds_native_architecture_by_default():
     assert '-DINTRASPLAT_CUDA_ARCHITECTURES="portable"' in dry_run("cuda", "CUDA_ARCHITECTURES=portable")
 
 
-def test_ci_builds_the_cuda_kernels_and_requires_them():
+def test_ci_builds_and_requires_cuda_kernels():
     script = (ROOT / ".ci" / "run").read_text()
     assert "set -euo pipefail" in script and "INTRASPLAT_REQUIRE_CUDA_BUILD=1" in script
     built, earlier = script.index("cuda CUDA_ARCHITECTURES=90-real"), script.rindex("for_earlier_gpus")
@@ -65,7 +65,7 @@ def test_make_test_is_fast_and_make_test_all_is_not(target, selected):
     assert ("--fast" in command.split()) == selected
 
 
-def test_ci_runs_all_tests():
+def test_ci_runs_make_test_all():
     lines = (ROOT / ".ci" / "run").read_text().splitlines()
     commands = [line.partition("||")[0].split() for line in lines if line.startswith("make ")]
     assert any("test-all" in words for words in commands) and not any("test" in words for words in commands)

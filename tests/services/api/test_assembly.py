@@ -25,7 +25,7 @@ from services.supervisor.stream import SupervisedStreams
         ("rtsp://user:pass@10.0.0.5/x does not answer", False),
     ],
 )  # fmt: skip
-def test_audit_log_omits_stream_end_reasons_that_may_name_a_file(reason, kept):
+def test_audit_log_omits_stream_end_reasons_that_may_name_files(reason, kept):
     events, heard = SystemEvents(), []
     events.tell = lambda *values, **detail: heard.append((values, detail))  # type: ignore[method-assign]
     event_receiver(StreamMeasures(), events)(StreamEvent("theatre", "engine", "ended", reason, 7))

@@ -129,7 +129,7 @@ def tcp(port: int):
 LIVE = b"GET /livez HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n"
 
 
-def test_half_sent_heads_of_one_address_do_not_block_others(served):
+def test_half_sent_heads_of_one_address_do_not_block_other_addresses(served):
     settings, bound, port, probe = served(connections_per_address=8, head_s=60)
     with contextlib.ExitStack() as open_:
         for _ in range(40):

@@ -77,7 +77,7 @@ FAILURES = [
 
 @pytest.mark.parametrize(("error", "code", "stage", "said"), FAILURES, ids=lambda each: type(each).__name__)
 @pytest.mark.parametrize("program", ["check", "convert"])
-def test_check_and_convert_reject_only_for_errors_of_the_file(
+def test_check_and_convert_reject_only_for_file_errors(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, program: str, error: Exception,
     code: int, stage: str | None, said: str,
 ) -> None:  # fmt: skip

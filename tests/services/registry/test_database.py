@@ -56,7 +56,7 @@ def test_concurrent_migrations_succeed(database):
     assert errors == []
 
 
-def test_migrate_raises_for_newer_schema_and_leaves_it_unchanged(database):
+def test_migrate_raises_for_newer_schema_and_changes_nothing(database):
     database.migrate()
     with database.writing() as connection:
         connection.execute(sa.text("UPDATE alembic_version SET version_num = '0999'"))
@@ -77,7 +77,7 @@ def test_failed_transaction_is_rolled_back(database):
         assert connection.execute(sa.select(MODELS)).all() == []
 
 
-def test_a_second_writer_waits_for_the_first(database):
+def test_second_database_writer_waits_for_first(database):
     database.migrate()
     order = []
     started = threading.Event()

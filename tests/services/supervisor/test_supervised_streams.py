@@ -185,7 +185,7 @@ def test_concurrent_set_options_are_all_kept(streams, slow):
     asyncio.run(run())
 
 
-def test_running_creates_streams_of_settings_and_starts_those_with_start(streams, processes, monkeypatch):
+def test_running_creates_streams_of_settings_and_obeys_start_option(streams, processes, monkeypatch):
     closed, removed = [], []
 
     async def close(*, stop):
