@@ -1,4 +1,4 @@
-"""A small model bundle to tamper with."""
+"""Bundles of a small model that tests tamper with."""
 
 from __future__ import annotations
 

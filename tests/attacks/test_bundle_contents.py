@@ -1,4 +1,4 @@
-"""A well-formed upload of a hostile model: its check rejects it with one sentence, and nothing in it is executed."""
+"""Well-formed uploads of hostile models: the check rejects them with one sentence and executes nothing."""
 
 import contextlib
 import io
@@ -25,7 +25,7 @@ def registry(tmp_path):
 
 @pytest.fixture
 def check_here(monkeypatch):
-    """Run the check program in this process, without its resource limits. A process of its own starts in seconds."""
+    """Run the check program in this process, without resource limits. Starting a separate process takes seconds."""
 
     def run(command, passed_s, take, **_):
         said = io.StringIO()
@@ -42,14 +42,14 @@ def check_here(monkeypatch):
 
 @pytest.fixture
 def payload(bundle, tmp_path):
-    """A good upload."""
+    """Return the bytes of a valid upload."""
     pack(bundle.folder, tmp_path / "good")
     return (tmp_path / "good").read_bytes()
 
 
 @pytest.fixture
 def rejected(registry, bundle, tmp_path):
-    """Pack the tampered bundle, upload it, and get the reason for which its check rejects it."""
+    """Return a function that packs and uploads the tampered bundle and returns the reason of its rejection."""
 
     def upload():
         pack(bundle.folder, tmp_path / "upload", overwrite=True)
@@ -65,7 +65,7 @@ def rejected(registry, bundle, tmp_path):
 
 
 class Attack:
-    """Leaves a file behind when it is unpickled."""
+    """Object that creates a file when it is unpickled."""
 
     def __init__(self, marker):
         self.marker = marker
@@ -129,7 +129,7 @@ def test_check_rejects_gaussian_count_beyond_file_size(check_here, rejected, bun
 
 @pytest.mark.slow
 def test_check_rejects_model_with_empty_picture(check_here, rejected, bundle):
-    """Every value is finite, and so is the picture: the Gaussians are moved out of it."""
+    """All values and the rendered picture are finite, but the Gaussians are moved out of view."""
     tensors = dict(load_bundle(bundle.folder).tensors())
     tensors["field.weights"] = torch.full_like(tensors["field.weights"], 3e38)
     bundle.replace_tensors(save(tensors))

@@ -1,4 +1,4 @@
-"""A model bundle may come from anyone: each of these is refused with its reason, and nothing large is allocated."""
+"""Malformed and hostile model bundles: `load_bundle` refuses each with its reason and without large allocations."""
 
 import json
 import struct
@@ -108,7 +108,7 @@ def test_load_bundle_refuses_offsets_outside_file(bundle):
 
 
 def test_load_bundle_refuses_gaussian_count_beyond_file_size(bundle):
-    """Fifty million Gaussians of 6 bumps would be 20 GB; the file's size tells that they are not there."""
+    """Fifty million Gaussians of 6 bumps need 20 GB, which the file does not hold."""
     bundle.edit(lambda manifest: manifest["gaussians"].update(count=50_000_000))
     with pytest.raises(BundleCorrupt, match="describes"):
         load_bundle(bundle.folder)

@@ -1,4 +1,4 @@
-"""An upload may come from anyone: what is not an archive of a model is refused with one sentence, and nothing of it is kept or executed."""
+"""Uploads that are no archive of a model are refused with one sentence; nothing is kept or executed."""
 
 import io
 import os
@@ -25,7 +25,7 @@ def registry(tmp_path):
 
 @pytest.fixture
 def refused(registry, tmp_path):
-    """Upload bytes and get the sentence with which they are refused."""
+    """Return a function that uploads bytes and returns the sentence of the refusal."""
 
     def upload(payload):
         (tmp_path / "upload").write_bytes(payload)
@@ -46,13 +46,13 @@ def refused(registry, tmp_path):
 
 @pytest.fixture
 def payload(bundle, tmp_path):
-    """A good upload."""
+    """Return the bytes of a valid upload."""
     pack(bundle.folder, tmp_path / "good")
     return (tmp_path / "good").read_bytes()
 
 
 def archive(*members, style=tarfile.USTAR_FORMAT):
-    """A tar archive of (name, bytes, changes of its header)."""
+    """Return a tar archive of members (name, bytes, changes of the header)."""
     file = io.BytesIO()
     with tarfile.open(fileobj=file, mode="w", format=style) as made:
         for name, content, changes in members:
@@ -80,7 +80,7 @@ def second_header(payload):
 
 
 class Attack:
-    """Leaves a file behind when it is unpickled."""
+    """Object that creates a file when it is unpickled."""
 
     def __init__(self, marker):
         self.marker = marker
@@ -151,7 +151,7 @@ def test_upload_with_extra_repeated_or_swapped_files_is_refused(refused):
 
 
 def test_upload_with_pax_or_long_name_headers_is_refused(refused):
-    """Such headers would give a file another name or size than its plain header."""
+    """Such headers override the name or size of the plain header."""
     renamed = {"pax_headers": {"path": "../../evil", "size": "9"}}
     assert "as plain files" in refused(
         archive((MANIFEST, b"{}", renamed), (TENSORS, b"x", {}), style=tarfile.PAX_FORMAT)

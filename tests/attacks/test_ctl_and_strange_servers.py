@@ -1,4 +1,4 @@
-"""`intrasplat ctl` with a server that is none of ours, and with addresses, keys and certificates that cannot be used: sentences, no tracebacks."""
+"""`intrasplat ctl` with foreign servers and unusable addresses, keys and certificates: one error line, no traceback."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ KEY = "intrasplat_00000000_" + 43 * "a"
 
 
 class Strange(BaseHTTPRequestHandler):
-    """Answers as the server's `answer` says: status, headers, body."""
+    """Request handler that answers with the server's `answer`: status, headers, body."""
 
     def do_GET(self):
         length = int(self.headers.get("Content-Length", 0))
@@ -38,7 +38,7 @@ class Strange(BaseHTTPRequestHandler):
 
 
 class StrangeServer(ThreadingHTTPServer):
-    """Ends a connection without a word when its client is gone: a late traceback would be read as the output of the next test."""
+    """Server that ignores connection errors, whose late tracebacks would appear in the output of the next test."""
 
     def handle_error(self, request, client_address):
         if not isinstance(sys.exc_info()[1], ConnectionError):
@@ -65,7 +65,7 @@ def ctl(server, *arguments):
 
 
 def sized(body: bytes, **headers: str):
-    """Return headers of an answer with a body, with the request id of a server of ours."""
+    """Return headers of a response with a body, including the request id that IntraSplat servers send."""
     return {
         "Content-Length": str(len(body)),
         "X-Request-ID": "0",
@@ -258,7 +258,7 @@ SILENT = {
 @pytest.mark.parametrize("status", [200, 204])
 @pytest.mark.parametrize("command", SILENT)
 def test_ctl_fails_for_response_without_request_id(server, capsys, tmp_path, command, status):
-    """Such as the sign-in page of a proxy. These commands read nothing in the answer that would tell."""
+    """An example is the sign-in page of a proxy. These commands do not parse the body of the response."""
     body = b"<html>sign in</html>" if status == 200 else b""
     server.answer = status, {"Content-Length": str(len(body))}, body
     assert ctl(server, *SILENT[command](str(tmp_path / "x.png"))) == BAD_INPUT

@@ -1,4 +1,4 @@
-"""Files that the program reads, and that are pipes, devices, sockets or damaged: one sentence, no hang, no traceback."""
+"""Input files that are pipes, devices, sockets or damaged: one error sentence, no hang, no traceback."""
 
 from __future__ import annotations
 

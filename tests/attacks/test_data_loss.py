@@ -1,4 +1,4 @@
-"""Outputs that would replace an input, a part of one, or a file of somebody else: refused, and nothing on the disk changes."""
+"""Outputs that would overwrite inputs or foreign files are refused, and no file changes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def held(folder: Path) -> dict[str, str]:
 
 @pytest.fixture
 def place(tmp_path):
-    """A recording, a model, and files of somebody else."""
+    """A folder with a recording, a model and foreign files."""
     take = tmp_path / "take"
     for name in ("images", "masks", "depth", "images_right"):
         (take / name).mkdir(parents=True)

@@ -34,7 +34,7 @@ def served(tmp_path):
 
 
 def asked_from(client: TestClient, headers, caplog) -> str:
-    """The address that the log has for a request."""
+    """Return the client address that is logged for a request."""
     caplog.clear()
     with caplog.at_level(logging.INFO, "intrasplat.requests"):
         client.get("/v1/version", headers=headers)

@@ -1,4 +1,4 @@
-"""Every value of a manifest has a range; a value out of range is refused in one sentence that names it."""
+"""Manifest values out of their range are refused in one sentence that names the value."""
 
 from __future__ import annotations
 
@@ -209,7 +209,7 @@ def test_manifest_with_invalid_hexplane_sizes_is_refused(hexplane_bundle, name, 
     ],
 )
 def test_hexplane_sizes_beyond_file_size_are_refused(hexplane_bundle, sizes):
-    """The largest that the ranges allow is some 10^17 bytes."""
+    """The largest sizes within the ranges would need about 10^17 bytes."""
     hexplane_bundle.edit(lambda values: (values["field"].update(sizes), values.pop("parameters")))
     refused(hexplane_bundle, "describes")
 

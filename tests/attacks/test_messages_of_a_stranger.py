@@ -1,4 +1,4 @@
-"""ZeroMQ messages that are no frames, or say that they are larger than they are."""
+"""ZeroMQ messages that are no frames or state a wrong size."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ GOOD = encode_message(1, 2, {"image": np.full((4, 6, 3), 5, np.uint8)})
 
 @contextmanager
 def opened(address):
-    """A source that is open inside."""
+    """Open a source, close it at exit."""
     source = open_source(address, SourceOptions(waiting=64))
     source.open()
     yield source
@@ -43,7 +43,7 @@ def next_frame(source):
 
 
 class Bomb:
-    """Would write a file if it were unpickled."""
+    """Object that would create a file if it were unpickled."""
 
     def __reduce__(self):
         return (open, ("unpickled", "w"))

@@ -31,7 +31,7 @@ FUZZ = settings(
 
 @contextmanager
 def seconds(limit: int) -> Iterator[None]:
-    """Ends the test, where something waits that must not."""
+    """Fail the test if its body takes longer than the limit."""
 
     def over(*_: object) -> None:
         raise AssertionError(f"still waiting after {limit} s")
@@ -136,7 +136,7 @@ def test_model_larger_than_memory_is_refused_with_required_size(bundle, tmp_path
 
 @pytest.mark.parametrize("count", [20_000_000, 50_000_000])
 def test_load_bundle_refuses_sparse_tensor_file_larger_than_memory(bundle, monkeypatch, count):
-    """Sizes that agree cost an attacker nothing on a file system with holes."""
+    """A sparse file of matching size costs an attacker no disk space."""
     monkeypatch.setattr(model_files, "available_bytes", lambda: 2**30)
     size = 4 * count * (14 + 6 * 15)
     header = json.dumps({"x": {"dtype": "F32", "shape": [size // 4], "data_offsets": [0, size]}}).encode()
@@ -157,7 +157,7 @@ JSON = st.recursive(
 
 
 def places(value: Any, here: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    """The path of every value inside a document."""
+    """Yield the path of every value in a JSON document."""
     inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     for key, each in inner:
         yield (*here, key)
@@ -165,7 +165,7 @@ def places(value: Any, here: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
 
 
 def loaded_or_refused(load: Callable[[], Any]) -> None:
-    """Any change gives either a model or one sentence."""
+    """Check that loading succeeds or raises a `BundleError` of one sentence."""
     try:
         load()
     except UserError as error:

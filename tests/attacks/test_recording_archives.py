@@ -1,4 +1,4 @@
-"""Archives of a stranger in place of a recording: each is refused with a sentence, and nothing is written outside of its folder."""
+"""Hostile archives uploaded as recordings are refused with a sentence, and nothing is written outside their folder."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def five_entries(monkeypatch):
 
 
 def archive(*entries: tuple[str | zipfile.ZipInfo, bytes], method: int = zipfile.ZIP_STORED) -> bytes:
-    """A zip archive of these files."""
+    """Return a zip archive of the given files."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", method) as opened:
         for name, content in entries:
@@ -32,7 +32,7 @@ def archive(*entries: tuple[str | zipfile.ZipInfo, bytes], method: int = zipfile
 
 
 def marked(name: str, **attributes: int) -> zipfile.ZipInfo:
-    """An entry with other attributes than `zipfile` gives it."""
+    """Return a zip entry with changed attributes."""
     info = zipfile.ZipInfo(name)
     for attribute, value in attributes.items():
         setattr(info, attribute, value)
@@ -41,7 +41,7 @@ def marked(name: str, **attributes: int) -> zipfile.ZipInfo:
 
 @pytest.fixture
 def refused(tmp_path):
-    """The sentence with which an archive is refused; nothing but its own folder was made."""
+    """Return a function that unpacks an archive and returns the sentence of the refusal."""
 
     def refuse(content: bytes, most_bytes: int = SMALL) -> str:
         (tmp_path / "inside").mkdir(exist_ok=True)

@@ -1,4 +1,4 @@
-"""Recordings made to harm: files that lead out, that run code, that exhaust memory, or that name the network."""
+"""Hostile recordings: paths out of the folder, pickles, memory exhaustion and network references."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Recordings of sessions made to harm, or damaged: what cannot be read is refused with a sentence or left out; nothing else happens."""
+"""Hostile or damaged session recordings: unreadable content is refused with a sentence or omitted."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def session(whole, tmp_path) -> Path:
 
 
 def outcome_of(folder: Path) -> list[Any] | str:
-    """Every way to read a session; the frames that are given, or the sentence that refuses it."""
+    """Read a session in every way. Return its frames, or the sentence that refuses it."""
     try:
         recording = open_recording(folder)
         frames = list(recording)
@@ -59,7 +59,7 @@ def outcome_of(folder: Path) -> list[Any] | str:
 
 
 def change_lines(folder: Path, change: Callable[[dict[str, Any]], None], event: str = "frame") -> None:
-    """Change the values of all lines of a kind."""
+    """Change all log lines of an event in place."""
     lines = [json.loads(line) for line in (folder / LOG).read_text().splitlines()]
     for line in lines:
         if line["event"] == event:

@@ -1,4 +1,4 @@
-"""Sidecars that are there and cannot be used, arrays and JSON made to harm, and links that lead out: one sentence each, never a hang."""
+"""Unusable sidecars, hostile arrays and JSON, and outward links in recordings: one error sentence each, no hang."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def _image(path: Path, value: int = 90) -> None:
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    """A recording of three images with every sidecar, which can be used as it is."""
+    """A valid recording of three images with every sidecar."""
     folder = tmp_path / "rec"
     for index in range(COUNT):
         _image(folder / "images" / f"{index}.png")

@@ -1,4 +1,4 @@
-"""Uploads that are begun and not finished hold no place, no file and no connection for long."""
+"""Unfinished uploads soon release their slot, file and connection."""
 
 from __future__ import annotations
 

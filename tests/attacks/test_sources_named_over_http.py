@@ -1,4 +1,4 @@
-"""Server-side request forgery: a caller of the API names a source, and this machine opens only what the settings list."""
+"""Server-side request forgery: sources named over the API are limited to those listed in the settings."""
 
 from __future__ import annotations
 

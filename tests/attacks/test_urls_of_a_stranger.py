@@ -1,4 +1,4 @@
-"""A URL, or what a server answers to it, that tries to read files of this machine or to take it down."""
+"""URLs and server responses that try to read local files or crash the process."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ HERE = SourceOptions(process=False)
 
 @pytest.fixture(scope="module")
 def secret(tmp_path_factory):
-    """Video on this machine that must not be reachable through a URL."""
+    """A local video that must not be reachable through a URL."""
     import av
     import numpy as np
 
@@ -31,7 +31,7 @@ def secret(tmp_path_factory):
 
 @pytest.fixture
 def answering():
-    """A server that answers every request with the same bytes, or a redirection."""
+    """A server that answers every request with the same bytes or a redirect."""
     answer = {"body": b"", "type": "application/octet-stream", "location": None}
 
     class Handler(http.server.BaseHTTPRequestHandler):

@@ -1,4 +1,4 @@
-"""Values that no option can have, files that give nothing, and folders that belong to a batch: one sentence, and nothing is lost."""
+"""Impossible option values, unusable files and folders of a batch: one error sentence, and no file is lost."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_audit_verify_prints_error_for_changed_log(tmp_path, capsys):
 
 
 def test_read_regular_raises_for_file_that_blocks(tmp_path, monkeypatch):
-    """Files of /proc such as kmsg are plain files by their mode, and wait for contents. A pipe that passes for one stands for them."""
+    """Simulates /proc/kmsg, a regular file by its mode that blocks on read, with a pipe."""
     os.mkfifo(tmp_path / "p")
     writer = os.open(tmp_path / "p", os.O_RDWR)
     monkeypatch.setattr(files.stat, "S_ISREG", lambda mode: True)

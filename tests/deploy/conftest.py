@@ -25,7 +25,7 @@ Run = Callable[..., subprocess.CompletedProcess[str]]
 
 
 def missing(message: str) -> NoReturn:
-    """Skip a test that this machine cannot run."""
+    """Skip a test whose tools are missing, or fail if they are required."""
     if os.environ.get("INTRASPLAT_REQUIRE_DEPLOY_TOOLS") == "1":
         pytest.fail(message)
     pytest.skip(message)

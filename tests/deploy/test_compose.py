@@ -1,4 +1,4 @@
-"""The compose files: Docker Compose takes them, and every service is closed as far as it can be."""
+"""The compose files are accepted by Docker Compose, and their services are hardened."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def services() -> dict:
 
 @pytest.fixture
 def composed(tool, tmp_path):
-    """The files as Docker Compose understands them, with secrets made by the script."""
+    """Return a function that gives the configuration computed by Docker Compose, with generated secrets."""
     folder = shutil.copytree(DEPLOY, tmp_path / "deploy")
     subprocess.run([folder / "new_secrets.sh"], check=True)
 

@@ -1,4 +1,4 @@
-"""The images' health check against servers that are well, not well, silent and gone."""
+"""The health check of the images against healthy, failing, silent and absent servers."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SCRIPT = Path(__file__).resolve().parents[2] / "docker" / "healthcheck.py"
 
 @contextmanager
 def server(status: int) -> Iterator[str]:
-    """A server that answers everything with one status; its address."""
+    """Run a server that answers every request with one status, and yield its address."""
 
     class Answer(http.server.BaseHTTPRequestHandler):
         def do_GET(self) -> None:

@@ -1,4 +1,4 @@
-"""The chart: helm renders it, Kubernetes' schemas take what it renders, and what cannot work is refused."""
+"""The chart renders, matches the schemas of Kubernetes, and refuses invalid values."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The Dockerfile: what it copies is there and reaches the build, and what it makes has neither compiler nor root."""
+"""The Dockerfile copies existing files that reach the build, and its images have no compiler and no root user."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ DOCKERFILE = ROOT / "docker" / "Dockerfile"
 
 
 def instructions() -> list[tuple[str, str]]:
-    """Each instruction and what follows it, continued lines joined."""
+    """Return each instruction and its arguments, with continued lines joined."""
     lines = [line for line in DOCKERFILE.read_text().splitlines() if not line.startswith("#")]
     text = re.sub(r"\\\n\s*", " ", "\n".join(lines))
     return [(name, rest.strip()) for name, _, rest in (line.partition(" ") for line in text.splitlines()) if name]
@@ -34,7 +34,7 @@ def stages() -> dict[str, tuple[str, list[tuple[str, str]]]]:
 
 
 def lineage(stage: str) -> list[tuple[str, str]]:
-    """The instructions of a stage and of those that it begins with."""
+    """Return the instructions of a stage and of its base stages."""
     base, own = stages()[stage]
     return [*(lineage(base) if base in stages() else []), *own]
 
@@ -118,7 +118,7 @@ def test_image_builds_cuda_wheel_as_make_cuda():
 
 @pytest.fixture(scope="module")
 def installing():
-    """The program that installs the images' packages."""
+    """Return the module that installs the packages of the images."""
     spec = importlib.util.spec_from_file_location("install_packages", ROOT / "docker" / "install_packages.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)

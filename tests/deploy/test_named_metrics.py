@@ -1,4 +1,4 @@
-"""Every metric that a panel or a rule names is one that the service has, with the labels that are asked for."""
+"""Metrics and labels named in dashboard panels and alert rules exist in the service."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ GROUPING = re.compile(r"\b(?:by|without)\s*\(([^)]*)\)")
 
 @cache
 def served() -> dict[str, set[str]]:
-    """Labels of each sample that the service gives Prometheus, by the sample's name."""
+    """Return the labels of each sample of the service, by name of the sample."""
     with tempfile.TemporaryDirectory() as folder:
         audit = AuditLog(Path(folder) / "audit.jsonl")
         audit.close()

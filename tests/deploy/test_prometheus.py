@@ -1,4 +1,4 @@
-"""Prometheus takes its files, and each alert comes when it should."""
+"""Prometheus accepts its configuration, and alerts fire as expected."""
 
 from __future__ import annotations
 

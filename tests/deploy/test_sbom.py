@@ -1,4 +1,4 @@
-"""`make sbom` lists every package that the images hold, and the images hold what is tested."""
+"""`make sbom` lists every package of the images, and the images contain the tested versions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Settings and variables that images, compose files, chart and units give the service are ones that it takes."""
+"""Settings and variables in images, compose files, chart and units are known to the service."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""systemd takes the units."""
+"""The systemd units are valid and hardened."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ UNITS = sorted((ROOT / "deploy" / "systemd").iterdir())
 
 @pytest.fixture
 def units(tmp_path) -> list[Path]:
-    """The units with programs that are there: systemd asks for each."""
+    """The units with existing programs, which systemd-analyze requires."""
     for unit in UNITS:
         (tmp_path / unit.name).write_text(re.sub(r"/opt/intrasplat/bin/\w+", "/bin/true", unit.read_text()))
     return sorted(tmp_path.iterdir())
@@ -37,7 +37,7 @@ def test_systemd_unit_security_exposure_is_low(tool, units):
 
 
 def test_systemd_unit_uses_notify_and_watchdog():
-    """`sd_notify` (services/api/server.py) and these lines come together."""
+    """Counterpart of `sd_notify` in services/api/server.py."""
     text = (ROOT / "deploy" / "systemd" / "intrasplat.service").read_text()
     assert "\nType=notify\n" in text and "\nNotifyAccess=main\n" in text
     assert re.search(r"^WatchdogSec=\d+s$", text, re.MULTILINE)

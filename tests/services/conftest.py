@@ -146,7 +146,7 @@ def postgresql() -> Iterator[str]:
 
 @pytest.fixture(params=["sqlite", "postgresql"])
 def database_url(request: pytest.FixtureRequest) -> str | None:
-    """None for SQLite in a folder of the test; the URL of an empty database of PostgreSQL."""
+    """None for SQLite in the test's folder, or the URL of an empty PostgreSQL database."""
     if request.param == "sqlite":
         return None
     return new_database(request.getfixturevalue("postgresql"))

@@ -1,4 +1,4 @@
-"""A backup holds all that the service keeps, is found out when it does not, and replaces nothing."""
+"""Backup and restore of all service data: completeness, damage detection, no overwriting."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ AT = "2026-01-01T00:00:00+00:00"
 
 @dataclass
 class Service:
-    """A service's data, with one of everything."""
+    """Data of a service with an item of every kind."""
 
     settings: ServiceSettings
     archive: Archive
@@ -149,7 +149,7 @@ def test_backup_includes_and_restores_folders_outside_data(tmp_path):
 
 
 def test_backup_is_consistent_while_service_writes(service, tmp_path, monkeypatch):
-    """During the copy an upload is checked, another one ends, and audit entries are written."""
+    """During the copy, an upload is checked and audit entries are written."""
     real, calls = backups._copy_files, []
     database, files = service.archive.files._database, service.archive.files._files
 
@@ -187,7 +187,7 @@ def test_backup_lists_files_missing_in_service(service, tmp_path, capsys):
 
 
 def damaged(folder: Path, how: str) -> None:
-    """Do one thing to a backup."""
+    """Damage a backup in the given way."""
     path, described = folder / MANIFEST, json.loads((folder / MANIFEST).read_text())
     recording = folder / "data" / "recordings" / "case-1-1" / "case-1" / "0.png"
     if how == "changed":

@@ -1,4 +1,4 @@
-"""A clock that jumps removes nothing: not at a start, not while the service runs, and not after a restart."""
+"""A clock jump removes no data: at start, during a run, and after a restart."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ DAY_S = 86_400.0
 
 
 class Clock:
-    """Two clocks, which go on together but for the steps of one."""
+    """Simulated wall and monotonic clocks."""
 
     def __init__(self) -> None:
         self.wall_s, self.mono_s = 1.8e9, 100.0
@@ -94,7 +94,7 @@ def test_clock_is_not_trusted_if_clock_file_is_unreadable(tmp_path, clock, conte
 
 
 class Store:
-    """Says with which age it was asked to remove things."""
+    """Store that records the bounds of its expiry calls."""
 
     def __init__(self) -> None:
         self.asked: list[tuple] = []

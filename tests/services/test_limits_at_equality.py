@@ -1,4 +1,4 @@
-"""Limits of lengths and counts: as much as is allowed is accepted, one more is not."""
+"""Limits of lengths and counts accept the limit itself and refuse one more."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def entry(parts: int) -> Any:
 
 
 def submit(count: int) -> Any:
-    """Ask for replays of `count` recordings of a store without a database."""
+    """Submit replays of `count` recordings to a store without a database."""
     made = object.__new__(jobs.JobStore)
     try:
         made.submit([jobs.NewJob("r")] * count, {}, "operator")

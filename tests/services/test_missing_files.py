@@ -1,4 +1,4 @@
-"""Rows of the database whose files are missing, and the watch that looks for them at intervals."""
+"""Database rows with missing files, and the periodic check for them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from services.registry.records import MODELS, VERSIONS
 
 
 def insert(connection: sa.Connection, table: sa.Table, **values: object) -> None:
-    """Insert a row; the columns without a value get one of their type."""
+    """Insert a row, with default values of their type for the other columns."""
     fill = {sa.String: "", sa.Text: "", sa.Integer: 0, sa.BigInteger: 0, sa.JSON: {}}
     needed = {
         column.name: fill[type(column.type)]

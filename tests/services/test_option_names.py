@@ -1,4 +1,4 @@
-"""Every name of every registry is accepted by the command line, the settings file, the REST API and jobs, and nothing else is."""
+"""Registered names are accepted by command line, settings file, REST API and jobs; other names are refused."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ KINDS = {"replay": ReplayOptions, "batch": JobOptions, "reconstruct": Reconstruc
 
 @dataclass
 class Network:
-    """File that an option with an address names."""
+    """Path of a network file, for options with an address."""
 
     path: str
 
@@ -58,7 +58,7 @@ def network(tmp_path):
 
 @pytest.fixture
 def given(monkeypatch, tmp_path):
-    """The options that a command hands on for a command line."""
+    """Return a function that parses a command line and returns the options passed to the command."""
 
     def parse(command: str, *words: str):
         found = {}
@@ -239,7 +239,7 @@ def test_sinks_are_accepted_by_runs_and_jobs(name, given):
 
 
 def test_every_source_scheme_has_rule():
-    """A scheme without a rule could not be allowed by the settings."""
+    """Settings cannot allow a scheme without a rule."""
     known = streams.OF_NETWORKS | streams.OF_FOLDERS | streams.OF_DEVICES | streams.OF_NOTHING
     assert set(SOURCES) == known
 

@@ -1,4 +1,4 @@
-"""Other users cannot read the service's files, whatever the user's umask."""
+"""Other users cannot read the service's files, independent of the user's umask."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ OF_THE_USER = {"services/cli/doctor.py"}
 
 
 def programs() -> list[Path]:
-    """Modules of the service that run as processes of their own."""
+    """Return the modules of the service that run as separate processes."""
     found = [path for path in SERVICES.rglob("*.py") if 'if __name__ == "__main__":' in path.read_text()]
     return [path for path in found if str(path.relative_to(SERVICES.parent)) not in OF_THE_USER]
 
@@ -38,7 +38,7 @@ def open_umask():
 
 
 def open_to_others(folder: Path) -> set[str]:
-    """Files and folders, itself among them, that somebody else has a right to."""
+    """Return the folder's files and folders, including itself, that other users may access."""
     return {str(path) for path in [folder, *folder.rglob("*")] if path.lstat().st_mode & 0o077}
 
 
@@ -52,7 +52,7 @@ ENTRIES = [
 
 @pytest.mark.parametrize(("module", "function"), ENTRIES)
 def test_service_programs_set_private_umask_first(monkeypatch, module, function):
-    """Nothing else happens before: no argument is looked at."""
+    """The umask is set before any argument is read."""
 
     class Begun(BaseException):
         pass
@@ -147,7 +147,7 @@ def test_make_state_private_refuses_path_that_is_no_folder(tmp_path, kind):
 
 @pytest.mark.slow
 def test_kept_lists_all_entries_of_data_folder():
-    """A name that the service gives below its data folder and that is not listed would keep its rights."""
+    """Entries of the data folder that `KEPT` does not list would keep their permissions."""
     named = set()
     for path in SERVICES.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):

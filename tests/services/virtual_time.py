@@ -1,4 +1,4 @@
-"""Event loop whose clock jumps to the next timer whenever nothing else is to do."""
+"""Event loop whose clock jumps to the next timer when idle."""
 
 from __future__ import annotations
 

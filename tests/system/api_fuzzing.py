@@ -36,7 +36,7 @@ ANSWER_S = 300.0
 
 
 def with_models(client: Client, folder: Path) -> None:
-    """A model with two versions, the second one active, so that calls of its routes reach it."""
+    """Upload a model with two versions and activate the second, so that its routes can be called."""
     save_bundle(replace(uniform((0.9, 0.1, 0.1)), time_window_s=WINDOW_S), folder / "model")
     pack(folder / "model", folder / "model.isplat")
     for number in (1, 2):
@@ -46,7 +46,7 @@ def with_models(client: Client, folder: Path) -> None:
 
 
 def with_snapshot(folder: Path) -> None:
-    """A snapshot of a stream, so that calls of its routes reach it; the server has made the folder."""
+    """Store a snapshot of a stream, so that its routes can be called."""
     store = SnapshotStore(folder / "data" / "snapshots")
     said = {"seq": 1, "model_version": 1, "gaussians": 1, "time_window_s": list(WINDOW_S), "pause_ms": 0.1}
     with store.new() as new:
@@ -55,7 +55,7 @@ def with_snapshot(folder: Path) -> None:
 
 
 def fuzz(url: str, key: str, folder: Path, examples: int, *options: str) -> list[subprocess.CompletedProcess[str]]:
-    """Run schemathesis over every route, on a server whose stream is not started yet; its exit codes are 0 where it has found nothing."""
+    """Run schemathesis on every route of a server with a stopped stream. The exit codes are 0 without findings."""
     with Client(url, key) as client:
         with_models(client, folder)
     with_snapshot(folder)

@@ -1,4 +1,4 @@
-"""Browsers without a window, steered over the protocols that they bring: DevTools in Chromium, WebDriver BiDi in Firefox."""
+"""Headless browsers controlled by DevTools (Chromium) and WebDriver BiDi (Firefox)."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class Page:
         raise NotImplementedError
 
     def evaluate(self, expression: str) -> Any:
-        """The value of a JavaScript expression, a promise's value included, as JSON carries it."""
+        """Return the value of a JavaScript expression, or of its promise, as JSON."""
         raise NotImplementedError
 
 
@@ -142,7 +142,7 @@ def page(browser: str, profile: Path) -> Iterator[Page]:
 
 
 def _address(log: Path, process: subprocess.Popen) -> str:
-    """The address that the browser writes into its log once it listens."""
+    """Wait for the address that the browser logs once it listens, and return it."""
     end = time.monotonic() + START_S
     while time.monotonic() < end and process.poll() is None:
         if found := re.search(r"listening on (ws://\S+)", log.read_text(errors="replace")):

@@ -1,4 +1,4 @@
-"""The whole program on small recordings, in this process where possible and otherwise in a child process."""
+"""The complete program on small recordings, in this process where possible, otherwise in a child process."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Servers as processes, for tests that ask them as a user would."""
+"""Server processes for tests that use them as a client."""
 
 from __future__ import annotations
 
@@ -22,8 +22,7 @@ streams: {{theatre-1: {{source: "synthetic:?width=64&height=48&frames=4&fps=2", 
 
 @contextmanager
 def serving(folder: Path) -> Iterator[tuple[str, str]]:
-    """A server with one stream that is not started, in a folder with a short path: its address and its administrator's key. It must end
-    well, and without a bug in its log."""
+    """Run a server with a stopped stream. Yield its URL and admin key. Check for a clean exit without traceback."""
     settings = folder / "settings.yaml"
     settings.write_text(SETTINGS.format(folder=folder))
     log = folder / "log"

@@ -1,4 +1,4 @@
-"""The page is for everybody in the room: names and roles for programs that read aloud, contrast, the keyboard (axe-core's rules, WCAG 2.1 AA)."""
+"""Accessibility of the console: axe-core's WCAG 2.1 AA rules, contrast and keyboard use."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ STATES = ("live", "stale", "frozen", "source lost", "no connection", "no picture
 
 @pytest.fixture(scope="module")
 def page() -> Iterator[Any]:
-    """The page of a server with a stream that does not run, after signing in."""
+    """The console of a server with a stopped stream, before sign-in, and the administrator's key."""
     with (
         chromium_by_playwright() as browser,
         tempfile.TemporaryDirectory(prefix="isa-") as folder,
@@ -82,7 +82,7 @@ def test_console_error_message_is_accessible(page):
 
 
 def test_badges_of_all_states_have_sufficient_contrast(page):
-    """Check the colour of every state, also of those that axe-core never sees, and of the badges by the pictures."""
+    """Includes states that axe-core does not encounter and badges of pictures."""
     page, _ = page
     page.click("#tab-live")
     for state in STATES:

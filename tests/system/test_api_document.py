@@ -17,7 +17,7 @@ pytest.importorskip("schemathesis", reason="schemathesis comes with the developm
 
 
 def test_api_responses_conform_to_openapi_document():
-    """Every operation with its examples, values at and beyond each limit of its schema, and two at random, the same ones each time."""
+    """Calls every operation with examples, boundary values and two fixed random inputs."""
     with tempfile.TemporaryDirectory(prefix="isf-") as folder, serving(Path(folder)) as (url, key):
         runs = fuzz(url, key, Path(folder), 2, "--phases", "examples,coverage,fuzzing", "--generation-deterministic")
     for done, fewest in zip(runs, (4, 200), strict=True):

@@ -1,4 +1,4 @@
-"""Bad input: one clear sentence, exit code 2, no traceback, and nothing that was already written is lost."""
+"""Bad input: one error sentence, exit code 2, no traceback, and earlier results are kept."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ QUICK = ("--steps-per-frame", "2")
 
 @pytest.fixture
 def refused(intrasplat):
-    """Run a command that must be refused with this sentence."""
+    """Return a function that runs a command and checks that it is refused with the given text."""
 
     def check(*arguments, match: str):
         done = intrasplat(*arguments)
@@ -35,7 +35,7 @@ def refused(intrasplat):
 
 @pytest.fixture
 def kept(finished, tmp_path, fingerprints):
-    """A copy of a finished run, which must be untouched at the end of the test."""
+    """A copy of a finished run that must be unchanged at the end of the test."""
     out = tmp_path / "kept"
     shutil.copytree(finished, out)
     before = fingerprints(out)
@@ -45,7 +45,7 @@ def kept(finished, tmp_path, fingerprints):
 
 @pytest.fixture
 def copy(tiny, tmp_path):
-    """A copy of the recording that may be broken."""
+    """A copy of the recording that the test may damage."""
     return shutil.copytree(tiny, tmp_path / "recording")
 
 
@@ -65,7 +65,7 @@ def test_replay_refuses_truncated_video(tmp_path, kept, refused):
 
 
 def test_replay_with_broken_image_saves_earlier_frames(copy, tmp_path, refused):
-    """The one fault that shows only on the way: the run ends early, and what it had reached is whole."""
+    """The fault appears only during the run, which ends early with valid results."""
     broken = sorted((copy / "images").iterdir())[3]
     broken.write_bytes(broken.read_bytes()[:-200])
     out = tmp_path / "out"
@@ -96,7 +96,7 @@ def test_replay_refuses_inverted_masks(copy, kept, refused):
 
 
 def rewrite_tensors(bundle, change):
-    """Change the tensors' bytes and let the manifest agree, as somebody would who means it."""
+    """Change the bytes of the tensors and update the digest in the manifest."""
     path, manifest_path = bundle / "model.safetensors", bundle / "manifest.json"
     data = bytearray(path.read_bytes())
     (header,) = struct.unpack("<Q", data[:8])
@@ -140,7 +140,7 @@ def test_render_refuses_empty_model_folder(tmp_path, refused):
 
 
 def fill(folder, leave_bytes):
-    """Take all room on the disk but so much."""
+    """Fill the disk except for the given number of bytes."""
     ballast = folder / "ballast"
     with open(ballast, "ab") as file:
         os.posix_fallocate(file.fileno(), 0, shutil.disk_usage(folder).free - leave_bytes)
@@ -153,7 +153,7 @@ def test_replay_refuses_full_disk(small_disk, tiny, refused):
 
 
 def test_replay_on_disk_that_fills_up_saves_earlier_frames(small_disk, tiny, refused, monkeypatch):
-    """Somebody else takes the room after three frames: video, model and report of these are still written, and whole."""
+    """The disk fills up after three frames. Video, model and report of these frames are still written."""
     from operators.sinks.video import VideoSinkOp
 
     compute = VideoSinkOp.compute

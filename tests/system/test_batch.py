@@ -1,4 +1,4 @@
-"""`intrasplat batch`: every recording of a folder once, whatever is killed meanwhile, and what it refuses."""
+"""`intrasplat batch`: each recording of a folder once despite kills, and refused arguments."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ QUICK = ("--steps-per-frame", "2")
 
 @pytest.fixture(scope="module")
 def batch_kill():
-    """The benchmark of the same."""
+    """The benchmark module that runs and kills batches."""
     spec = importlib.util.spec_from_file_location("batch_kill", BENCHMARK)
     module = sys.modules["batch_kill"] = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -27,7 +27,7 @@ def batch_kill():
 
 @pytest.fixture
 def recordings(tiny, tmp_path):
-    """A folder with two recordings, a folder that is none, and a file that is none."""
+    """A folder with two recordings, an empty folder and a text file."""
     folder = tmp_path / "recordings"
     for name in ("a", "b"):
         shutil.copytree(tiny, folder / name)

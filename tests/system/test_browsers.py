@@ -1,4 +1,4 @@
-"""`report.html` as its readers see it: its video plays in Chromium and in Firefox, in the right colours."""
+"""The video of `report.html` plays in Chromium and Firefox with correct colours."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ PIXELS = """(async () => {
 
 @pytest.fixture(scope="module", params=sorted(PROGRAMS))
 def browser(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
-    """A running browser. Where it is not installed the test is skipped; in CI it fails."""
+    """A page of a running browser. If it is not installed, the test is skipped; in CI it fails."""
     required(request.param)
     with page(request.param, tmp_path_factory.mktemp(request.param)) as opened:
         yield opened
@@ -42,7 +42,7 @@ class _Quiet(SimpleHTTPRequestHandler):
 
 @pytest.fixture
 def server(finished: Path) -> Iterator[str]:
-    """The output folder over HTTP: what a canvas may read."""
+    """The output folder over HTTP, because a canvas may not read files."""
     with ThreadingHTTPServer(("127.0.0.1", 0), partial(_Quiet, directory=str(finished))) as httpd:
         thread = threading.Thread(target=httpd.serve_forever)
         thread.start()

@@ -1,4 +1,4 @@
-"""The console in a browser: what it asks before it deletes, what it shows of keys, audit and health, and that its live page fits the window."""
+"""The console in a browser: confirmation of deletions, keys, audit log, health, and layout of the live page."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ CUT = """() => [...document.querySelectorAll("#live canvas, #live figcaption, #l
 
 @pytest.fixture(scope="module")
 def console() -> Iterator[tuple[Any, Client]]:
-    """The page of a server with a stream that does not run, after signing in as its administrator; and a client. Nothing may go wrong in it."""
+    """The console of a server with a stopped stream, signed in as administrator, and a client. Fails on page errors."""
     with (
         chromium_by_playwright() as browser,
         tempfile.TemporaryDirectory(prefix="isc-") as folder,
@@ -50,7 +50,7 @@ def console() -> Iterator[tuple[Any, Client]]:
 
 @pytest.fixture
 def page(console):
-    """The page, with no dialog open."""
+    """The console page. Checks that the test leaves no dialog open."""
     page, _ = console
     yield page
     assert page.locator("dialog[open]").count() == 0
@@ -66,12 +66,12 @@ def listed(client: Client) -> list[KeyView]:
 
 
 def until(page: Any, true: str) -> None:
-    """Wait until an expression is true. Playwright's own way needs `eval`, which the page's policy forbids."""
+    """Wait until an expression is true. Playwright's wait needs `eval`, which the page's policy forbids."""
     for _ in range(6000):
         if page.evaluate(true):
             return
         page.wait_for_timeout(50)
-    raise AssertionError(f"it did not come about: {true}")
+    raise AssertionError(f"condition not met in time: {true}")
 
 
 def opened(page: Any, tab: str) -> None:

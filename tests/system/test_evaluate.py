@@ -1,4 +1,4 @@
-"""`intrasplat evaluate` on small recordings: figures that agree with the run's own, reports, and what is refused."""
+"""`intrasplat evaluate` on small recordings: agreement with the run's figures, reports, refused arguments."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def long(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def offline(long, tmp_path_factory) -> Path:
-    """An offline reconstruction of it."""
+    """An offline reconstruction of `long`."""
     out = tmp_path_factory.mktemp("outputs") / "offline"
     assert run(["reconstruct", str(long), "--out", str(out), "--steps", "30"]) == 0
     return out

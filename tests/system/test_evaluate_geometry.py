@@ -1,4 +1,4 @@
-"""`intrasplat evaluate --protocol geometry`: what a recording knows is measured, what it does not know has no figure."""
+"""`intrasplat evaluate --protocol geometry` scores exactly the ground truth that a recording has."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from services.reports.evaluation import EvaluationReport
 
 @pytest.fixture(scope="module")
 def known(tmp_path_factory) -> Path:
-    """Nine frames of a moving scope with everything that is known."""
+    """Nine frames of a moving scope with all kinds of ground truth."""
     extras = Extras(third=True, tracks=True, flow=True)
     folder = tmp_path_factory.mktemp("known") / "known"
     return synthesize(folder, frames=9, fps=9, width_px=64, height_px=48, camera="moving", extras=extras)
@@ -68,7 +68,7 @@ def test_geometry_is_printed_and_written_with_baselines(intrasplat, known, made,
 
 
 def test_geometry_poses_option_scores_trajectory(intrasplat, known, made, tmp_path):
-    """Halve the trajectory's lengths: its scale is wrong, and the model is away from its stated place."""
+    """Halved translations give the trajectory a wrong scale and the model a wrong place."""
     recording = open_recording(known)
     poses = np.stack([recording.camera_at(k).world_to_camera for k in range(9)])
     halved = poses.copy()

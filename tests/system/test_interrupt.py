@@ -1,4 +1,4 @@
-"""Ctrl-C in the middle: what was displayed is written, the exit code is 130, and nothing looks like a crash."""
+"""Ctrl-C during a run: displayed frames are saved, exit code 130, no traceback."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`live` as a whole program: however it ends, what was reached is there, and one sentence says why."""
+"""`live` as a process: however it ends, results are saved and one sentence states the reason."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def scope(tmp_path_factory):
 
 
 def showing(start, source, out):
-    """A run whose pictures are on the screen."""
+    """Start a live run and return when its first picture is displayed."""
     process = start("live", source, "--loop", "--scale", 1, "--out", out)
     for line in process.stderr:
         if line.startswith("live"):
@@ -43,7 +43,7 @@ def showing(start, source, out):
 
 
 def reached(out, frames=1):
-    """The report of a run that has left everything, whole."""
+    """Return the report of a run, after checking that all outputs are complete."""
     report = RunReport.read(out / "report.json")
     assert report.run.command == "live" and report.frames.displayed >= frames
     assert load_bundle(out / "model").sha256() == report.model.sha256
@@ -54,7 +54,7 @@ def reached(out, frames=1):
 
 
 def one_sentence(err):
-    """The only line that says what went wrong."""
+    """Return the only error line."""
     assert "Traceback" not in err
     said = [line for line in err.splitlines() if line.startswith("error: ")]
     assert len(said) == 1, err
@@ -86,7 +86,7 @@ def test_live_ends_after_seconds_option(scope, tmp_path, intrasplat):
 
 
 class Dying(RealtimeSource):
-    """A recording whose 40th frame does not come. A busy machine has shown at least one by then."""
+    """Recording that is lost at its 40th frame. A busy machine has displayed a frame by then."""
 
     def frames(self) -> Iterator[Frame]:
         """See `RealtimeSource`."""
@@ -132,7 +132,7 @@ def test_live_saves_results_if_gpu_is_out_of_memory(scope, tmp_path, monkeypatch
 
 @pytest.mark.slow
 def test_live_saves_results_if_disk_fills_up(scope, small_disk, start):
-    """Somebody else takes the room: the model and the report find what was kept free for them."""
+    """Another program fills the disk; model and report use reserved space."""
     process = showing(start, scope, small_disk / "out")
     with open(small_disk / "ballast", "ab") as ballast:
         os.posix_fallocate(ballast.fileno(), 0, shutil.disk_usage(small_disk).free - (6 << 20))

@@ -30,7 +30,7 @@ def dry_run(*arguments: str, **environment: str) -> str:
 
 
 def test_make_demo_builds_cuda_only_with_gpu():
-    """`make` runs what is under `$(MAKE)` even in a dry run, so its line is read here."""
+    """The recipe is read, because `make` executes lines with `$(MAKE)` even in a dry run."""
     recipe = (ROOT / "Makefile").read_text().partition("\ndemo:")[2].partition("\n\n")[0]
     assert "set -e; if $(BIN)/python -m services.cli.doctor; then" in recipe
     assert "||" not in recipe  # a build that fails ends the demo

@@ -1,4 +1,4 @@
-"""`intrasplat live`, `replay` and `batch` end with 3 and a sentence where no frame was shown."""
+"""`intrasplat live`, `replay` and `batch` exit with 3 and a sentence if no frame was shown."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from services.reports.schema import RunReport
 
 @pytest.fixture
 def drapes(tmp_path):
-    """A recording of nothing but blue drapes, whose light changes a little from frame to frame."""
+    """A recording of blue drapes only, with slightly changing light."""
     folder = tmp_path / "in" / "drapes"
     (folder / "images").mkdir(parents=True)
     rng = np.random.default_rng(0)
@@ -31,7 +31,7 @@ def drapes(tmp_path):
 
 
 def test_runs_and_batch_with_only_withheld_frames_exit_3(drapes, tmp_path, capsys):
-    """A single test, because a live run takes seconds."""
+    """One test, because a live run takes seconds."""
     assert (
         run(
             [
@@ -105,7 +105,7 @@ def test_reconstruct_exits_3_for_black_images(level, bits, tmp_path, capsys):
 
 @pytest.fixture
 def black_beginning(tiny, tmp_path):
-    """`tiny`, of which the first two pictures are black."""
+    """The recording `tiny` with its first two images black."""
     recording = tmp_path / "recording"
     shutil.copytree(tiny, recording)
     for path in sorted((recording / "images").iterdir())[:2]:

@@ -1,4 +1,4 @@
-"""`live --record` as a whole program: killed, interrupted, started again, and replayed."""
+"""`live --record` as a process: killed, interrupted, restarted and replayed."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def scope(tmp_path_factory):
 
 
 def recording_under_way(start, source, out):
-    """A live run that has recorded a few frames."""
+    """Start a live run and return when it has recorded a few frames."""
     process = start("live", source, "--loop", "--scale", 1, "--out", out, "--record", "--json")
     recordings = out / "recordings"
     for _ in range(6000):
@@ -91,7 +91,7 @@ def test_live_record_without_out_is_refused(scope, intrasplat):
 
 
 def test_evaluate_session_uses_its_own_size_and_times(scope, tmp_path, intrasplat):
-    """Scale and time are those of the recorded run and are not applied again, even after loops of the source."""
+    """Scale and times of the recorded run are not applied twice, even if the source looped."""
     out = tmp_path / "out"
     arguments = ("--loop", "--max-frames", "60", "--scale", "0.5", "--fps", "60", "--record", "--json")
     assert intrasplat("live", scope, *arguments, "--out", out).code == 0

@@ -1,4 +1,4 @@
-"""Real endoscopy through the whole program; the recordings are not part of the repository."""
+"""Real endoscopy recordings, which are not part of the repository."""
 
 from __future__ import annotations
 

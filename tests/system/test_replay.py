@@ -1,4 +1,4 @@
-"""A replay from the command line: what it writes, what it prints, and the same bytes twice."""
+"""A replay from the command line: outputs, messages and reproducibility."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Recordings and replays of a running service: uploaded, replayed, read, kept as a model; and what becomes of a replay when processes are killed."""
+"""Recordings and replays of a running service: upload, replay, results, kept models, and killed processes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ LONG = {"steps_per_frame": 300}
 
 
 class Server:
-    """`intrasplat serve` without streams, in a folder that outlives it."""
+    """`intrasplat serve` without streams. Its folder outlives the process."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.log = folder, folder / "log"
@@ -38,7 +38,7 @@ class Server:
         )
 
     def start(self) -> Client:
-        """Start it; a client with its administrator's key."""
+        """Start the server and return a client with the administrator's key."""
         with self.log.open("w") as output:
             self.process = subprocess.Popen(
                 [sys.executable, "-m", "services.cli", "serve", "--config", self.folder / "service.yaml"],
@@ -56,20 +56,20 @@ class Server:
             if result:
                 return result
             time.sleep(0.05)
-        raise AssertionError(f"it did not come about within {WITHIN_S} s:\n{self.log.read_text()[-4000:]}")
+        raise AssertionError(f"condition not met within {WITHIN_S} s:\n{self.log.read_text()[-4000:]}")
 
     def pool(self) -> int | None:
-        """The process of the pool."""
+        """Return the process id of the pool, or None."""
         return next((pid for pid in children(self.process.pid) if b"services.jobs.pool" in command(pid)), None)
 
     def attempt(self) -> int | None:
-        """The process of the attempt that runs."""
+        """Return the process id of the running attempt, or None."""
         pool = self.pool()
         return None if pool is None else next(iter(children(pool)), None)
 
 
 def children(pid: int) -> list[int]:
-    """Processes that a process has started."""
+    """Return the process ids of a process's children."""
     try:
         return [
             int(each)
@@ -106,13 +106,13 @@ def server(tiny, tmp_path_factory):
 
 
 def running(server, job_id):
-    """Wait until an attempt at a replay runs; its process."""
+    """Wait until an attempt of the replay runs. Return its process id."""
     server.until(lambda: server.client.replay(job_id).state == "running")
     return server.until(server.attempt)
 
 
 def results(server):
-    """Every result that lies on the disk, by the replay's id; and nothing half-made."""
+    """Return every report on the disk by id of its replay. Check that no attempt left files."""
     folder = server.folder / "data" / "replays"
     assert list((folder / ".running").glob("*/*-*")) == []
     return {
@@ -212,7 +212,7 @@ def test_console_uploads_and_replays_recording(server, page):
 
 
 def test_console_keeps_chosen_recording_while_list_loads(server, page):
-    """Answers may arrive in any order: one that was requested before the choice does not know the recording."""
+    """A list requested before the choice may arrive later and lack the chosen recording."""
     held: list = []
     page.click("#tab-recordings")
     row = page.locator("#recording-rows tr", has_text="by-hand")
@@ -235,10 +235,10 @@ def test_console_keeps_chosen_recording_while_list_loads(server, page):
 
 
 def until_true(found, page):
-    """Let the page go on until `found` says so."""
+    """Wait until `found` returns true while the page keeps running."""
     end_s = time.monotonic() + WITHIN_S
     while not found():
-        assert time.monotonic() < end_s, f"it did not come about within {WITHIN_S} s"
+        assert time.monotonic() < end_s, f"condition not met within {WITHIN_S} s"
         page.wait_for_timeout(20)
 
 

@@ -1,4 +1,4 @@
-"""`intrasplat serve` as a hospital's engineer meets it: a process, its page in a browser, its API, and engines that die."""
+"""`intrasplat serve` as a process: console in a browser, API, and killed engines."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def until(found, log, within_s=WITHIN_S):
         if result:
             return result
         time.sleep(0.05)
-    raise AssertionError(f"it did not come about within {within_s} s:\n{log.read_text()[-4000:]}")
+    raise AssertionError(f"condition not met within {within_s} s:\n{log.read_text()[-4000:]}")
 
 
 def test_service_reports_its_parts_and_stream(served):
@@ -114,7 +114,7 @@ def walls(tmp_path_factory):
 
 
 def colour_shown(client, stream):
-    """Red, green or blue: what the middle of the newest picture has most of; and which version it says that it is."""
+    """Return the dominant colour in the middle of the newest picture, and the model version in its header."""
     shown = client.pictures(stream)
     picture = next(shown)
     shown.close()
@@ -188,7 +188,7 @@ def page(served):
 
 
 def brightness(page, canvas):
-    """Mean of a canvas's values, 0 to 255."""
+    """Return the mean of a canvas's values, from 0 to 255."""
     return page.evaluate(
         """(id) => { const canvas = document.getElementById(id);
         const data = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data;

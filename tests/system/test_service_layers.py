@@ -1,5 +1,5 @@
 # ruff: noqa: F811 - fixtures of another module
-"""The third dimension of a running service: depth, confidence, the virtual camera, snapshots and exports, through its API and its page."""
+"""Layers, virtual camera, snapshots and exports of a running service, through its API and console."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Signals from start-up to the last frame: acknowledged at once, all that was reached is saved, and no run is mixed with another."""
+"""Signals from start-up to the last frame: immediate acknowledgement, saved results, no mixed outputs."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def long(tmp_path_factory):
 
 
 def started(start, *arguments):
-    """A replay that has shown its first frame."""
+    """Start a replay and return when it has displayed its first frame."""
     process = start(*arguments)
     for line in process.stderr:
         if line.startswith("replay 1"):

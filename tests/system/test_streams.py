@@ -1,4 +1,4 @@
-"""Standard streams that are closed, full or broken, and names that are not text: what a run writes to its folder is the same."""
+"""Closed, full or broken standard streams and non-text names do not change the outputs of a run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A control plane with parts in memory, and clients with each role."""
+"""A control plane with in-memory parts, and clients of each role."""
 
 from __future__ import annotations
 

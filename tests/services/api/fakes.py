@@ -1,4 +1,4 @@
-"""Parts in memory, for tests of the control plane."""
+"""In-memory parts of the control plane."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class FakeModel:
 
 
 class FakeModels:
-    """Takes what begins with `GOOD`."""
+    """Registry that accepts models beginning with `GOOD`."""
 
     def __init__(self) -> None:
         self.kept: dict[str, dict[int, FakeVersion]] = {}
@@ -160,7 +160,7 @@ class FakeStreams:
 
 
 class FakeDisplay:
-    """A picture every few milliseconds, without an end; counts who looks."""
+    """Endless display with a picture every 5 ms that counts its open subscriptions."""
 
     def __init__(self, jpeg: bytes = b"\xff\xd8jpeg\xff\xd9", most: int | None = None) -> None:
         self.jpeg = jpeg
@@ -186,7 +186,7 @@ class FakeDisplay:
 
 
 class FakeRecordings:
-    """Takes what begins with `GOOD`."""
+    """Recording store that accepts files beginning with `GOOD`."""
 
     def __init__(self) -> None:
         self.kept: dict[str, FakeRecording] = {}

@@ -1,4 +1,4 @@
-"""Limits of the values that clients send, and statuses of answers. Clients rely on both."""
+"""Limits of request values and status codes of responses. Clients rely on both."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The application as a whole: what it loads, what it answers without parts, how it is described."""
+"""The whole application: imports, routes without parts, OpenAPI document."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ def test_audit_log_omits_stream_end_reasons_that_may_name_files(reason, kept):
     ("state", "ready"), [("live", "ready"), ("stopped", "ready"), ("source lost", "degraded"), ("failed", "degraded")]
 )
 def test_streams_check_is_degraded_when_stream_lost_source_or_failed(tmp_path, monkeypatch, state, ready):
-    """The reason is left out: /readyz needs no key, and a reason may name a source."""
+    """The check omits the reason: /readyz needs no key, and a reason may name a source."""
     source = "rtsp://10.0.0.5/x"
     view = StreamView(
         name="theatre", source=source, show="live", device="cpu", options={}, state=state, reason=f"{source} is gone"

@@ -1,4 +1,4 @@
-"""The audit log over the API: searched, paged, downloaded; and what of that is an entry."""
+"""The audit log over the API: search, pages, export, and the entries written for reads and exports."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from services.audit import AuditLog, Keeping, Wanted, exported, reading, search,
 
 @pytest.fixture
 def kept(plane):
-    """A server whose log has 40 activations of two models and one key that was refused."""
+    """A server whose log holds 40 activations of two models and one refused key revocation."""
     audit = plane.control.audit
     for number in range(40):
         audit.append("model.activate", actor=f"console (1f{number % 2})", role="operator", subject=f"liver/{number}")

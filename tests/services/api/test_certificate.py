@@ -1,4 +1,4 @@
-"""The server's certificate: loaded again while it serves, whatever its files become meanwhile, and its expiry."""
+"""The server's certificate: reload while serving, unusable files, expiry."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SOON = datetime(2030, 5, 17, 12, 30, 15, tzinfo=UTC)
 
 
 def made(until: datetime = SOON, name: str = "room-1.example", kind: str = "ec"):
-    """A self-signed certificate and its key."""
+    """Return a self-signed certificate and its key."""
     key = ec.generate_private_key(ec.SECP256R1()) if kind == "ec" else rsa.generate_private_key(65537, 2048)
     subject = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, name)])
     certificate = (
@@ -47,7 +47,7 @@ def key_pem(key, passphrase: bytes | None = None) -> bytes:
 
 
 def put(folder: Path, certificate: bytes, key: bytes) -> tuple[Path, Path]:
-    """Write a pair as a renewal does: each file replaced."""
+    """Replace certificate and key files atomically, as a renewal does."""
     for name, content in (("cert.pem", certificate), ("key.pem", key)):
         (folder / "new").write_bytes(content)
         os.replace(folder / "new", folder / name)
@@ -56,7 +56,7 @@ def put(folder: Path, certificate: bytes, key: bytes) -> tuple[Path, Path]:
 
 @contextmanager
 def listening(certificate: ServerCertificate, pair: tuple[Path, Path]) -> Iterator[int]:
-    """A TLS server as `serve` has it: one context for its whole life. Its port."""
+    """Run a TLS server with one context for its lifetime, as `serve` does, and yield its port."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.load_cert_chain(*pair)
     certificate.attach(context)
@@ -79,7 +79,7 @@ def listening(certificate: ServerCertificate, pair: tuple[Path, Path]) -> Iterat
 
 
 def shown(port: int, name: str | None) -> bytes:
-    """The certificate that a new connection gets."""
+    """Return the certificate that a new connection receives."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
     with (

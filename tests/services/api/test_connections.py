@@ -1,4 +1,4 @@
-"""One address cannot take every connection, and the probe listener answers independently of the server's port."""
+"""Connection limits per address, request head limits, and the separate probe listener."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_address_bound_logs_refusals_once_per_minute(caplog):
 
 @pytest.fixture
 def served():
-    """A server in a thread, its ports and what bounds it."""
+    """Return a function that starts a server in a thread and returns its settings, bound and ports."""
     started = []
 
     with tempfile.TemporaryDirectory(prefix="isp-") as folder, contextlib.ExitStack() as stack:
@@ -290,7 +290,7 @@ HANDSHAKE = (
 
 
 def test_refused_websocket_handshake_gets_status_and_is_closed(served):
-    """Refusal by the HTTP parser, WebSocket parser or application leaves no connection open without an answer."""
+    """Refusals by HTTP parser, WebSocket parser and application all answer and close the connection."""
     _, bound, port, _ = served()
     line = b"X-Long: " + 20_000 * b"a" + b"\r\n"
     lines = b"".join(b"X-%d: a\r\n" % number for number in range(300))

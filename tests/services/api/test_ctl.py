@@ -1,4 +1,4 @@
-"""`intrasplat ctl` against a control plane: tables with headings, questions before deletions, keys, the audit log, health and watch."""
+"""`intrasplat ctl` against a control plane: tables, confirmations, keys, audit log, health and watch."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ PROCESSES = {
 
 @pytest.fixture
 def service(tmp_path, monkeypatch) -> Iterator[Client]:
-    """A control plane with parts in memory that listens on a port, and what a shell needs to reach it."""
+    """A listening control plane with in-memory parts, and the environment that `ctl` needs to reach it."""
     for name in [name for name in os.environ if name.startswith("INTRASPLAT_")]:
         monkeypatch.delenv(name)
     parts = fake_parts(checks={"camera": lambda: answered(CheckResult(False, "theatre-1: its source is lost", False))})
@@ -63,7 +63,7 @@ async def answered(result: CheckResult) -> CheckResult:
 
 @pytest.fixture
 def ctl(service, capsys):
-    """Run a command: its exit code, what it wrote to standard output and to standard error."""
+    """Return a function that runs a command and returns exit code, standard output and standard error."""
 
     def call(*arguments: str) -> tuple[int, str, str]:
         capsys.readouterr()
@@ -129,7 +129,7 @@ def test_ctl_delete_asks_for_confirmation(ctl, service, tmp_path, monkeypatch, w
 
 
 class Terminal(io.StringIO):
-    """Somebody who answers."""
+    """Standard input that claims to be a terminal."""
 
     def isatty(self) -> bool:
         return True
@@ -184,7 +184,7 @@ def test_ctl_audit_filters_and_formats_entries(ctl, service):
 
 def test_ctl_audit_follow_prints_new_entries_once(ctl, service, monkeypatch, capsys):
     class Enough(Exception):
-        """The test has seen what it waits for."""
+        """Raised to end following the audit log."""
 
     looks = 0
 

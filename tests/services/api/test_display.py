@@ -1,4 +1,4 @@
-"""Pictures to viewers: by WebSocket and MJPEG, with tickets; who leaves, stalls, or is one too many."""
+"""Pictures by WebSocket and MJPEG: tickets, disconnected, stalled and excess viewers."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def until(condition):
         if condition():
             return
         time.sleep(0.01)
-    raise AssertionError("it did not happen")
+    raise AssertionError("condition not met in time")
 
 
 def test_display_websocket_sends_header_and_jpeg_per_picture(watched, display):
@@ -188,7 +188,7 @@ def test_stalled_mjpeg_viewer_is_dropped_and_counted(new_plane):
 
 
 def revoke(plane, how: str) -> None:
-    """End the viewer's key, or the token of a person."""
+    """Revoke the viewer's key by the API or by the command in another process."""
     keys = plane.control.keys
     (key,) = [each for each in keys.all() if each.name == "test-viewer"]
     if how == "by the API":
@@ -199,7 +199,7 @@ def revoke(plane, how: str) -> None:
 
 @pytest.fixture
 def endless(new_plane, monkeypatch):
-    """A display without an end, whose viewers' keys are looked at often."""
+    """A server with an endless display that checks the keys of viewers every 20 ms."""
     monkeypatch.setattr(display_module, "POLL_S", 0.02)
     plane = new_plane(fake_parts(display=FakeDisplay()))
     plane.ask("POST", "/v1/streams", json={"name": "endoscope", "source": "synthetic:"})
@@ -207,13 +207,13 @@ def endless(new_plane, monkeypatch):
 
 
 def end_of(socket) -> int:
-    """The code with which the server closes a WebSocket that has pictures."""
+    """Receive pictures until the WebSocket is closed. Return the close code."""
     for _ in range(5000):
         try:
             socket.receive_bytes()
         except WebSocketDisconnect as ended:
             return ended.code
-    raise AssertionError("it goes on")
+    raise AssertionError("the WebSocket is still open after 5000 pictures")
 
 
 @pytest.mark.parametrize("how", ["by the API", "by the command"])
@@ -270,7 +270,7 @@ def test_damaged_key_file_does_not_close_open_display_websocket(endless):
     "change", [{"streams": ["another"]}, {"streams": ["endoscope", "another"]}, {"role": "viewer"}, {"expires_at": "2020-01-01T00:00:00+00:00"}]
 )  # fmt: skip
 def test_still_valid_is_false_after_key_entry_changed(plane, change):
-    """A key whose role, streams or expiry are changed in the file of the keys must be presented again."""
+    """A key whose role, streams or expiry changed in the key file must be presented again."""
     keys = plane.control.keys
     key = next(key for key in keys.all() if key.role is Role.OPERATOR)
     caller = Caller(key.name, key.id, key.role)

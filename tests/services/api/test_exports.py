@@ -1,4 +1,4 @@
-"""Snapshots and exports through the API: roles, audit, digests, requests that are sent again."""
+"""Snapshots and exports over the API: roles, audit, digests, idempotency keys."""
 
 from __future__ import annotations
 

@@ -85,7 +85,7 @@ def test_unknown_host_header_returns_421_on_all_routes(new_plane):
     ],
 )
 def test_known_hosts_refuses_multiple_host_headers(plane, kind, hosts, taken):
-    """A server before this one may have looked at the other of the two."""
+    """A proxy in front of the server may have checked the other header."""
     reached, sent = [], []
 
     async def app(scope, receive, send):

@@ -150,7 +150,7 @@ def test_ticket_is_invalid_after_its_key_is_revoked(plane):
 
 
 def test_find_compares_every_token_by_compare_digest(tmp_path, monkeypatch):
-    """Both are compared, and by `compare_digest`."""
+    """Known and unknown keys are compared in constant time."""
     from services.auth import keys
 
     compared = []
@@ -165,7 +165,7 @@ def test_find_compares_every_token_by_compare_digest(tmp_path, monkeypatch):
 
 @pytest.fixture
 def clock(monkeypatch):
-    """The wall clock of the keys: `clock(days=3)` sets it forward."""
+    """Return a function that sets the wall clock of the keys forward, such as `clock(days=3)`."""
 
     class Clock(datetime):
         ahead = timedelta()
@@ -388,7 +388,7 @@ def test_still_valid_is_false_after_key_expiry_or_revocation(plane, clock):
 
 @pytest.fixture
 def limited(new_plane):
-    """A server with two streams, and the headers of an operator's and a viewer's key for the first."""
+    """A server with two streams, and headers of an operator's and a viewer's key limited to the first."""
     plane = new_plane(fake_parts(display=FakeDisplay(most=2)))
     for name in ("theatre-1", "theatre-2"):
         assert plane.ask("POST", "/v1/streams", json={"name": name, "source": "synthetic:"}).status_code == 201
@@ -406,7 +406,7 @@ OPEN_TO_LIMITED_KEYS = {("GET", "/v1/streams"), ("POST", "/v1/streams"), ("POST"
 
 
 def test_limited_key_gets_403_on_routes_beyond_its_streams(limited):
-    """Every route there is: a new one is closed to limited keys unless it says otherwise."""
+    """Checks every route; new routes refuse limited keys by default."""
     plane, headers = limited
     looked_at = 0
     for route in iter_route_contexts(plane.app.routes):

@@ -1,4 +1,4 @@
-"""Rates, lengths and times."""
+"""Rate limits, body limits and body timeouts."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ def test_invalid_json_body_returns_400_or_422(plane, body):
 
 
 def bounded(messages, most_bytes=100, **limits):
-    """The bytes that a bounded body lets through; a number among the messages is a pause in seconds."""
+    """Return the bytes that pass a bounded body. A number among the messages is a pause in seconds."""
 
     async def receive():
         message = messages.pop(0)

@@ -1,4 +1,4 @@
-"""The socket that the server listens at."""
+"""Options of the server's listening socket."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from services.settings import load_settings
 
 @pytest.fixture
 def accepted(tmp_path):
-    """Both ends of a connection to it."""
+    """Both ends of a connection to the listener."""
     settings = load_settings(None, {"server.port": "0", "paths.data": f'"{tmp_path}"'})
     with bind(settings) as listener, socket.socket() as client:
         client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)

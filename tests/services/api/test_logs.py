@@ -16,7 +16,7 @@ from services.settings import LogSettings
 
 
 class Terminal(io.StringIO):
-    """Says that it is one."""
+    """Standard error that claims to be a terminal."""
 
     def isatty(self) -> bool:
         return True

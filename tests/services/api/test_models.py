@@ -1,4 +1,4 @@
-"""Models over the API: uploads, activation, rollback, deletion, and what each refuses."""
+"""Models over the API: upload, activation, rollback, deletion and their refusals."""
 
 from __future__ import annotations
 

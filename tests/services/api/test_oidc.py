@@ -1,4 +1,4 @@
-"""Persons of an OpenID Connect issuer: a local one with real keys, and what a stranger may try with a token."""
+"""OpenID Connect tokens: a local issuer with real keys, and forged tokens."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ ROLES = {"theatre": "viewer", "research": "operator", "it": "admin"}
 
 
 class Issuer:
-    """An issuer on this machine, its keys, and what it was asked for."""
+    """OpenID Connect issuer on this machine that records requested paths."""
 
     def __init__(self) -> None:
         self.first = rsa.generate_private_key(public_exponent=65537, key_size=2048)

@@ -1,4 +1,4 @@
-"""Recordings over the API: uploaded, listed, deleted, and what each refuses."""
+"""Recordings over the API: upload, list, deletion and their refusals."""
 
 from __future__ import annotations
 

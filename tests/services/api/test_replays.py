@@ -1,4 +1,4 @@
-"""Replays over the API: started once for each idempotency key, watched, cancelled, deleted, their results handed out."""
+"""Replays over the API: idempotent start, progress, cancellation, deletion, results."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ REPLAYS = "/v1/replays"
 
 
 class Worker:
-    """Runs jobs as the test says."""
+    """Worker that runs jobs on request of the test."""
 
     def __init__(self, store: JobStore, results: Path) -> None:
         self.claims = Claims(store.database, "worker", 60, 3, lambda folder: False)
@@ -41,7 +41,7 @@ class Worker:
 
 @pytest.fixture
 def worker_and_plane(new_plane, tmp_path):
-    """A plane whose replays are real, and somebody who runs them."""
+    """A worker, and a control plane with real replays."""
 
     def find(connection, name):
         if name == "unknown":

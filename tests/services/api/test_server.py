@@ -1,4 +1,4 @@
-"""The server as a process: it starts, answers over a real socket, bounds slow callers, and drains."""
+"""The server as a process: start, real sockets, slow clients, TLS, drain."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ SERVE = [sys.executable, "-m", "services.cli", "serve", "--port", "0", "--set", 
 
 @contextmanager
 def serving(folder: Path, *options: str) -> Iterator[tuple[subprocess.Popen, int, str]]:
-    """A server's process, its port, and the administrator's key."""
+    """Start a server process. Yield the process, its port and the administrator's key."""
     environment = {name: value for name, value in os.environ.items() if not name.startswith("INTRASPLAT_")}
     process = subprocess.Popen(
         [*SERVE, "--data", str(folder), "--set", f"paths.runtime={folder / 'r'}", *options],
@@ -160,7 +160,7 @@ def test_refused_request_is_answered_before_body_arrives(served):
     ],
 )
 def test_ambiguous_request_framing_returns_400(served, head):
-    """Request smuggling: what a proxy before the server could understand in another way is refused or ends the connection."""
+    """Request smuggling: framing that a proxy could read differently is refused."""
     _, port, _ = served
     answer = raw(port, head.encode("latin1")).lower()
     assert answer.startswith(b"http/1.1 400") and b"connection: close" in answer and answer.count(b"http/1.1") == 1

@@ -1,4 +1,4 @@
-"""Viewers that take nothing, over real sockets: each is dropped, and others go on."""
+"""Stalled viewers over real sockets are dropped while others continue."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def until(condition) -> None:
         if condition():
             return
         time.sleep(0.02)
-    raise AssertionError("it did not happen")
+    raise AssertionError("condition not met in time")
 
 
 @pytest.mark.parametrize(("path", "more"), [("mjpeg", ()), ("display", UPGRADE)])

@@ -53,7 +53,7 @@ def digest(data: bytes) -> str:
 
 
 def test_slow_uploads_of_one_key_do_not_block_other_keys(new_plane):
-    """Two uploads of the operator hang; the administrator's is taken, and a third of the operator's is not."""
+    """Two uploads of the operator hang. The operator's third is refused and the administrator's accepted."""
 
     class SlowModels(FakeModels):
         def __init__(self) -> None:

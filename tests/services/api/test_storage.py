@@ -1,4 +1,4 @@
-"""A full disk: the audit log refuses, /readyz and the metrics say so, and the service goes on by itself once there is space."""
+"""A full disk: refused changes, /readyz, metrics, and recovery once there is space."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ WANTED = {"name": "room", "source": "synthetic:", "start": False}
 
 @pytest.fixture
 def full_disk(monkeypatch):
-    """Call to fill the disk under the head of the audit log, and again to free it."""
+    """Return a function that simulates a full disk under the head of the audit log, or frees it."""
     real = os.replace
 
     def refuse(source, target):
@@ -82,7 +82,7 @@ def test_disk_check_is_degraded_below_spare_bytes(plane, monkeypatch, free, stat
 
 
 def test_disk_check_is_degraded_if_any_folder_is_full_or_unreadable(tmp_path, monkeypatch):
-    """The order of the folders does not matter."""
+    """Independent of the order of the folders."""
     audit = AuditLog(tmp_path / AUDIT_FILE)
     audit.close()
     free = {tmp_path / "a": 5 * state.SPARE_BYTES, tmp_path / "b": 2**20, tmp_path / "c": 5 * state.SPARE_BYTES}
@@ -130,7 +130,7 @@ def test_disk_check_covers_configured_recordings_folder(new_plane, tmp_path, mon
 )
 @pytest.mark.parametrize("store", ["keys", "registry", "streams"])
 def test_disk_errors_of_stores_return_507_or_503_without_traceback(plane, monkeypatch, caplog, store, number, status):
-    """An error of the disk in any store is an answer that names it, and not a traceback."""
+    """The response names the error of the disk."""
 
     def refuse(*_, **__):
         raise OSError(number, os.strerror(number), "/secret/path")

@@ -1,4 +1,4 @@
-"""Actions of the service itself are written to the audit log without blocking their caller."""
+"""System events are written to the audit log without blocking their caller."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Notifications to systemd: ready, watchdog while the event loop runs, stopping; none without a socket."""
+"""Notifications to systemd: ready, watchdog, stopping; none without a socket."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ROOT = Path(__file__).resolve().parents[3]
 
 @pytest.fixture
 def manager() -> Iterator[tuple[socket.socket, str]]:
-    """A socket as systemd has one, and its address."""
+    """A notification socket as systemd provides it, and its address."""
     with tempfile.TemporaryDirectory() as folder, socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as heard:
         heard.bind(f"{folder}/notify")
         heard.settimeout(300)

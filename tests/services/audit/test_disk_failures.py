@@ -1,4 +1,4 @@
-"""Every call to the disk that the audit log makes fails once, fails from then on, or is the last one before a kill. The chain stays whole."""
+"""Disk calls of the audit log that fail once or permanently, or are the last before a kill. The chain stays intact."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ MANY_FILES = Keeping(segment_bytes=700, segments=1)
 
 
 class Killed(BaseException):
-    """A kill: nothing of the program runs after it."""
+    """Simulates a kill: no handler of the program runs after it."""
 
 
 class Tripwire:
-    """Calls of `os` that end with an error from the one with the number `at` on, `times` of them."""
+    """Makes calls of `os` fail from number `at` on, `times` in a row."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self._monkeypatch = monkeypatch
@@ -64,7 +64,7 @@ def wire(monkeypatch) -> Tripwire:
 
 
 def subjects(log: AuditLog) -> list[str]:
-    """Subjects of the entries that callers have asked for, the oldest first."""
+    """Return the subjects of the entries appended by the test, oldest first."""
     return [
         entry.subject for entry in reversed(search(log.path, Wanted(), 1000).entries) if entry.event == "model.activate"
     ]

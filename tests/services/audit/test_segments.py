@@ -1,4 +1,4 @@
-"""A log in several files: the chain goes on from one to the next, old ones go as the settings say, and nothing else goes unseen."""
+"""A log in several segments: continuous chain, retention by settings, and detection of other removals."""
 
 from __future__ import annotations
 

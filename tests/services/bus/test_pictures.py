@@ -37,7 +37,7 @@ def picture(value: int, height: int = 4, width: int = 6) -> np.ndarray:
 
 
 def received(socket: zmq.Socket):
-    """The next picture, without those of `connected` that came late."""
+    """Return the next picture, skipping late ones of `connected`."""
     while socket.poll(300_000):
         picture = picture_from(socket.recv_multipart(copy=False))
         if picture.header["seq"] != -1:
@@ -46,7 +46,7 @@ def received(socket: zmq.Socket):
 
 
 def connected(publisher: PicturePublisher, *sockets: zmq.Socket) -> None:
-    """Publish until everybody has heard something, then let what is under way come in."""
+    """Publish until every socket has received a picture, then empty the sockets."""
     for socket in sockets:
         while not socket.poll(10):
             publisher.publish({"seq": -1}, picture(0))
@@ -173,7 +173,7 @@ def test_picture_from_raises_for_malformed_message(parts):
 
 @pytest.mark.parametrize(("more", "is_read"), [(0, True), (1, False)])
 def test_messages_and_headers_are_limited_to_most_bytes(more, is_read):
-    """One byte more is refused by the sender and by the reader."""
+    """One byte more is refused by sender and reader."""
     text = {"text": "x" * (MOST_BYTES - len(packed_json({"text": ""})) + more)}
     data = b'{"text":"' + b"x" * (MOST_BYTES - len(b'{"text":""}') + more) + b'"}'
     assert len(data) == MOST_BYTES + more

@@ -1,4 +1,4 @@
-"""A publisher that knows whether anybody reads."""
+"""A publisher that detects whether it has readers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The command line without a run: help, versions, a wrong command line, a quick import."""
+"""The command line without a run: help, version, invalid command lines, fast import."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_commands_refuse_empty_arguments_and_options(words, capsys, monkeypatch,
 
 
 def is_numeric(parameter) -> bool:
-    """Find out by values of which at least one is in the option's range."""
+    """Return true if the parameter accepts a number. One of the tried values is in the range of each option."""
     for text in ("9", "200", "0.5"):
         try:
             found = parameter.process_value(CONTEXT, text)

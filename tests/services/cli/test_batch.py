@@ -27,7 +27,7 @@ def failed(*reasons: str) -> list[Any]:
 
 @pytest.fixture
 def run(monkeypatch, tmp_path):
-    """Run the command with a given summary; its settings are kept in `run.seen`."""
+    """Return a function that runs the command with a given summary and keeps its settings in `run.seen`."""
     seen: dict[str, Any] = {}
 
     def start(

@@ -1,4 +1,4 @@
-"""`intrasplat bench`: frames along a path are rendered, measured and shown; wrong options get one sentence."""
+"""`intrasplat bench`: rendering along a path, measurements, video output, invalid options."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def scene(tmp_path):
 
 
 def path_of(tmp_path, count=5):
-    """Cameras that move along x, one each 10 s: longer than the time window of a scene file."""
+    """Write a path of cameras moving along x, 10 s apart, which exceeds the time window of a scene file."""
     cameras = []
     for k in range(count):
         pose = np.eye(4)

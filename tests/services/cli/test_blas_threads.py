@@ -1,4 +1,4 @@
-"""The command computes with one BLAS thread, whatever the environment and the machine's cores: sums then have one order."""
+"""The command uses one BLAS thread on every machine, so that sums have one order."""
 
 from __future__ import annotations
 

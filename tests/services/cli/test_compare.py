@@ -40,7 +40,7 @@ def surface() -> Mesh:
 
 
 def write(mesh: Mesh, path) -> None:
-    """Write the mesh in the style of another program."""
+    """Write a mesh as other programs do."""
     if path.suffix == ".ply":
         path.write_bytes(b"".join(mesh_ply_pieces(mesh, "millimetre", with_triangles=True)))
     elif path.suffix == ".obj":

@@ -1,4 +1,4 @@
-"""Requests that `intrasplat ctl` sends to a service, and what it prints of the answers."""
+"""Requests that `intrasplat ctl` sends, and its output for the responses."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def entry(seq: int) -> dict[str, Any]:
 
 
 class Service:
-    """Answers of a service, and the requests that it received."""
+    """Prepared responses of a service, and the requests it received."""
 
     def __init__(self) -> None:
         self.answers: dict[tuple[str, str], list[Any]] = {}
@@ -284,7 +284,7 @@ def test_ctl_replays_filters_by_batch_and_prints_json(ctl: Ctl, service: Service
 
 
 def test_ctl_add_recording_uploads_folder_as_uncompressed_zip(ctl: Ctl, service: Service, tmp_path: Path) -> None:
-    """Nothing is compressed, because pictures are already."""
+    """Images are compressed already."""
     folder = tmp_path / "case"
     (folder / "images").mkdir(parents=True)
     contents = {"images/0.png": b"first" * 50, "images/1.png": b"second", "camera.json": b"{}"}

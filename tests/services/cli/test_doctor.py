@@ -13,7 +13,7 @@ NONE = doctor.Graphics(False, "none: this machine has no NVIDIA driver", "not ne
 
 @pytest.fixture
 def said(monkeypatch):
-    """Doctor's lines by name for a machine, what is missing of the kernels, and what the GPU says of them."""
+    """Return a function that gives doctor's checks by name for a machine, a kernel build and an answer of the GPU."""
 
     def look(machine: doctor.Graphics, missing: str | None, refusal: str | None = None) -> dict[str, doctor.Check]:
         monkeypatch.setattr(doctor, "find_graphics", lambda: machine)

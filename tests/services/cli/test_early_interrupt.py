@@ -1,4 +1,4 @@
-"""Ctrl-C while the program starts: no traceback, and the exit code of an interrupt."""
+"""Ctrl-C during start-up: no traceback and exit code 130."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stays at a place as an option, and the table of an evaluation."""
+"""The --place option, and the table of an evaluation."""
 
 from __future__ import annotations
 

@@ -80,7 +80,7 @@ def test_thread_limit_prints_error_with_advice(capsys):
 
 
 def test_user_errors_are_separate_from_programming_errors():
-    """InvalidInput, the graph's errors and their like are a program's mistakes: none of them is a UserError."""
+    """Errors such as InvalidInput and those of the graph are programming errors, not UserErrors."""
 
     def family(kind):
         return {kind}.union(*(family(child) for child in kind.__subclasses__()))

@@ -10,7 +10,7 @@ from services.cli import doctor
 
 @pytest.fixture
 def machine(monkeypatch, tmp_path):
-    """A machine with these files of NVIDIA's driver, on which torch sees these compute capabilities."""
+    """Return a function that simulates files of NVIDIA's driver and the GPUs seen by torch."""
 
     def make(files: str = "", capabilities: tuple[tuple[int, int], ...] = (), cuda: str | None = "13.0") -> None:
         for name in ("DRIVER", "DEVICE", "WSL"):

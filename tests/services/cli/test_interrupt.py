@@ -1,4 +1,4 @@
-"""The first Ctrl-C asks, the second insists, and afterwards the handlers are as they were."""
+"""The first Ctrl-C requests a stop, the second raises, and signal handlers are restored."""
 
 from __future__ import annotations
 

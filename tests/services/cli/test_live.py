@@ -1,4 +1,4 @@
-"""The settings that `intrasplat live` makes of its options."""
+"""Settings of `intrasplat live` from its options."""
 
 from __future__ import annotations
 

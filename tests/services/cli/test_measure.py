@@ -1,4 +1,4 @@
-"""`intrasplat measure`: what is printed, in which unit, and what is refused."""
+"""`intrasplat measure`: output, units and refused points."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every option of every command with values that it cannot have: 2, one sentence, no traceback, and nothing is written."""
+"""Impossible values of command options: exit code 2, one error line, no traceback, no files."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def may_work(option: str, value: str) -> bool:
 
 @pytest.fixture(scope="module")
 def inputs(tmp_path_factory):
-    """A model and a recording, as small as they can be."""
+    """The smallest possible model and recording."""
     import torch
 
     from gsplat_core.io.recordings import synthesize

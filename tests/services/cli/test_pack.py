@@ -1,4 +1,4 @@
-"""`intrasplat pack`: one file of a model, the same bytes every time, and nothing that could not be uploaded."""
+"""`intrasplat pack`: a single uploadable file with reproducible bytes."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_pack_prints_one_error_line_for_invalid_input(tmp_path, capsys, model, f
 
 @pytest.mark.parametrize("first", [True, False])
 def test_pack_refuses_incompletely_saved_model(tmp_path, capsys, first):
-    """Both bundles can be loaded: their tensors belong to the manifest that was not renamed yet."""
+    """Both bundles load: their tensors match the manifest that was not renamed yet."""
     model = save_model(tmp_path / "model")
     save_model(tmp_path / "other", seed=1)
     (model / "manifest.json").rename(model / ("manifest.next.json" if first else "manifest.json"))

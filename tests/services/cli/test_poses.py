@@ -1,4 +1,4 @@
-"""`intrasplat poses`: a file that the recording is read with from then on, what is said about it, and what is refused."""
+"""`intrasplat poses`: the written file, notes, and refused inputs."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ STILL = (0.0, 0.0, 0.0)
 
 @pytest.fixture
 def clip(tmp_path):
-    """Writes the pictures of a scope that moves by `step` from frame to frame, and what its camera is like where that is known."""
+    """Return a function that writes images of a scope moving by `step` per frame, with or without calibration."""
 
     def write(step=SIDEWAYS, calibrated=True, blank=()):
         folder = tmp_path / "clip"

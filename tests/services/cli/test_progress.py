@@ -1,4 +1,4 @@
-"""Progress output: plain lines without a terminal, none with JSON; stdout stays clean."""
+"""Progress output: plain lines without a terminal, none if quiet; standard output stays empty."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`.ply`, `.splat` and `.spz` scenes of other programs in `render`, `export`, `measure` and `view`; hostile ones get a sentence."""
+"""Scenes of other programs (`.ply`, `.splat`, `.spz`) in commands, and malformed ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tables and messages on the terminal, and the end of a run that does not react to the second signal."""
+"""Tables and messages on the terminal, and runs that do not end after the second signal."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ from tests.colmap_writer import write_scene
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    """Nine images of a cloud; its centres are the points."""
+    """Nine images of a point cloud, whose centres are the points."""
     folder = tmp_path_factory.mktemp("scene")
     generator = torch.Generator().manual_seed(0)
     n = 80

@@ -1,4 +1,4 @@
-"""`intrasplat view` and `intrasplat igtl`: what is refused, where a model is read from, and what is served."""
+"""`intrasplat view` and `intrasplat igtl`: refused options, model loading and serving."""
 
 from __future__ import annotations
 
@@ -163,7 +163,7 @@ def test_bundle_in_yields_folder_or_temporarily_unpacked_file(
 
 
 def test_view_help_states_default_samples(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Pictures of `view` have fewer samples than those of other commands, because they add up while the camera stands still."""
+    """`view` has fewer samples by default because they accumulate while the camera is still."""
     made = []
     monkeypatch.setattr(models, "view_command", lambda *arguments, options, **others: made.append(options) or OK)
     run_view(tmp_path, host="127.0.0.1", port=8, renderer="stochastic", device="cpu")

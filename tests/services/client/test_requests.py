@@ -1,4 +1,4 @@
-"""Requests of the client: addresses, keys, waiting, whole files, and answers that no server of ours gives."""
+"""Requests of the client: addresses, keys, polling, complete files, malformed responses."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ URL = "http://room-1.example:8000"
 
 
 class Client(Requests):
-    """A client whose requests are answered by a function; `asked` holds what was sent."""
+    """Client whose requests are answered by a function and kept in `asked`."""
 
     def __init__(self, answer: httpx2.Response | Exception, timeout_s: float = 5.0) -> None:
         super().__init__(URL + "/", " key ", timeout_s, True)

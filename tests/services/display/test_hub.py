@@ -19,7 +19,7 @@ HEADER = {"state": "live", "new": True, "model_version": 3, "run": 1}
 
 @contextlib.asynccontextmanager
 async def published(runtime, every_s: float = 0.01):
-    """A hub, and a process that publishes."""
+    """Run a process stand-in that publishes pictures. Yield the hub and the publishing task."""
     folder = runtime.stream("a")
     publisher = PicturePublisher(folder.pictures("engine"))
     hub = DisplayHub(folder)

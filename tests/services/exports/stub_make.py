@@ -1,4 +1,4 @@
-"""Stands in for the program that makes exports: what it does is the name of the folder that it is given."""
+"""Stand-in for the export program. The name of the given folder selects its behaviour."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Exports are made once, within bounds, in a process of their own."""
+"""Exports are made once, within limits, in a separate process."""
 
 from __future__ import annotations
 

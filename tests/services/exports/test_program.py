@@ -1,4 +1,4 @@
-"""Export program: formats, refusals, and the limits under which it runs."""
+"""Export program: formats, refusals and resource limits."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.services.supervisor.test_model_show import uniform
 
 @pytest.fixture
 def ran(monkeypatch):
-    """Run the program with fakes in place of the writers; `calls` has what it did."""
+    """Replace the writers by fakes and return a dict of their calls."""
     calls: dict[str, tuple] = {}
     monkeypatch.setattr(files, "keep_files_private", lambda: calls.update(private=()))
     monkeypatch.setattr(files.os, "nice", lambda by: calls.update(nice=(by,)))

@@ -1,4 +1,4 @@
-"""Snapshots that are kept: the newest of each stream, whole or not there."""
+"""Stored snapshots: the newest of each stream, complete or absent."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Snapshots that go to the store or to the registry, and exports of what exists."""
+"""Snapshots stored or uploaded to the registry, and exports of versions and snapshots."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from services.registry.records import State
 
 @pytest.fixture
 def taking(tmp_path, monkeypatch):
-    """Snapshots with fakes around them; `calls` has what was done."""
+    """Stream snapshots with fakes that record their calls in `calls`."""
     calls = []
 
     @contextmanager

@@ -1,4 +1,4 @@
-"""Job stores on either database, a small recording, and a runner that the test controls."""
+"""Job stores on either database, a small recording, and a runner controlled by the test."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def new_store(tmp_path: Path, database_url: str | None) -> Iterator[Callable[[],
 
 @pytest.fixture
 def store(tmp_path: Path) -> Iterator[JobStore]:
-    """An empty store where the database does not matter."""
+    """An empty SQLite store, for tests that do not depend on the database."""
     store = JobStore(f"sqlite:///{tmp_path / 'jobs.sqlite'}", lambda _, name: Path("/r") / name)
     yield store
     store.close()

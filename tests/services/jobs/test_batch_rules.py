@@ -1,4 +1,4 @@
-"""`batch`: recordings and results that changed between two calls, folders that are no batch, names and options."""
+"""`batch`: changed recordings and results, folders that are no batch, names and options."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from services.jobs.store import JOBS, JobState, JobStore
 
 @pytest.fixture
 def place(tmp_path):
-    """Two recordings that have their results."""
+    """A batch of two recordings with their results."""
     for name in ("a.mp4", "b.mp4"):
         (tmp_path / "in").mkdir(exist_ok=True)
         (tmp_path / "in" / name).write_bytes(name.encode() * 10_000)
@@ -34,7 +34,7 @@ def place(tmp_path):
 
 
 def begin(place: Path, done: bool = True) -> dict[str, int]:
-    """Begin the batch as the command does, and let every job end well."""
+    """Begin the batch as the command does, and mark every job as done."""
     batch = Batch(place / "in", place / "out", JobOptions())
     counts = batch._store.counts()
     with batch._store.database.writing() as connection:

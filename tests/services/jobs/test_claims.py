@@ -1,4 +1,4 @@
-"""Claims: one owner for each job, for the length of a lease."""
+"""Claims: one owner per job for the duration of a lease."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ NOTHING = JobProgress(0, None, None)
 
 @pytest.fixture
 def clock(monkeypatch):
-    """The wall clock in milliseconds, in a list of one number."""
+    """The wall clock in milliseconds, as a list of one number."""
     at = [1_000_000]
     monkeypatch.setattr(module, "_now_ms", lambda: at[0])
     return at

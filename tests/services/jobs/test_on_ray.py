@@ -19,7 +19,7 @@ WITHIN_S = 300.0
 
 @pytest.fixture
 def on_ray():
-    """A local Ray. It gives itself 30 s to start, and a very busy machine takes longer: then it is started again."""
+    """A local Ray. Its 30 s start limit is too short on a busy machine, so the start is retried."""
     ray = pytest.importorskip("ray", reason="Ray is not installed (extra `ray`)")  # takes seconds
 
     from services.jobs.runners import OnRay

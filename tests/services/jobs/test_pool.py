@@ -1,4 +1,4 @@
-"""The pool: what it publishes, and what it makes of attempts that fail, die, are cancelled, or are not its own any more."""
+"""The pool: published results, and attempts that fail, die, are cancelled or lose their claim."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Supervision of the pool process: start on demand, restart with a delay, orderly end, log."""
+"""Supervision of the pool process: start on demand, delayed restart, stop, log."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from services.jobs.pool import PoolKeeper, relayed
 
 @pytest.fixture
 def kept(monkeypatch):
-    """Run `_keep` with a clock of its own, until its events are used up."""
+    """Return a function that runs `_keep` with simulated job counts, exit codes and sleeps."""
 
     def run(jobs, codes):
         sleeps, runs = [], []
@@ -66,7 +66,7 @@ def test_keeper_retries_unavailable_store(kept):
 
 @pytest.fixture
 def program(monkeypatch):
-    """Start a small program in place of the pool."""
+    """Replace the pool by a small program."""
 
     start = asyncio.create_subprocess_exec
 

@@ -1,4 +1,4 @@
-"""The pool as a program, dead pools, and attempts on Ray, with stand-ins for the store and for Ray."""
+"""The pool program, dead pools, and attempts on Ray, with stand-ins for the store and Ray."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def test_idle_s_counts_from_end_of_last_job(tmp_path: Path, monkeypatch: pytest.
 
 
 class Ray(ModuleType):
-    """Stand-in for Ray, whose attempts end when they are told to."""
+    """Stand-in for Ray, whose attempts end when the test sets `ready`."""
 
     class exceptions:  # as in Ray
         class RayError(Exception):

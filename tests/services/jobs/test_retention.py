@@ -1,4 +1,4 @@
-"""Recordings that go by themselves are in the audit log."""
+"""Expired recordings and replays are removed and written to the audit log."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from services.retention import DAY_S, RecordingRetention, ReplayRetention
 
 
 class FakeStore:
-    """Notes what it is asked for."""
+    """Recording store that records its calls."""
 
     def __init__(self, expired):
         self.expired, self.asked, self.checked, self.closed = expired, [], [], False

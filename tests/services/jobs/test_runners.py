@@ -1,4 +1,4 @@
-"""Attempts as forked processes: their surroundings, their ends, and what the body of a job reports."""
+"""Attempts as forked processes: environment, end, and reports of the job body."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def is_running(pid: int) -> bool:
 
 
 def noted(path: Path) -> int:
-    """Wait for the process id that an attempt writes."""
+    """Wait for the process id that an attempt writes, and return it."""
     deadline = time.monotonic() + 60
     while not path.exists() and time.monotonic() < deadline:
         time.sleep(0.01)
@@ -184,7 +184,7 @@ def test_fork_computes_after_parent_used_openmp_threads(tmp_path):
 
 @pytest.fixture
 def replayed(monkeypatch):
-    """Replace the replay and its reports in this process. Returns the settings of each replay."""
+    """Replace the replay and its reports in this process. Return the settings of each replay."""
     seen = []
 
     def become(run: Callable[[Callable[[Progress], None]], None]) -> list:

@@ -1,4 +1,4 @@
-"""The store of jobs: submitting, once for each idempotency key, listing, cancelling, forgetting."""
+"""The job store: submission, idempotency keys, listing, cancellation, removal."""
 
 from __future__ import annotations
 

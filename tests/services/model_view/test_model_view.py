@@ -1,4 +1,4 @@
-"""The viewer of a model with a stand-in for viser's server: its time slider, playback, axes and camera."""
+"""The model viewer with a stand-in for viser's server: time slider, playback, axes and camera."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from tests.gsplat_core.io.exports.test_exports import random_model
 
 
 class Control(SimpleNamespace):
-    """Slider or checkbox with the options that it was made with."""
+    """Slider or checkbox with its options."""
 
 
 class Server:
-    """Records what the viewer sets up and shows."""
+    """Records the controls and splats of the viewer."""
 
     def __init__(self, **options: Any) -> None:
         self.options, self.stopped, self.shown, self.texts = options, False, [], []

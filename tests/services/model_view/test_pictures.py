@@ -1,4 +1,4 @@
-"""Viewer by pictures: what the browser gets, accumulation while the camera stands still, and refused requests."""
+"""Viewer by pictures: page, rendered pictures, accumulation of samples, refused requests."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ STILL = {"azimuth": 0, "elevation": 0, "distance": 1, "right": 0, "down": 0, "ti
 
 
 class Counter:
-    """Renderer with samples that keeps the cameras of its frames."""
+    """Renderer of grey pictures with samples, for counting accumulated samples."""
 
     capabilities = Capabilities(
         outputs=("image", "alpha", "depth"),

@@ -1,4 +1,4 @@
-"""A model in a browser: what is served, where the browser begins, and its sizes."""
+"""The model viewer with viser: served page and splats, sharing, slider, and view transforms."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ POSE = np.array([[0.0, -1, 0, 5], [1, 0, 0, -6], [0, 0, 1, 7], [0, 0, 0, 1]])
 
 
 def asymmetric() -> np.ndarray:
-    """Red in the upper left corner, green in the upper right one, blue in the lower left one, white in the lower right one; wider than high."""
+    """Return an image with corners red, green (upper) and blue, white (lower), wider than high."""
     image = np.zeros((4, 7, 3), np.uint8)
     image[0, 0], image[0, -1], image[-1, 0], image[-1, -1] = (255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 255, 255)
     return image
@@ -32,7 +32,7 @@ def asymmetric() -> np.ndarray:
 
 @contextlib.contextmanager
 def sending(runtime, header, image, **options):
-    """A stream that publishes, a server, and its port."""
+    """Run a publishing stream and a message server, and yield the server."""
     folder = runtime.stream("theatre")
     publisher, server, stop = (
         PicturePublisher(folder.pictures("engine")),
@@ -125,7 +125,7 @@ def test_client_receives_no_picture_state_of_silent_stream(runtime):
 
 
 def test_no_picture_state_is_sent_once_per_second(runtime, monkeypatch):
-    """Each look at the stream takes a tenth of a second of the test's clock."""
+    """Each poll of the stream advances the simulated clock by 0.1 s."""
     looks = itertools.count()
     monkeypatch.setattr("services.openigtlink.POLL_MS", 1)
     monkeypatch.setattr(
@@ -173,7 +173,7 @@ def test_message_server_close_waits_for_accept_thread(monkeypatch):
 
 
 def test_client_socket_has_stall_timeout_and_is_closed(monkeypatch):
-    """Sending to it must not block a thread without end."""
+    """Sending to a stalled client must not block a thread forever."""
     calls = []
 
     class Client:

@@ -23,7 +23,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def packed(recording: Path, tmp_path: Path) -> Callable[..., Path]:
-    """The recording as a new zip archive, its files below `top`."""
+    """Return a function that packs the recording as a new zip archive, with its files below `top`."""
 
     def pack(top: str = "", name: str = "upload.zip") -> Path:
         with zipfile.ZipFile(tmp_path / name, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -51,7 +51,7 @@ def new_store(tmp_path: Path) -> Iterator[Callable[..., RecordingStore]]:
 
 @pytest.fixture
 def add(new_store) -> Callable[..., Any]:
-    """Put a file into a store."""
+    """Return a function that adds a file to a store."""
 
     def put(store: RecordingStore, name: str, file: Path):
         return store.add(name, file, hashlib.sha256(file.read_bytes()).hexdigest(), "operator (1)")

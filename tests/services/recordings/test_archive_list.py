@@ -1,4 +1,4 @@
-"""Rules for the list of files of a zip archive, in this process: each limit on both of its sides."""
+"""Rules for the directory of a zip archive, with each limit tested on both sides."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def listed(file: io.BytesIO, most_bytes: int = MOST_BYTES, stated: int | None = 
 
 
 def with_end(**changed: int) -> io.BytesIO:
-    """An archive of one file whose end record has other figures."""
+    """Return an archive of one file with changed values in its end record."""
     content = bytearray(packed(("a.png", b"x")).getvalue())
     names = ("disk", "list_disk", "entries", "every", "list_bytes", "list_at", "comment_bytes")
     values = dict(zip(names, struct.unpack_from("<4H2LH", content, len(content) - 18), strict=True)) | changed

@@ -1,4 +1,4 @@
-"""Check of an upload: place, limits and verdict."""
+"""Check of an uploaded recording: location, resource limits and verdict."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Recordings: kept, checked, deleted, removed by age and size, and what a process that dies leaves behind."""
+"""Recording store: upload, check, deletion, expiry by age and size, recovery after a crash."""
 
 from __future__ import annotations
 

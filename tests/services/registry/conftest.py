@@ -1,4 +1,4 @@
-"""Registries on either database, and the servers that some tests need: PostgreSQL from Debian's package, S3 from PyPI's moto."""
+"""Registries on either database, and the servers of some tests: PostgreSQL from Debian, S3 from moto."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Packed models to upload, and registries that do not wait for a real check."""
+"""Packed models to upload, and registries with a stub check."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from services.registry.records import Recovery
 
 
 def save_model(folder: Path, seed: int = 0, count: int = 5) -> Path:
-    """A bundle of a few Gaussians in front of a small camera; another seed is another model."""
+    """Save a bundle of a few Gaussians in front of a small camera, different for each seed."""
     random = torch.Generator().manual_seed(seed)
     draw = lambda *shape: torch.randn(*shape, generator=random)
     means = draw(count, 3)
@@ -30,7 +30,7 @@ def save_model(folder: Path, seed: int = 0, count: int = 5) -> Path:
 
 
 def packed_model(folder: Path, seed: int = 0) -> Path:
-    """An upload."""
+    """Return the path of a packed model, made on first use."""
     file = folder / f"model-{seed}.isplat"
     if not file.exists():
         pack(save_model(folder / f"model-{seed}", seed), file)
@@ -43,7 +43,7 @@ def sha256(path: Path) -> str:
 
 
 def add_ready(registry: ModelRegistry, files: Path, seed: int = 0, name: str = "liver") -> int:
-    """Upload a model and check it; returns the version's number."""
+    """Upload a model and check it. Return the number of the version."""
     record = registry.upload(name, packed_model(files, seed), None, "surgeon")
     assert registry.check(name, record.version).state == "ready"
     return record.version

@@ -1,4 +1,4 @@
-"""A check that takes no time; it loads nothing."""
+"""Stub of the check program that takes no time and imports nothing."""
 
 from __future__ import annotations
 
@@ -10,5 +10,5 @@ ALWAYS_READY = (sys.executable, "-S", "-c", f"import sys; sys.stdout.write({_STE
 
 
 def says(text: str) -> tuple[str, ...]:
-    """A check that runs this Python."""
+    """Return a check program that runs the given Python code."""
     return (sys.executable, "-S", "-c", text)

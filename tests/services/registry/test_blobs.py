@@ -1,4 +1,4 @@
-"""Stores of uploaded files: a folder, and an object store in memory."""
+"""Blob stores: a folder, and an in-memory object store."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def test_store_errors_passes_other_exceptions_and_bad_url_is_refused() -> None:
     ],
 )  # fmt: skip
 def test_is_intact_only_for_regular_files_with_uploaded_digests(tmp_path, change, is_intact):
-    """Links lead to files that may change."""
+    """Links are refused because their targets may change."""
     model = tmp_path / "model"
     model.mkdir()
     row = {}

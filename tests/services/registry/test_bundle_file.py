@@ -1,4 +1,4 @@
-"""The upload format: what is packed comes out again, other programs read and write it too, and the bytes are always the same."""
+"""The upload format: lossless round trip, compatibility with tar, reproducible bytes."""
 
 import io
 import shutil

@@ -1,4 +1,4 @@
-"""The check of a model in its own process: its verdicts, its bounds, and what it is kept away from."""
+"""The check of a model in its own process: verdicts, resource limits, isolation."""
 
 import json
 import os
@@ -77,7 +77,7 @@ def test_check_describes_and_renders_valid_model(tmp_path):
 
 
 def test_check_renders_model_with_its_own_renderer(checked, tmp_path):
-    """A model of weighted sums has no picture by alpha blending."""
+    """A weighted-sum model cannot be rendered by alpha blending."""
     model = load_bundle(save_model(tmp_path / "alpha"))
     gaussians = WeightedSumRenderer.extended(model.gaussians)
     trained_by = TrainedBy("weighted_sum", WeightedSumRenderer.first_values(20.0))
@@ -120,7 +120,7 @@ def test_check_rejects_model_over_memory_limit(tmp_path):
 
 
 def test_check_gives_no_verdict_if_machine_lacks_memory(tmp_path, monkeypatch, capsys):
-    """Through the same program in this process: the reader finds too little memory left."""
+    """The check program runs in this process, and the reader finds too little free memory."""
     folder = save_model(tmp_path / "model")
     monkeypatch.setattr(check, "limit_resources", lambda device: None)
     monkeypatch.setattr(model_files, "available_bytes", lambda: 100)
@@ -196,7 +196,7 @@ def test_version_can_be_checked_again_after_check_failed(tmp_path, files):
 
 
 def test_closing_registry_ends_running_and_waiting_checks(tmp_path, files):
-    """Two are under way: one runs, the other waits for it. Neither version is rejected for that."""
+    """One check runs and another waits for it. Neither version is rejected."""
     begun = tmp_path / "begun"
     program = says(f"import time; open({str(begun)!r}, 'w').close(); time.sleep(60)")
     registry = ModelRegistry(tmp_path / "registry", check_program=program)
@@ -233,7 +233,7 @@ def test_run_check_survives_output_flood(tmp_path):
 
 
 def test_check_rejects_model_with_non_finite_render(tmp_path, monkeypatch, capsys):
-    """Through the same program in this process, with a renderer that is broken."""
+    """The check program runs in this process with a broken renderer."""
     folder = save_model(tmp_path / "model")
     monkeypatch.setattr(check, "limit_resources", lambda device: None)
     render = AlphaRenderer.render

@@ -1,4 +1,4 @@
-"""Limits of the programs that check and convert uploads, and their exit codes and verdicts."""
+"""Resource limits, exit codes and verdicts of the programs that check and convert uploads."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ FREE = resource.RLIM_INFINITY
 
 
 class Limits:
-    """Resource limits of a process, without setting them."""
+    """Records resource limits instead of setting them."""
 
     def __init__(self, patch: pytest.MonkeyPatch, hard: dict[int, int]) -> None:
         self.set: dict[int, tuple[int, int]] = {}

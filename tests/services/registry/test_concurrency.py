@@ -1,4 +1,4 @@
-"""Concurrent threads and processes at one registry: one wins, the others get a conflict, and numbers are unique."""
+"""Concurrent threads and processes on one registry: one change succeeds, others conflict, numbers are unique."""
 
 import multiprocessing
 import threading
@@ -65,7 +65,7 @@ def test_concurrent_checks_of_same_version_agree(registry, files):
 
 @pytest.mark.slow
 def test_checks_run_one_at_a_time(tmp_path, files):
-    """Each check takes a file for itself, and fails where it is taken."""
+    """Each check creates a folder exclusively and fails if another check holds it."""
     taken = str(tmp_path / "taken")
     program = says(
         f'import os, time; os.mkdir({taken!r}); time.sleep(0.2); os.rmdir({taken!r}); print(\'{{"stage": "ready"}}\')'

@@ -1,4 +1,4 @@
-"""Splat files of other programs that become models of the registry."""
+"""Splat files of other programs are converted to models of the registry."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A process that changes the registry is killed at every step: afterwards the old version is served or the new one, whole, and nothing lies about."""
+"""A process that changes the registry is killed at every step; the old or new state remains, without leftovers."""
 
 import multiprocessing
 import os
@@ -40,7 +40,7 @@ STEPS = {
 
 
 def prepare(folder, files, action, database_url=None):
-    """Versions 1 and 2 are ready, and one is active (2 after 1 where it is rolled back); 3 waits for its check, or for being deleted."""
+    """Make versions 1 and 2 ready and activate 1, or 1 then 2 for a rollback. Version 3 awaits check or deletion."""
     with ModelRegistry(folder, database_url=database_url, check_program=ALWAYS_READY) as registry:
         for seed in (0, 1):
             add_ready(registry, files, seed)

@@ -1,4 +1,4 @@
-"""The database: migrated at start, one writer at a time, refused when a later version wrote it, and errors with a sentence."""
+"""The database: migration at start, exclusive writers, newer schemas, error messages."""
 
 import shutil
 import sqlite3

@@ -1,4 +1,4 @@
-"""The life of versions: uploaded, checked, activated, rolled back, deleted; on SQLite and on PostgreSQL."""
+"""Model versions on SQLite and PostgreSQL: upload, check, activation, rollback, deletion."""
 
 import errno
 import os

@@ -1,4 +1,4 @@
-"""The blob store on a server that speaks S3."""
+"""The blob store on an S3 server."""
 
 import secrets
 
@@ -23,7 +23,7 @@ def credentials(monkeypatch):
 
 @pytest.fixture
 def bucket(s3, credentials):
-    """A new bucket: its file system and its name."""
+    """File system and name of a new bucket."""
     import s3fs
 
     files = s3fs.S3FileSystem(**s3, skip_instance_cache=True)

@@ -1,4 +1,4 @@
-"""Charts: valid SVG, ticks at round numbers, gaps where there is nothing."""
+"""Charts: valid SVG, round ticks, gaps at missing values."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_number_has_at_most_four_significant_digits(value, text):
 @pytest.mark.parametrize("x_log", [False, True])
 @pytest.mark.parametrize("width", [WIDE, NARROW])
 def test_chart_points_match_axis_ticks(x_log, width):
-    """Pixel positions of the curve against those of the labelled ticks, as a reader sees them."""
+    """Compares pixel positions of the curve with those of the labelled ticks."""
     x, y = [0.5, 2.0, 7.0, 30.0, 80.0], [31.0, 34.5, None, 36.25, 33.0]
     chart = Chart(
         "T", "D", "time", "PSNR", (Line("a", x, y, "main"),), x_unit=" s", y_unit=" dB", x_log=x_log, width=width

@@ -1,4 +1,4 @@
-"""Rows about three dimensions: values, units and baselines, written out by hand."""
+"""Rows of geometry scores: expected values, units and baselines."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`evaluation.html` needs nothing but itself, says what it must, and cannot be injected into; `evaluation.json` is read back as it was."""
+"""`evaluation.html` is self-contained, complete and escaped; `evaluation.json` round-trips."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The report shows tissue behind tools, depth and the scene from the side, and scores them where the truth is known."""
+"""The report shows and scores tissue behind tools, depth and a side view of the scene."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`report.html` needs nothing but itself, says what it must, and cannot be injected into."""
+"""`report.html` is self-contained, complete and escaped."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from services.reports.html import _quality_over_age, render_html, write_html
 
 
 class Page(HTMLParser):
-    """Collects elements and checks that they nest."""
+    """HTML parser that collects elements and checks that they nest."""
 
     VOID = frozenset({"meta", "img", "br", "line", "circle", "polyline"})
 
@@ -135,7 +135,7 @@ def test_write_html_leaves_only_complete_file(tmp_path, report, scored):
 
 
 def test_report_html_places_dots_proportionally_to_scores(text):
-    """The lowest score is one decibel from the left end, the highest one from the right end."""
+    """The scale extends one decibel below the lowest and above the highest score."""
     rows = re.findall(r'<td class="n">([0-9.]+)</td><td class="track">.*?left:([0-9.-]+)%', text)
     values, places = ([float(row[part]) for row in rows] for part in (0, 1))
     low, high = min(values) - 1, max(values) + 1

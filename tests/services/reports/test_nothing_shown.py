@@ -1,4 +1,4 @@
-"""A run that showed nothing says how many frames came, why they were withheld, and what changes that."""
+"""Error of a run that showed nothing: number of frames, reasons for withholding, and remedies."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ CAMERA = Camera.from_focal(60.0, 64, 48)
 
 
 def ended(command, *parts, interrupted=False, wall_s=3.0, stop_reason="end of stream"):
-    """The outcome of a run with these parts."""
+    """Return the outcome of a run with the given parts."""
     return RunOutcome(
         command=command,
         settings=RunSettings("cpu", "embedded", "basis", "alpha", 0, 1.0, None, False),

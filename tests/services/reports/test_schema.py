@@ -1,4 +1,4 @@
-"""`report.json`: whole, readable back, without NaN, with the fields that were promised."""
+"""`report.json`: complete, readable, without NaN, with the promised fields."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A PSNR of a frame that was trained on is called a training error wherever it is shown, and never stands without a baseline."""
+"""The PSNR of a trained frame is labelled as training error everywhere and has a baseline."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def predicted(report) -> RunReport:
 
 
 def text_of(page: str) -> str:
-    """The page's words, one line for each element that ends a line."""
+    """Return the text of a page, one line per block element."""
     page = re.sub(r"<style>.*?</style>", "", page, flags=re.DOTALL)
     return re.sub(r"<[^>]+>", " ", re.sub(r"</(?:li|tr|p|h2|figcaption|div)>", "\n", page))
 

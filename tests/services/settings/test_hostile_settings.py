@@ -63,7 +63,7 @@ def test_load_settings_rejects_deeply_nested_environment_variable(monkeypatch):
 
 
 def _numbers(kind: str) -> list[str]:
-    """Every setting of a kind, by its place."""
+    """Return the names of all settings of a kind."""
     wanted = {"number": (int, float), "flag": (bool,)}[kind]
     found = []
     for section, field in ServiceSettings.model_fields.items():

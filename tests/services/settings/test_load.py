@@ -1,4 +1,4 @@
-"""Settings from a file, the environment and flags, and what is said of wrong ones."""
+"""Settings from file, environment and flags, and their error messages."""
 
 from __future__ import annotations
 

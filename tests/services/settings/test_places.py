@@ -1,4 +1,4 @@
-"""Each refused setting is named with the place that it came from."""
+"""Errors name the source of the refused setting."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Accepted ranges and defaults of numbers in the service's settings, which installations rely on."""
+"""Accepted ranges and defaults of numeric service settings, which installations rely on."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The capture process reads its source itself: it starts no further process."""
+"""The capture process reads its source without starting further processes."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def test_capture_starts_no_child_process(kind, video_url, tmp_path):
 
 
 def test_capture_opens_every_scheme_with_process_option_false(monkeypatch):
-    """Blocking sources such as cameras run in a child process unless configured otherwise."""
+    """By default, blocking sources such as cameras run in a child process."""
     opened = []
 
     def opens(rest, options):
@@ -130,7 +130,7 @@ def test_capture_opens_every_scheme_with_process_option_false(monkeypatch):
 
 
 class StuckCamera:
-    """Gives one frame's worth of nothing for ever."""
+    """Camera that never delivers a frame."""
 
     state = SourceState.STALLED
 
@@ -159,7 +159,7 @@ def test_capture_exits_if_camera_driver_is_stuck(monkeypatch):
 
 
 class Scripted:
-    """Source that gives frames, states and errors in turn."""
+    """Source that returns given frames, states and errors in turn."""
 
     description = SourceDescription("a camera", 8, 6, 30.0, Camera.from_focal(50.0, 8, 6))
 
@@ -183,7 +183,7 @@ class Scripted:
 
 
 class Counting(FakePublisher):
-    """Stops the worker after some frames."""
+    """Publisher that stops the worker after a number of frames."""
 
     def __init__(self, worker, most):
         super().__init__(worker)
@@ -206,7 +206,7 @@ class Waiting(FakeWorker):
 
 
 def published(monkeypatch, *sources, most):
-    """Publish the frames of sources that are opened in turn; an error stands for a source that cannot be opened."""
+    """Publish the frames of sources opened in turn. An exception stands for a source that cannot be opened."""
     left, worker, capture = list(sources), Waiting(), Capture(SourceSpec(address="synthetic:"))
 
     def open_source(address, options):

@@ -18,7 +18,7 @@ ABOUT = SourceDescription("made up", 6, 4, 25.0, Camera.from_focal(5.0, 6, 4), f
 
 
 class StandIn:
-    """Speaks as a capture process does."""
+    """Stand-in for a capture process."""
 
     def __init__(self, folder, run: int) -> None:
         self.run, self.said = run, {"state": "live", "reason": "well"}
@@ -46,7 +46,7 @@ def folder(runtime):
 
 
 def first(source: CapturedSource, capture: StandIn, seq: int = 0, **changes) -> Frame:
-    """Send frames until one is read."""
+    """Send frames until the source returns one."""
     until_s = time.monotonic() + SOON_S
     while time.monotonic() < until_s:
         capture.send(seq, **changes)
@@ -60,7 +60,7 @@ def first(source: CapturedSource, capture: StandIn, seq: int = 0, **changes) -> 
 def until(what) -> None:
     until_s = time.monotonic() + SOON_S
     while not what():
-        assert time.monotonic() < until_s, "it did not come about"
+        assert time.monotonic() < until_s, "condition not met in time"
         time.sleep(0.01)
 
 

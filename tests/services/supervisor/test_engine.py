@@ -43,7 +43,7 @@ def test_started_runs_trial_and_warm_up_on_first_start_only(monkeypatch, again):
 
 
 class Recorder:
-    """Remembers method calls by name."""
+    """Records method calls by name."""
 
     def __init__(self, **values):
         self.calls = []

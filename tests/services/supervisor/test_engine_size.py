@@ -1,4 +1,4 @@
-"""An engine on a CPU measures once, and then keeps, the size that the machine sustains while serving viewers."""
+"""An engine on a CPU measures once and caches the size that the machine sustains while serving viewers."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def stream(width_px=640, height_px=512, fps=30.0):
 
 
 class Machine:
-    """Takes 2 ms for a frame and 180 ms for each million of its pixels."""
+    """Simulated machine that takes 2 ms per frame and 180 ms per million pixels."""
 
     def __init__(self):
         self.measured = 0

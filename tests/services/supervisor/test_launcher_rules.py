@@ -1,4 +1,4 @@
-"""Requests to the launcher and the ends that it remembers, without forking anything."""
+"""Requests to the launcher and remembered exit statuses, without forking."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def test_launcher_replaces_old_socket_file(tmp_path: Path) -> None:
 
 
 class Started:
-    """Start of processes that records modules and times, and answers with numbers from 100."""
+    """Process starter that records modules and times and returns process ids from 100."""
 
     def __init__(self) -> None:
         self.modules: list[tuple[str, float]] = []

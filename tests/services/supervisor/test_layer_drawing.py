@@ -21,7 +21,7 @@ RED, GREEN = (0.9, 0.1, 0.1), (0.1, 0.9, 0.1)
 
 
 def wall_and_post(unseen: bool = False) -> Model:
-    """The post covers the left half of the wall, at half its distance."""
+    """Return a model of a wall, whose left half is covered by a post at half the distance."""
     wall, post = uniform(RED), uniform(GREEN).gaussians
     left = post.select(post.means[:, 0] < -0.3)
     near = replace(left, means=left.means * 0.5, log_scales=left.log_scales - 0.7)

@@ -1,4 +1,4 @@
-"""Further pictures of an engine: drawn while somebody watches, and not otherwise."""
+"""Layers of an engine are drawn only while they are watched."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ NOW = {"seq": 5, "state": "live", "show": "live", "new": True}
 
 
 class Drawing:
-    """Says what it was asked for."""
+    """Layer drawing that records the requested layers."""
 
     def __init__(self, device: str) -> None:
         self.drawn: list[str] = []

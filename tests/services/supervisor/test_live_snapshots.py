@@ -1,4 +1,4 @@
-"""The command that writes the live model as it stands."""
+"""The command that writes the current live model."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.services.supervisor.test_model_show import uniform
 
 
 class Reconstruct:
-    """Answers in another thread, as the operator does."""
+    """Answers model requests in another thread, as the operator does."""
 
     def __init__(self, answer) -> None:
         self.answer = answer

@@ -1,4 +1,4 @@
-"""Finished models on an engine's screen: taken up between pictures, taken back when they fail."""
+"""Finished models on an engine's screen: switching between pictures, fallback on failure."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Published:
 
 
 class Frames:
-    """A source that gives a frame every 10 ms."""
+    """Source with a frame every 10 ms."""
 
     def __init__(self, folder, stop) -> None:
         self.state, self.seq = SourceState.LIVE, 0
@@ -54,7 +54,7 @@ class Frames:
 
 
 def uniform(colour, version: int = 1) -> Model:
-    """A wall of one colour in front of the camera."""
+    """Return a model of a wall of one colour in front of the camera."""
     x, y = torch.meshgrid(torch.linspace(-2, 2, 12), torch.linspace(-2, 2, 12), indexing="xy")
     count = x.numel()
     means = torch.stack([x.reshape(-1), y.reshape(-1), torch.full((count,), 4.0)], 1)
@@ -87,7 +87,7 @@ def show(runtime, monkeypatch):
 def until(what) -> None:
     until_s = time.monotonic() + SOON_S
     while not what():
-        assert time.monotonic() < until_s, "it did not come about"
+        assert time.monotonic() < until_s, "condition not met in time"
         time.sleep(0.005)
 
 

@@ -1,4 +1,4 @@
-"""Finished models that take turns in a running engine: each picture is of one of them as a whole, and says of which."""
+"""Finished models swapped in a running engine: each picture shows exactly the model of its header."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SWAPS = 12
 
 @pytest.fixture
 def bundles(tmp_path):
-    """Two models that differ in every pixel: one is red, one is blue."""
+    """Two models that differ in every pixel: a red one and a blue one."""
     for version, colour in ((1, [[[2.0, -2, -2]]]), (2, [[[-2.0, -2, 2]]])):
         wall = Gaussians(
             *(torch.tensor(values) for values in ([[0.0, 0, 4]], [[1.0, 0, 0, 0]], [[3.0, 3, 0]], [6.0], colour))

@@ -1,4 +1,4 @@
-"""State of a stream from the states of its two processes."""
+"""Overall state of a stream from the states of its two processes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Processes that let others go first."""
+"""Niceness of processes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rules by which a process is taken to be well, hung or ended, with a clock that is set by hand."""
+"""Rules by which a process counts as well, hung or ended, with a simulated clock."""
 
 from __future__ import annotations
 
@@ -173,7 +173,7 @@ class Identity:
 
 
 class Starter:
-    """Starts nothing; notes what it was asked for."""
+    """Process starter that records requests and starts nothing."""
 
     def __init__(self, how: str | None = None) -> None:
         self.how, self.asked, self.started = how, [], []
@@ -319,7 +319,7 @@ def test_running_process_with_other_spec_is_replaced(runtime, monkeypatch):
 def kept(
     process: ManagedProcess, monkeypatch: pytest.MonkeyPatch, how: list[str | None], *, other: bool = False
 ) -> Any:
-    """Supervise a process through some ends; None is a start that failed. Return the waits between them in seconds."""
+    """Supervise a process through given ends (None: failed start). Return the waits between them in seconds."""
     waits: list[float] = []
     ends, cleaned = iter(how), []
 
@@ -419,7 +419,7 @@ def test_ping_is_sent_only_after_first_heartbeat(runtime, monkeypatch):
 
 
 def test_listen_ignores_malformed_and_foreign_heartbeats(runtime, monkeypatch):
-    """Those of an earlier process and texts that are no heartbeats are passed over."""
+    """Foreign heartbeats come from an earlier process."""
     heard = [b'{"pid": 6, "state": "ended"}', b"nonsense", b'{"pid": 7, "state": "live"}']
     closed = []
 

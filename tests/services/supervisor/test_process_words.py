@@ -1,4 +1,4 @@
-"""Descriptions of process events: one sentence for an exit reason, and a source that is lost or recovered."""
+"""Reasons of process ends, and events of a lost or recovered source."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_last_words_return_last_error_of_log(tmp_path, printed, reason):
 
 @pytest.fixture
 def capture(runtime, monkeypatch):
-    """A capture process of which only heartbeats are heard, its events, and a clock."""
+    """Return a function that feeds a heartbeat to a capture process and returns the kinds of its events."""
     events, now_s = [], [100.0]
     monkeypatch.setattr(processes.time, "monotonic", lambda: now_s[0])
     spec = ProcessSpec(stream="theatre", capture=SourceSpec(address="synthetic:"))

@@ -1,4 +1,4 @@
-"""Temporary folders of engines that were killed go, and those of engines that run stay."""
+"""Temporary folders of killed engines are removed; those of running engines are kept."""
 
 from __future__ import annotations
 

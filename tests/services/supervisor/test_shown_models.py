@@ -1,4 +1,4 @@
-"""Streams that show a model follow the registry, and the registry follows an engine that cannot show one."""
+"""Streams that show a model follow the registry; the registry rolls back versions that an engine gives up."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Registry:
 
 
 class Engine:
-    """An engine that shows what it is asked for."""
+    """Engine that shows every requested model."""
 
     def __init__(self) -> None:
         self.figures: dict = {"model": None, "gave_way": []}

@@ -1,4 +1,4 @@
-"""Options of a source's address are refused when the stream is made, as the source itself would refuse them."""
+"""Invalid options in a source address are refused when the stream is created."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Conversion of an API stream to the specification of its processes, and of its processes to its state."""
+"""Conversion of an API stream to process specifications, and of process states to the stream state."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def test_specs_of_accepts_existing_onnx_file(tmp_path):
 
 
 def test_overall_reports_source_lost_if_source_never_opened():
-    """A camera that is not there stays in the state `opening`: after a while that is a lost source, as the audit log says."""
+    """A missing camera stays in state `opening`, which counts as lost after a while, as in the audit log."""
     absent = ProcessState("opening", "there is no camera", 1, 0, {}, 0.1, lost=True)
     assert overall(absent, process("running")) == ("source lost", "there is no camera")
 

@@ -1,4 +1,4 @@
-"""Whole streams on a small synthetic endoscope: processes are killed, stopped, orphaned and adopted."""
+"""Complete streams on a small synthetic endoscope: processes are killed, stopped, orphaned and adopted."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def of_one_process(headers: list[dict]) -> bool:
 
 @contextlib.asynccontextmanager
 async def capturing(runtime: RuntimeFolder, events: list[StreamEvent] | None = None, **limits):
-    """A capture process that is kept running."""
+    """Run a supervised capture process."""
     folder = runtime.stream("a")
     process = ManagedProcess(spec(**limits), folder, Direct(), [].append if events is None else events.append)
     process.open()
@@ -199,7 +199,7 @@ asyncio.run(run())
 
 
 def test_processes_survive_kills_of_control_plane_and_each_other(runtime, bundle):
-    """A single long scenario, because an engine takes seconds to start."""
+    """One long scenario, because an engine takes seconds to start."""
 
     async def scenario() -> None:
         command = [sys.executable, "-c", CONTROL_PLANE, str(runtime.path), SMALL]

@@ -1,4 +1,4 @@
-"""The streams of a server, without their processes: what is refused, what is kept."""
+"""Streams of a server with stand-ins for their processes."""
 
 from __future__ import annotations
 
@@ -142,7 +142,7 @@ def test_launcher_opens_before_first_stream_starts(streams, processes, monkeypat
 
 
 class SlowProcess(Process):
-    """A process whose end lets other tasks run."""
+    """Process whose close yields to other tasks."""
 
     async def close(self, reason):
         for _ in range(5):
@@ -159,7 +159,7 @@ def slow(processes, monkeypatch):
 
 @pytest.mark.parametrize("late", ["start", "set_options", "stop", "delete"])
 def test_concurrent_calls_do_not_restart_deleted_stream(streams, slow, late):
-    """Nothing would stop its processes: the API has forgotten it."""
+    """Processes of a deleted stream would never be stopped."""
 
     async def run():
         streams.create("theatre-1", stream())

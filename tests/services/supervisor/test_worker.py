@@ -126,7 +126,7 @@ def watch(monkeypatch):
     """Run the watch thread's loop in this thread at given times."""
 
     def run(worker: Worker, *times: float, then=lambda now_s: None) -> float | None:
-        """Return the time at which the process ended itself, or None."""
+        """Return the time at which the process exited, or None."""
         looks = iter(times)
         now = SimpleNamespace(s=0.0)
 
