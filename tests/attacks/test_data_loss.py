@@ -17,7 +17,7 @@ from services.cli.terminal import BAD_INPUT, OK
 from tests.services.registry.made import save_model
 
 
-def held(folder: Path) -> dict[str, str]:
+def digests_of_files(folder: Path) -> dict[str, str]:
     return {
         path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
         for path in sorted(folder.rglob("*"))
@@ -86,11 +86,11 @@ def place(tmp_path):
 )
 def test_commands_do_not_overwrite_foreign_files(place, monkeypatch, capsys, arguments, overwrite):
     monkeypatch.chdir(place)
-    before = held(place)
+    before = digests_of_files(place)
     assert run([*arguments, *overwrite]) == BAD_INPUT
     said = capsys.readouterr().err
     assert said.startswith("error: ") and len(said.strip().splitlines()) == 1, said
-    assert held(place) == before
+    assert digests_of_files(place) == before
 
 
 @pytest.mark.parametrize("name", ["out.ply", "out.splat", "out.glb", "out.zip", "out.isplat"])
@@ -174,10 +174,10 @@ def test_second_run_refuses_output_folder_with_changed_results(tmp_path, what):
     out = tmp_path / "out"
     _first_run(out)
     FOREIGN[what](out)
-    before = held(out)
+    before = digests_of_files(out)
     with pytest.raises(OutputFolderInUse, match="no run of intrasplat wrote"):
         _second_run(out)
-    assert held(out) == before
+    assert digests_of_files(out) == before
 
 
 @pytest.mark.parametrize("what", [what for what in FOREIGN if what != "another page"])

@@ -65,7 +65,7 @@ def listed(client: Client) -> list[KeyView]:
     return client.keys()
 
 
-def until(page: Any, true: str) -> None:
+def wait_until(page: Any, true: str) -> None:
     """Wait until an expression is true. Playwright's wait needs `eval`, which the page's policy forbids."""
     for _ in range(6000):
         if page.evaluate(true):
@@ -85,7 +85,7 @@ def test_live_page_fits_window(page, window):
     page.set_viewport_size({"width": width, "height": height})
     opened(page, "live")
     page.wait_for_selector("#take-snapshot")
-    until(page, "Math.abs(document.getElementById('age').width - document.getElementById('age').clientWidth) < 2")
+    wait_until(page, "Math.abs(document.getElementById('age').width - document.getElementById('age').clientWidth) < 2")
     assert page.evaluate(CUT) == []
     assert page.evaluate(
         "[document.documentElement.scrollHeight <= innerHeight, live.scrollHeight <= live.clientHeight + 1]"
@@ -133,7 +133,7 @@ def test_console_delete_requires_confirmation(page, client):
         assert "cannot be undone" in page.inner_text("#confirm-consequence")
         page.keyboard.press(refuse)
         page.wait_for_selector("#confirm:not([open])", state="attached")
-        until(page, "document.activeElement.getAttribute('aria-label') === 'Delete the stream spare'")
+        wait_until(page, "document.activeElement.getAttribute('aria-label') === 'Delete the stream spare'")
     assert client.stream("spare").state == "stopped"
     page.keyboard.press("Enter")
     page.wait_for_selector("#confirm[open]")
@@ -191,7 +191,7 @@ def test_console_creates_shows_once_and_revokes_keys(page, client):
     days = (datetime.fromisoformat(made.expires_at) - datetime.fromisoformat(made.created_at)).total_seconds() / 86400
     assert days == pytest.approx(7, abs=0.01)
     page.click("#made-key >> text=Close")
-    until(page, "document.getElementById('made-key-secret').value === ''")
+    wait_until(page, "document.getElementById('made-key-secret').value === ''")
     assert secret not in page.content()
     line = page.locator("#key-rows tr", has_text="wall")
     assert made.id in line.inner_text() and "theatre-1, theatre-2" in line.inner_text() and "never" in line.inner_text()
@@ -211,7 +211,7 @@ def test_console_filters_and_saves_audit_log(page, client, tmp_path):
     page.fill("#audit-event", "key")
     page.fill("#audit-subject", "for-a-while")
     page.keyboard.press("Enter")
-    until(page, "[...document.querySelectorAll('#entries tr')].length === 1")
+    wait_until(page, "[...document.querySelectorAll('#entries tr')].length === 1")
     assert everything > 3 and "key.create" in page.inner_text("#entries")
     stamp = page.locator("#entries time").first
     assert "GMT+9" in stamp.inner_text() or "JST" in stamp.inner_text()
@@ -230,7 +230,7 @@ def test_console_filters_and_saves_audit_log(page, client, tmp_path):
     page.click("#audit-filter >> text=Filter")
     page.wait_for_selector("#audit-said >> text=no matching entries")
     page.click("#audit-filter >> text=Clear")
-    until(page, f"document.querySelectorAll('#entries tr').length >= {everything}")
+    wait_until(page, f"document.querySelectorAll('#entries tr').length >= {everything}")
 
 
 def test_console_health_page_matches_readyz(page, client):

@@ -34,14 +34,14 @@ def offline(long, tmp_path_factory) -> Path:
     return out
 
 
-def evaluated(intrasplat, *arguments) -> EvaluationReport:
+def run_evaluate(intrasplat, *arguments) -> EvaluationReport:
     done = intrasplat("evaluate", *arguments, "--json")
     assert done.code == 0, done.err
     return EvaluationReport.model_validate_json(done.out)
 
 
 def test_evaluate_heldout_scores_match_run_report(intrasplat, long, offline):
-    report = evaluated(intrasplat, offline, long, "--protocol", "heldout")
+    report = run_evaluate(intrasplat, offline, long, "--protocol", "heldout")
     own = RunReport.read(offline / "report.json")
     assert report.heldout is not None and own.quality.heldout is not None
     for name in ("psnr_tissue_db", "psnr_frame_db", "ssim", "frames"):
@@ -55,11 +55,11 @@ def test_evaluate_heldout_scores_match_run_report(intrasplat, long, offline):
 
 def test_evaluate_model_without_run_notes_unknown_facts(intrasplat, long, offline, tmp_path):
     shutil.copytree(offline / "model", tmp_path / "elsewhere")
-    report = evaluated(intrasplat, tmp_path / "elsewhere", long)
+    report = run_evaluate(intrasplat, tmp_path / "elsewhere", long)
     assert report.heldout is not None and report.retention is not None and report.live is None
     assert any("it is not known whether the held-out frames" in note for note in report.notes)
     assert any("live was not measured" in note for note in report.notes)
-    beside = evaluated(intrasplat, offline / "model", long)
+    beside = run_evaluate(intrasplat, offline / "model", long)
     assert beside.evaluated.command == "reconstruct" and not any("it is not known" in note for note in beside.notes)
 
 
@@ -106,15 +106,15 @@ def test_evaluate_writes_reports_and_prints_table(intrasplat, long, offline, tmp
 
 def test_evaluate_motion_prior_option_changes_prediction(intrasplat, long, offline):
     few = ("--protocol", "causal", "--steps-per-frame", 2, "--max-frames", 5)
-    flow, plain = (evaluated(intrasplat, offline, long, *few, *more) for more in (("--motion-prior", "flow"), ()))
+    flow, plain = (run_evaluate(intrasplat, offline, long, *few, *more) for more in (("--motion-prior", "flow"), ()))
     assert flow.causal is not None and plain.causal is not None
     assert (flow.causal.motion_prior, plain.causal.motion_prior) == ("flow", "bumps")
     assert flow.series["causal"] != plain.series["causal"]
 
 
 def test_causal_prediction_does_not_depend_on_later_frames(intrasplat, long, offline, tmp_path):
-    whole = evaluated(intrasplat, offline, long, "--protocol", "causal", "--steps-per-frame", 2)
-    start = evaluated(intrasplat, offline, long, "--protocol", "causal", "--steps-per-frame", 2, "--max-frames", 6)
+    whole = run_evaluate(intrasplat, offline, long, "--protocol", "causal", "--steps-per-frame", 2)
+    start = run_evaluate(intrasplat, offline, long, "--protocol", "causal", "--steps-per-frame", 2, "--max-frames", 6)
     assert start.series["causal"] == whole.series["causal"][:5]
 
 
@@ -122,14 +122,14 @@ def test_evaluate_run_trained_on_all_frames_has_no_heldout_scores(intrasplat, ti
     assert intrasplat("replay", tiny, "--out", tmp_path / "run", "--steps-per-frame", 1).code == 0
     done = intrasplat("evaluate", tmp_path / "run", tiny, "--protocol", "heldout")
     assert done.code == 2 and "trained on the held-out frames" in done.err
-    report = evaluated(intrasplat, tmp_path / "run", tiny)
+    report = run_evaluate(intrasplat, tmp_path / "run", tiny)
     assert report.heldout is None and any("trained on the held-out frames" in note for note in report.notes)
     done = intrasplat("evaluate", tmp_path / "run", tiny, "--protocol", "live")
     assert done.code == 2 and "not a live run" in done.err
 
 
 def test_evaluate_notes_or_refuses_other_recording(intrasplat, long, offline, tiny, tmp_path):
-    report = evaluated(intrasplat, offline, tiny, "--protocol", "retention")
+    report = run_evaluate(intrasplat, offline, tiny, "--protocol", "retention")
     assert any("made from other files" in note for note in report.notes)
     other = synthesize(tmp_path / "wide", frames=3, width_px=96, height_px=48, stereo=False)
     done = intrasplat("evaluate", offline, other)
@@ -144,20 +144,20 @@ def test_evaluate_notes_or_refuses_other_recording(intrasplat, long, offline, ti
 
 def test_evaluate_notes_partially_covered_recording(intrasplat, long, tmp_path):
     assert intrasplat("reconstruct", long, "--out", tmp_path / "run", "--steps", 5, "--max-frames", 4).code == 0
-    report = evaluated(intrasplat, tmp_path / "run", long)
+    report = run_evaluate(intrasplat, tmp_path / "run", long)
     assert any("the first 5 of the 12 frames" in note for note in report.notes)
     assert {each.frames for each in report.baselines if each.age_frames == 1} == {4}
 
 
 def test_evaluate_uses_size_of_model_unless_scale_is_given(intrasplat, long, tmp_path):
     assert intrasplat("reconstruct", long, "--out", tmp_path / "run", "--steps", 5, "--scale", 0.5).code == 0
-    report = evaluated(intrasplat, tmp_path / "run", long, "--protocol", "heldout")
+    report = run_evaluate(intrasplat, tmp_path / "run", long, "--protocol", "heldout")
     assert (report.recording.width_px, report.evaluated.scale) == (32, 0.5)
-    alone = evaluated(
+    alone = run_evaluate(
         intrasplat, shutil.copytree(tmp_path / "run" / "model", tmp_path / "m"), long, "--protocol", "heldout"
     )
     assert alone.evaluated.scale == 0.5 and any("model's size of 32x24" in note for note in alone.notes)
-    full = evaluated(intrasplat, tmp_path / "run", long, "--protocol", "heldout", "--scale", 1)
+    full = run_evaluate(intrasplat, tmp_path / "run", long, "--protocol", "heldout", "--scale", 1)
     assert full.recording.width_px == 64 and any("as --scale says" in note for note in full.notes)
 
 
@@ -206,7 +206,7 @@ def test_evaluate_refuses_output_in_run_or_foreign_folder(intrasplat, long, offl
 
 
 def test_evaluate_place_option_selects_time_ranges(intrasplat, long, offline):
-    report = evaluated(intrasplat, offline, long, "--protocol", "retention", "--place", "0:0.05,0.2:0.3")
+    report = run_evaluate(intrasplat, offline, long, "--protocol", "retention", "--place", "0:0.05,0.2:0.3")
     assert report.retention is not None
     (place,) = report.retention.places
     assert (place.again_s, place.first.frames, place.again.frames) == ((0.2, 0.3), 2, 4)
@@ -234,7 +234,7 @@ def test_interrupted_evaluate_writes_partial_report(long, offline, tmp_path, sta
 
 def test_evaluate_bins_long_series(intrasplat, long, offline, monkeypatch):
     monkeypatch.setattr("services.reports.evaluation.MAX_SERIES", 4)
-    report = evaluated(intrasplat, offline, long, "--protocol", "retention")
+    report = run_evaluate(intrasplat, offline, long, "--protocol", "retention")
     assert report.series_frames_per_entry == {"baselines": 3, "retention": 3}
     assert [len(report.series[name]) for name in ("baselines", "retention")] == [4, 4]
     (own,) = report.series["retention"][:1]
@@ -251,12 +251,12 @@ def test_evaluate_looped_live_run_uses_its_own_frame_times(intrasplat, long, off
     content["run"]["command"], content["recording"]["fps"] = "live", 60.0
     content["model"]["sha256"] = load_bundle(folder / "model").sha256()
     (folder / "report.json").write_text(json.dumps(content))
-    report = evaluated(intrasplat, folder, long, "--protocol", "retention")
+    report = run_evaluate(intrasplat, folder, long, "--protocol", "retention")
     assert any("played the recording at 60 frames/s" in note for note in report.notes)
     assert any("last of 2.4 rounds" in note or "last of 2.5 rounds" in note for note in report.notes)
     series = report.series["retention"]
     assert [entry["seq"] for entry in series] == list(range(30)), "twelve frames a round, the third round half"
     assert series[-1]["time_s"] == pytest.approx(29 / 60, abs=1e-3)
     assert [entry["seq"] for entry in report.series["baselines"]] == list(range(1, 12))
-    alone = evaluated(intrasplat, folder / "model", long, "--protocol", "retention", "--max-frames", 6)
+    alone = run_evaluate(intrasplat, folder / "model", long, "--protocol", "retention", "--max-frames", 6)
     assert any("frames that are evaluated end" in note for note in alone.notes)

@@ -33,7 +33,7 @@ def scope(tmp_path_factory):
     )
 
 
-def showing(start, source, out):
+def start_showing(start, source, out):
     """Start a live run and return when its first picture is displayed."""
     process = start("live", source, "--loop", "--scale", 1, "--out", out)
     for line in process.stderr:
@@ -42,7 +42,7 @@ def showing(start, source, out):
     pytest.fail("the process ended before its first picture")
 
 
-def reached(out, frames=1):
+def complete_report(out, frames=1):
     """Return the report of a run, after checking that all outputs are complete."""
     report = RunReport.read(out / "report.json")
     assert report.run.command == "live" and report.frames.displayed >= frames
@@ -53,7 +53,7 @@ def reached(out, frames=1):
     return report
 
 
-def one_sentence(err):
+def only_error_line(err):
     """Return the only error line."""
     assert "Traceback" not in err
     said = [line for line in err.splitlines() if line.startswith("error: ")]
@@ -63,12 +63,12 @@ def one_sentence(err):
 
 @pytest.mark.slow
 def test_sigterm_ends_live_with_exit_code_0(scope, tmp_path, start):
-    process = showing(start, scope, tmp_path / "out")
+    process = start_showing(start, scope, tmp_path / "out")
     process.send_signal(signal.SIGTERM)  # SIGINT: test_recorded_sessions
     out, err = process.communicate(timeout=300)
     assert process.returncode == 0 and "Traceback" not in err
     assert "ended: interrupted" in out and "error" not in err
-    report = reached(tmp_path / "out")
+    report = complete_report(tmp_path / "out")
     assert report.run.interrupted and report.run.stop_reason == "interrupted"
 
 
@@ -78,7 +78,7 @@ def test_live_ends_after_seconds_option(scope, tmp_path, intrasplat):
         if done.code != NOTHING_SHOWN:
             break
     assert done.code == 0, done.err
-    report = reached(tmp_path / "out")
+    report = complete_report(tmp_path / "out")
     assert report.run.stop_reason == "end of the time asked for" and not report.run.interrupted
     assert json.loads(done.out)["run"]["stop_reason"] == "end of the time asked for", (
         "one JSON document and nothing else"
@@ -105,8 +105,8 @@ def test_live_saves_results_if_source_is_lost(scope, tmp_path, intrasplat, monke
     monkeypatch.setattr(live_module, "open_source", dying)
     done = intrasplat("live", scope, "--loop", "--scale", 1, "--out", tmp_path / "out")
     assert done.code == 2
-    assert "the scope was pulled out; plug it in again" in one_sentence(done.err)
-    assert "the scope was pulled out" in reached(tmp_path / "out").run.stop_reason
+    assert "the scope was pulled out; plug it in again" in only_error_line(done.err)
+    assert "the scope was pulled out" in complete_report(tmp_path / "out").run.stop_reason
 
 
 @pytest.mark.slow
@@ -133,10 +133,10 @@ def test_live_saves_results_if_gpu_is_out_of_memory(scope, tmp_path, monkeypatch
 @pytest.mark.slow
 def test_live_saves_results_if_disk_fills_up(scope, small_disk, start):
     """Another program fills the disk; model and report use reserved space."""
-    process = showing(start, scope, small_disk / "out")
+    process = start_showing(start, scope, small_disk / "out")
     with open(small_disk / "ballast", "ab") as ballast:
         os.posix_fallocate(ballast.fileno(), 0, shutil.disk_usage(small_disk).free - (6 << 20))
     _, err = process.communicate(timeout=300)
     assert process.returncode == 2
-    assert "is full" in one_sentence(err) and "free some space" in one_sentence(err)
-    assert "is full" in reached(small_disk / "out").run.stop_reason
+    assert "is full" in only_error_line(err) and "free some space" in only_error_line(err)
+    assert "is full" in complete_report(small_disk / "out").run.stop_reason

@@ -220,21 +220,21 @@ def test_console_keeps_chosen_recording_while_list_loads(server, page):
     page.evaluate("document.getElementById('replay-recording').replaceChildren()")
     page.route("**/v1/recordings", lambda route: held.append(route))
     page.click("#tab-replays")
-    until_true(lambda: len(held) == 1, page)
+    wait_until_true(lambda: len(held) == 1, page)
     page.evaluate("for (const id of ['recordings', 'replays']) document.getElementById(id).hidden = id === 'replays'")
     row.get_by_text("Replay").click()
     assert page.input_value("#replay-recording") == "by-hand"
-    until_true(lambda: len(held) == 2, page)
+    wait_until_true(lambda: len(held) == 2, page)
     held[0].fulfill(json=[])
     page.wait_for_timeout(200)
     assert page.input_value("#replay-recording") == "by-hand"
     held[1].continue_()
     page.unroute("**/v1/recordings")
-    until_true(lambda: page.evaluate("document.getElementById('replay-recording').options.length") >= 2, page)
+    wait_until_true(lambda: page.evaluate("document.getElementById('replay-recording').options.length") >= 2, page)
     assert page.input_value("#replay-recording") == "by-hand"
 
 
-def until_true(found, page):
+def wait_until_true(found, page):
     """Wait until `found` returns true while the page keeps running."""
     end_s = time.monotonic() + WITHIN_S
     while not found():

@@ -42,9 +42,9 @@ def served():
                 [sys.executable, "-m", "services.cli", "serve", "--config", config], stdout=output, stderr=output
             )
         try:
-            url = until(lambda: re.search(r"IntraSplat is on (http://\S+?)(?:/\S*)?\n", log.read_text()), log)[1]
+            url = wait_until(lambda: re.search(r"IntraSplat is on (http://\S+?)(?:/\S*)?\n", log.read_text()), log)[1]
             with Client(url, (data / "admin.key").read_text()) as client:
-                until(lambda: client.stream("theatre").state == "live", log)
+                wait_until(lambda: client.stream("theatre").state == "live", log)
                 yield client, url, log
             process.send_signal(signal.SIGTERM)
             assert process.wait(300) == 0, log.read_text()
@@ -54,7 +54,7 @@ def served():
             process.wait()
 
 
-def until(found, log, within_s=WITHIN_S):
+def wait_until(found, log, within_s=WITHIN_S):
     """Poll `found` until its result is true and return the result."""
     end_s = time.monotonic() + within_s
     while time.monotonic() < end_s:
@@ -97,7 +97,7 @@ def test_raw_pictures_continue_while_killed_engine_restarts(served):
         found = client.stream("theatre")
         return found.state == "live" and found.processes["engine"]["pid"] != before["pid"] and found
 
-    after = until(back, log).processes["engine"]
+    after = wait_until(back, log).processes["engine"]
     raw.close()
     assert len(numbers) >= 5, "an engine takes seconds to start, and the camera gives fifteen pictures a second"
     assert after["restarts"] == before["restarts"] + 1
@@ -134,12 +134,12 @@ def test_model_stream_follows_activation_and_rollback(served, walls):
         client.activate("wall", versions[0], expected_current=7)
     client.activate("wall", versions[0], expected_current=None)
     client.create_stream("playback", SOURCE, show="model wall", device="cpu")
-    until(lambda: client.stream("playback").state == "live", log)
-    until(lambda: colour_shown(client, "playback") == ("red", versions[0]), log)
+    wait_until(lambda: client.stream("playback").state == "live", log)
+    wait_until(lambda: colour_shown(client, "playback") == ("red", versions[0]), log)
     client.activate("wall", versions[1], expected_current=versions[0])
-    until(lambda: colour_shown(client, "playback") == ("green", versions[1]), log)
+    wait_until(lambda: colour_shown(client, "playback") == ("green", versions[1]), log)
     client.rollback("wall")
-    until(lambda: colour_shown(client, "playback") == ("red", versions[0]), log)
+    wait_until(lambda: colour_shown(client, "playback") == ("red", versions[0]), log)
     with pytest.raises(Refused, match="active"):
         client.delete_version("wall", versions[0])
     client.delete_stream("playback")

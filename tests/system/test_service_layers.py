@@ -16,7 +16,7 @@ from gsplat_core.io.ply import load_ply
 from services.client import Refused
 from services.registry.bundle_file import unpack
 from tests.gsplat_core.io.exports.glb_reader import read_glb
-from tests.system.test_service import brightness, page, served, until, walls  # noqa: F401 - fixtures
+from tests.system.test_service import brightness, page, served, wait_until, walls  # noqa: F401 - fixtures
 
 pytestmark = pytest.mark.slow
 
@@ -38,14 +38,14 @@ def test_layer_is_drawn_only_while_watched(served, kind):
     assert ("legend" in header) == (kind != "orbit") and ("virtual" in header) == (kind == "orbit")
     image = cv2.imdecode(np.frombuffer(pictures[-1].jpeg, np.uint8), cv2.IMREAD_COLOR_RGB)
     assert image.shape == (128, 160, 3) and image.std() > 5
-    until(lambda: not layers_of(client)[kind]["watched"], log)
+    wait_until(lambda: not layers_of(client)[kind]["watched"], log)
 
     def rests():
         before = layers_of(client)[kind]["drawn"]
         time.sleep(0.6)
         return layers_of(client)[kind]["drawn"] == before > 0
 
-    until(rests, log)  # one may be drawn while the figures already report no viewer
+    wait_until(rests, log)  # one may be drawn while the figures already report no viewer
 
 
 def test_turn_camera_changes_virtual_view(served):
@@ -103,7 +103,7 @@ def test_model_stream_has_layers_but_no_snapshots(served, walls):
     assert client.checked("wall", made.version).state == "ready"
     client.activate("wall", made.version, expected_current=None)
     client.create_stream("playback", client.stream("theatre").source, show="model wall", device="cpu")
-    until(lambda: client.stream("playback").processes.get("engine", {}).get("figures", {}).get("model"), log)
+    wait_until(lambda: client.stream("playback").processes.get("engine", {}).get("figures", {}).get("model"), log)
     shown = client.pictures("playback", "depth")
     header = next(picture.header for picture in shown if picture.header["show"] == "model")
     shown.close()

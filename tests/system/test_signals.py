@@ -22,7 +22,7 @@ def long(tmp_path_factory):
     )
 
 
-def started(start, *arguments):
+def start_replay(start, *arguments):
     """Start a replay and return when it has displayed its first frame."""
     process = start(*arguments)
     for line in process.stderr:
@@ -33,7 +33,7 @@ def started(start, *arguments):
 
 @pytest.mark.parametrize("number", [signal.SIGHUP])
 def test_sighup_ends_replay_and_saves_results(long, tmp_path, start, number):
-    process = started(start, "replay", long, "--out", tmp_path / "out", "--steps-per-frame", 12)
+    process = start_replay(start, "replay", long, "--out", tmp_path / "out", "--steps-per-frame", 12)
     process.send_signal(number)
     if number == signal.SIGHUP:
         process.send_signal(number)  # the shell sends it and the system too: it is no second request

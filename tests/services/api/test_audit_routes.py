@@ -13,7 +13,7 @@ from services.audit import AuditLog, Keeping, Wanted, exported, reading, search,
 
 
 @pytest.fixture
-def kept(plane):
+def filled_plane(plane):
     """A server whose log holds 40 activations of two models and one refused key revocation."""
     audit = plane.control.audit
     for number in range(40):
@@ -24,7 +24,7 @@ def kept(plane):
     return plane
 
 
-def found(plane, **query):
+def search_audit(plane, **query):
     answer = plane.ask("GET", "/v1/audit", params=query)
     assert answer.status_code == 200, answer.text
     return answer.json()
@@ -44,30 +44,34 @@ def found(plane, **query):
         ({"subject": "spleen"}, set()),
     ],
 )
-def test_audit_search_returns_only_matching_entries(kept, query, events):
-    entries = [entry for entry in found(kept, count=500, **query)["entries"] if not entry["event"].startswith("audit.")]
+def test_audit_search_returns_only_matching_entries(filled_plane, query, events):
+    entries = [
+        entry
+        for entry in search_audit(filled_plane, count=500, **query)["entries"]
+        if not entry["event"].startswith("audit.")
+    ]
     assert {entry["event"] for entry in entries} == events
-    everything = found(kept, count=500)["entries"]
+    everything = search_audit(filled_plane, count=500)["entries"]
     assert 0 <= len(entries) < len(everything)
     assert all(entry in everything for entry in entries)
 
 
-def test_audit_search_is_bounded_by_since_and_until_with_zone(kept):
-    entries = found(kept, count=500, event="model.activate")["entries"]
+def test_audit_search_is_bounded_by_since_and_until_with_zone(filled_plane):
+    entries = search_audit(filled_plane, count=500, event="model.activate")["entries"]
     assert all(datetime.fromisoformat(entry["at"]).tzinfo is not None for entry in entries)
     at = datetime.fromisoformat(entries[20]["at"])
-    later = found(kept, count=500, event="model.activate", since=at.isoformat())["entries"]
-    earlier = found(kept, count=500, event="model.activate", until=at.isoformat())["entries"]
+    later = search_audit(filled_plane, count=500, event="model.activate", since=at.isoformat())["entries"]
+    earlier = search_audit(filled_plane, count=500, event="model.activate", until=at.isoformat())["entries"]
     assert later + earlier == entries and entries[20] in later
     zone = (at.astimezone(UTC) + timedelta(hours=2)).replace(tzinfo=None).isoformat() + "+02:00"
-    assert found(kept, count=500, event="model.activate", since=zone)["entries"] == later
+    assert search_audit(filled_plane, count=500, event="model.activate", since=zone)["entries"] == later
 
 
-def test_audit_search_pages_contain_every_entry_once(kept, monkeypatch):
+def test_audit_search_pages_contain_every_entry_once(filled_plane, monkeypatch):
     monkeypatch.setattr(reading, "MOST_EXAMINED", 7)
     seen, before, asked = [], None, 0
     while asked == 0 or before is not None:
-        page = found(kept, count=5, actor="1f1", **({} if before is None else {"before": before}))
+        page = search_audit(filled_plane, count=5, actor="1f1", **({} if before is None else {"before": before}))
         seen += [entry["subject"] for entry in page["entries"]]
         before, asked = page["next_before"], asked + 1
     assert seen == [f"liver/{number}" for number in range(39, 0, -2)]
@@ -78,9 +82,9 @@ def test_audit_search_pages_contain_every_entry_once(kept, monkeypatch):
     "query",
     [{"outcome": "well"}, {"since": "yesterday"}, {"until": "0.5"}, {"since": "1700000000"}, {"since": "2026-01-01T00:00:00"}, {"actor": ""}, {"actor": "a\nb"}, {"subject": 101 * "a"}, {"event": "<b>"}],
 )  # fmt: skip
-def test_audit_routes_return_422_for_invalid_filter(kept, query):
+def test_audit_routes_return_422_for_invalid_filter(filled_plane, query):
     for path in ("/v1/audit", "/v1/audit/export"):
-        assert kept.ask("GET", path, params=query).status_code == 422
+        assert filled_plane.ask("GET", path, params=query).status_code == 422
 
 
 @pytest.mark.parametrize(
@@ -94,22 +98,22 @@ def test_audit_route_limits_count_to_500_and_before_to_64_bits(plane, query, sta
     assert plane.ask("GET", "/v1/audit", params=query).status_code == status
 
 
-def test_full_audit_export_passes_verification(kept, tmp_path):
-    answer = kept.ask("GET", "/v1/audit/export")
+def test_full_audit_export_passes_verification(filled_plane, tmp_path):
+    answer = filled_plane.ask("GET", "/v1/audit/export")
     assert 'filename="audit-' in answer.headers["content-disposition"]
     assert answer.headers["content-type"].startswith("application/jsonl")
     file = tmp_path / "copy.jsonl"
     file.write_bytes(answer.content)
     verdict = verify(file)
-    assert verdict.entries == kept.control.audit.head.seq + 1
-    assert verdict.head == kept.control.audit.head
+    assert verdict.entries == filled_plane.control.audit.head.seq + 1
+    assert verdict.head == filled_plane.control.audit.head
     (finding,) = verdict.findings  # of the chain nothing is wrong; a copy has no head beside it
     assert "the head file next to the log is missing" in finding.what
     assert json.loads(answer.content.splitlines()[-1])["event"] == "audit.export"
 
 
-def test_audit_csv_export_escapes_spreadsheet_formulas(kept):
-    answer = kept.ask("GET", "/v1/audit/export", params={"format": "csv"})
+def test_audit_csv_export_escapes_spreadsheet_formulas(filled_plane):
+    answer = filled_plane.ask("GET", "/v1/audit/export", params={"format": "csv"})
     assert answer.headers["content-type"] == "text/csv; charset=utf-8"
     rows = list(csv.DictReader(io.StringIO(answer.text)))
     assert [int(row["seq"]) for row in rows] == list(range(len(rows)))
@@ -118,7 +122,7 @@ def test_audit_csv_export_escapes_spreadsheet_formulas(kept):
     assert (odd["actor"], odd["subject"]) == ("'+cmd", "'=1+1")
     refused = next(row for row in rows if row["outcome"] == "refused")
     assert json.loads(refused["detail"]) == {"error": "KeyConflict", "n": 3}
-    one = kept.ask("GET", "/v1/audit/export", params={"format": "csv", "outcome": "refused"})
+    one = filled_plane.ask("GET", "/v1/audit/export", params={"format": "csv", "outcome": "refused"})
     assert len(list(csv.DictReader(io.StringIO(one.text)))) == 1
 
 
@@ -138,8 +142,8 @@ def test_audit_export_reads_all_segments_of_rotated_log(tmp_path):
 
 def test_audit_logs_reads_once_per_minute_and_every_export(plane):
     for _ in range(5):
-        found(plane)
-    found(plane, outcome="refused")
+        search_audit(plane)
+    search_audit(plane, outcome="refused")
     for _ in range(2):
         plane.ask("GET", "/v1/audit/export", params={"format": "csv"})
     entries = [

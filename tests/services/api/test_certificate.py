@@ -25,7 +25,7 @@ from cryptography.hazmat.primitives.asymmetric import ec, rsa  # noqa: E402
 SOON = datetime(2030, 5, 17, 12, 30, 15, tzinfo=UTC)
 
 
-def made(until: datetime = SOON, name: str = "room-1.example", kind: str = "ec"):
+def self_signed(until: datetime = SOON, name: str = "room-1.example", kind: str = "ec"):
     """Return a self-signed certificate and its key."""
     key = ec.generate_private_key(ec.SECP256R1()) if kind == "ec" else rsa.generate_private_key(65537, 2048)
     subject = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, name)])
@@ -46,7 +46,7 @@ def key_pem(key, passphrase: bytes | None = None) -> bytes:
     return key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, guard)
 
 
-def put(folder: Path, certificate: bytes, key: bytes) -> tuple[Path, Path]:
+def write_pair(folder: Path, certificate: bytes, key: bytes) -> tuple[Path, Path]:
     """Replace certificate and key files atomically, as a renewal does."""
     for name, content in (("cert.pem", certificate), ("key.pem", key)):
         (folder / "new").write_bytes(content)
@@ -78,7 +78,7 @@ def listening(certificate: ServerCertificate, pair: tuple[Path, Path]) -> Iterat
         thread.join()
 
 
-def shown(port: int, name: str | None) -> bytes:
+def served_certificate(port: int, name: str | None) -> bytes:
     """Return the certificate that a new connection receives."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
@@ -99,54 +99,54 @@ def der(certificate) -> bytes:
     [SOON, datetime(2049, 12, 31, 23, 59, 59, tzinfo=UTC), datetime(2050, 1, 1, tzinfo=UTC), datetime(9999, 12, 31, 23, 59, 59, tzinfo=UTC)],
 )  # fmt: skip
 def test_expiry_of_returns_not_after_of_certificate(until, kind):
-    certificate, _ = made(until, kind=kind)
+    certificate, _ = self_signed(until, kind=kind)
     assert datetime.fromtimestamp(expiry_of(der(certificate)), UTC) == certificate.not_valid_after_utc == until
 
 
 def test_expiry_of_raises_for_malformed_certificate():
-    good = der(made()[0])
+    good = der(self_signed()[0])
     for bad in (b"", b"\x30", b"hello", good[:40], good[1:], bytes(len(good)), b"\x30\x84\xff\xff\xff\xff" + good):
         with pytest.raises((ValueError, IndexError)):
             expiry_of(bad)
 
 
 def test_expires_at_is_earliest_expiry_in_chain(tmp_path):
-    leaf, key = made(SOON)
-    authority, _ = made(SOON - timedelta(days=400), "authority.example")
-    certificate = ServerCertificate(*put(tmp_path, b"a comment\n" + pem(leaf) + pem(authority), key_pem(key)))
+    leaf, key = self_signed(SOON)
+    authority, _ = self_signed(SOON - timedelta(days=400), "authority.example")
+    certificate = ServerCertificate(*write_pair(tmp_path, b"a comment\n" + pem(leaf) + pem(authority), key_pem(key)))
     assert certificate.expires_at == authority.not_valid_after_utc
 
 
 @pytest.mark.parametrize("name", ["room-1.example", None])
 def test_new_connections_get_renewed_certificate_after_reload(tmp_path, name):
-    old, old_key = made()
-    new, new_key = made(SOON + timedelta(days=90), kind="rsa")
-    pair = put(tmp_path, pem(old), key_pem(old_key))
+    old, old_key = self_signed()
+    new, new_key = self_signed(SOON + timedelta(days=90), kind="rsa")
+    pair = write_pair(tmp_path, pem(old), key_pem(old_key))
     certificate = ServerCertificate(*pair)
     with listening(certificate, pair) as port:
         assert not certificate.reload_if_changed()
-        assert shown(port, name) == der(old)
-        put(tmp_path, pem(new), key_pem(new_key))
-        assert shown(port, name) == der(old)
+        assert served_certificate(port, name) == der(old)
+        write_pair(tmp_path, pem(new), key_pem(new_key))
+        assert served_certificate(port, name) == der(old)
         assert certificate.reload_if_changed() and not certificate.reload_if_changed()
-        assert shown(port, name) == der(new)
+        assert served_certificate(port, name) == der(new)
         assert certificate.expires_at == new.not_valid_after_utc
 
 
 def of_another_key(folder, new, key):
-    put(folder, pem(new), key_pem(made()[1]))
+    write_pair(folder, pem(new), key_pem(self_signed()[1]))
 
 
 def cut_off(folder, new, key):
-    put(folder, pem(new)[:300], key_pem(key))
+    write_pair(folder, pem(new)[:300], key_pem(key))
 
 
 def empty(folder, new, key):
-    put(folder, b"", b"")
+    write_pair(folder, b"", b"")
 
 
 def with_a_passphrase(folder, new, key):
-    put(folder, pem(new), key_pem(key, b"secret"))
+    write_pair(folder, pem(new), key_pem(key, b"secret"))
 
 
 def gone(folder, new, key):
@@ -171,15 +171,15 @@ def only_half_renewed(folder, new, key):
     "spoil", [of_another_key, cut_off, empty, with_a_passphrase, gone, a_folder, a_pipe, only_half_renewed]
 )
 def test_reload_keeps_old_certificate_if_new_files_are_unusable(tmp_path, caplog, spoil):
-    old, old_key = made()
-    new, new_key = made(SOON + timedelta(days=90))
-    pair = put(tmp_path, pem(old), key_pem(old_key))
+    old, old_key = self_signed()
+    new, new_key = self_signed(SOON + timedelta(days=90))
+    pair = write_pair(tmp_path, pem(old), key_pem(old_key))
     certificate = ServerCertificate(*pair)
     with listening(certificate, pair) as port:
         assert asyncio.run(certificate.check()).ok
         spoil(tmp_path, new, new_key)
         assert not certificate.reload_if_changed()
-        assert shown(port, "room-1.example") == der(old)
+        assert served_certificate(port, "room-1.example") == der(old)
         assert certificate.expires_at == old.not_valid_after_utc
         checked = asyncio.run(certificate.check())
         assert not checked.ok and not checked.needed and "cannot be used" in checked.detail
@@ -188,31 +188,31 @@ def test_reload_keeps_old_certificate_if_new_files_are_unusable(tmp_path, caplog
         assert not certificate.reload_if_changed() and len(caplog.records) == 1, "said once for each change"
         if spoil is a_folder:
             (tmp_path / "key.pem").rmdir()
-        put(tmp_path, pem(new), key_pem(new_key))
+        write_pair(tmp_path, pem(new), key_pem(new_key))
         assert certificate.reload_if_changed()
-        assert shown(port, "room-1.example") == der(new)
+        assert served_certificate(port, "room-1.example") == der(new)
         assert asyncio.run(certificate.check()).ok
 
 
 @pytest.mark.parametrize("spoil", [of_another_key, cut_off, empty, with_a_passphrase, gone, a_folder, a_pipe])
 def test_server_certificate_raises_for_unusable_files(tmp_path, spoil):
-    new, key = made()
-    pair = put(tmp_path, pem(new), key_pem(key))
+    new, key = self_signed()
+    pair = write_pair(tmp_path, pem(new), key_pem(key))
     spoil(tmp_path, new, key)
     with pytest.raises(OSError):
         ServerCertificate(*pair)
 
 
 def test_certificate_check_is_degraded_after_expiry(tmp_path):
-    old, key = made(datetime(2021, 1, 1, tzinfo=UTC))
-    checked = asyncio.run(ServerCertificate(*put(tmp_path, pem(old), key_pem(key))).check())
+    old, key = self_signed(datetime(2021, 1, 1, tzinfo=UTC))
+    checked = asyncio.run(ServerCertificate(*write_pair(tmp_path, pem(old), key_pem(key))).check())
     assert (checked.ok, checked.needed) == (False, False)
     assert "has expired at 2021-01-01 00:00 UTC; renew it" in checked.detail
 
 
 def test_certificate_metrics_report_expiry_and_failed_reload(tmp_path):
-    old, key = made()
-    certificate = ServerCertificate(*put(tmp_path, pem(old), key_pem(key)))
+    old, key = self_signed()
+    certificate = ServerCertificate(*write_pair(tmp_path, pem(old), key_pem(key)))
 
     def values():
         return {family.name: family.samples[0].value for family in certificate.collect()}
@@ -230,8 +230,8 @@ def test_watched_certificate_reloads_and_writes_audit_entries(tmp_path, monkeypa
 
     monkeypatch.setattr(module, "POLL_S", 0.01)
     audit, events = AuditLog(tmp_path / "audit.jsonl"), SystemEvents()
-    old, key = made()
-    certificate = ServerCertificate(*put(tmp_path, pem(old), key_pem(key)), events)
+    old, key = self_signed()
+    certificate = ServerCertificate(*write_pair(tmp_path, pem(old), key_pem(key)), events)
 
     async def until(count: int) -> None:
         end_s = time.monotonic() + 300
@@ -241,10 +241,10 @@ def test_watched_certificate_reloads_and_writes_audit_entries(tmp_path, monkeypa
 
     async def renew() -> None:
         async with events.written_to(audit), certificate.watched():
-            new, new_key = made(SOON + timedelta(days=1))
+            new, new_key = self_signed(SOON + timedelta(days=1))
             (tmp_path / "cert.pem").write_bytes(b"")
             await until(1)
-            put(tmp_path, pem(new), key_pem(new_key))
+            write_pair(tmp_path, pem(new), key_pem(new_key))
             end_s = time.monotonic() + 300
             while certificate.expires_at != new.not_valid_after_utc:
                 assert time.monotonic() < end_s

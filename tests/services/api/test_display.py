@@ -37,7 +37,7 @@ def ticket(plane, path, role="viewer"):
     return plane.ask("POST", "/v1/tickets", role, json={"path": path}).json()["ticket"]
 
 
-def until(condition):
+def wait_until(condition):
     for _ in range(30_000):
         if condition():
             return
@@ -57,7 +57,7 @@ def test_display_websocket_sends_header_and_jpeg_per_picture(watched, display):
             socket.receive_bytes()
     assert ended.value.code == 1001
     assert display.asked == [("endoscope", "raw", 60)]
-    until(lambda: display.open == 0)
+    wait_until(lambda: display.open == 0)
 
 
 def test_display_websocket_accepts_key_in_header(watched):
@@ -136,8 +136,8 @@ def test_display_subscription_ends_when_viewer_disconnects(new_plane):
     with plane.client.websocket_connect(SOCKET, headers=plane.headers()) as socket:
         socket.receive_bytes()
         assert display.open == 1
-    until(lambda: display.open == 0)
-    until(lambda: 'intrasplat_viewers{transport="websocket"} 0.0' in plane.ask("GET", "/metrics").text)
+    wait_until(lambda: display.open == 0)
+    wait_until(lambda: 'intrasplat_viewers{transport="websocket"} 0.0' in plane.ask("GET", "/metrics").text)
 
 
 def test_mjpeg_returns_503_over_viewer_limit(new_plane):

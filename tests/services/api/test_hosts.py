@@ -14,13 +14,13 @@ from services.api.problems import PROBLEM_JSON
 from services.settings import ServerSettings
 
 
-def knows(host: str, /, **server: object) -> bool:
+def is_known_host(host: str, /, **server: object) -> bool:
     return KnownHosts(lambda *_: None, ServerSettings(**server), Measures()).knows(host)  # type: ignore[arg-type,return-value]
 
 
 @pytest.mark.parametrize("host", ["localhost", "localhost:8000", "127.0.0.1:8000", "[::1]:8000", "[::1]", "10.0.0.4"])
 def test_known_hosts_accepts_ip_addresses_and_localhost(host):
-    assert knows(host) and knows(host, allowed_hosts=["room-1.example"])
+    assert is_known_host(host) and is_known_host(host, allowed_hosts=["room-1.example"])
 
 
 @pytest.mark.parametrize(
@@ -29,7 +29,7 @@ def test_known_hosts_accepts_ip_addresses_and_localhost(host):
      "evil.example:80:80", "user@localhost", "localhost/x", "[evil]", "*", "127.0.0.1, evil.example", "lоcalhost"],
 )  # fmt: skip
 def test_known_hosts_rejects_unlisted_names(host):
-    assert not knows(host) and not knows(host, allowed_hosts=["room-1.example", "*.hospital.example"])
+    assert not is_known_host(host) and not is_known_host(host, allowed_hosts=["room-1.example", "*.hospital.example"])
 
 
 def test_allowed_hosts_match_exact_names_and_subdomain_wildcards():
@@ -41,15 +41,15 @@ def test_allowed_hosts_match_exact_names_and_subdomain_wildcards():
         "a.hospital.example",
         "a.b.hospital.example",
     ):
-        assert knows(host, allowed_hosts=listed), host
-    assert not knows("hospital.example", allowed_hosts=listed)
-    assert knows("theatre-pc", host="theatre-pc")
+        assert is_known_host(host, allowed_hosts=listed), host
+    assert not is_known_host("hospital.example", allowed_hosts=listed)
+    assert is_known_host("theatre-pc", host="theatre-pc")
 
 
 def test_tls_without_allowed_hosts_accepts_any_valid_host():
     tls = {"certfile": "/x", "keyfile": "/x"}
-    assert knows("room-1.example", **tls) and not knows("a b", **tls)
-    assert not knows("evil.example", **tls, allowed_hosts=["room-1.example"])
+    assert is_known_host("room-1.example", **tls) and not is_known_host("a b", **tls)
+    assert not is_known_host("evil.example", **tls, allowed_hosts=["room-1.example"])
 
 
 @pytest.mark.parametrize("name", ["http://x", "x:80", "*", "a*b", "", ".x", "x/y", "[::1]", "*.*.x"])

@@ -51,7 +51,7 @@ UPGRADE = (
 )
 
 
-def until(condition) -> None:
+def wait_until(condition) -> None:
     for _ in range(15_000):
         if condition():
             return
@@ -71,7 +71,7 @@ def test_stalled_viewer_is_dropped_while_healthy_viewer_continues(served, path, 
         stuck.sendall(request(address, key, *more))
         healthy.sendall(request(address, key, *more))
         healthy.settimeout(300)
-        until(lambda: display.open == 2 or not healthy.recv(65536))
+        wait_until(lambda: display.open == 2 or not healthy.recv(65536))
         taken = 0
         deadline_s = time.monotonic() + 300
         while display.open == 2 and time.monotonic() < deadline_s:
@@ -83,16 +83,16 @@ def test_stalled_viewer_is_dropped_while_healthy_viewer_continues(served, path, 
             assert received
             taken += received
         # The system cuts the connection off; the client need not read the queued data.
-        until(lambda: len(server.server_state.connections) == 1)
-    until(lambda: display.open == 0)
+        wait_until(lambda: len(server.server_state.connections) == 1)
+    wait_until(lambda: display.open == 0)
 
 
 def test_metrics_count_dropped_stalled_viewer(served):
     port, key, display, _ = served
     with socket.create_connection(("127.0.0.1", port)) as stuck:
         stuck.sendall(request("/v1/streams/endoscope/mjpeg", key))
-        until(lambda: display.open == 1)
-        until(lambda: display.open == 0)
+        wait_until(lambda: display.open == 1)
+        wait_until(lambda: display.open == 0)
     with socket.create_connection(("127.0.0.1", port)) as client:
         client.sendall(request("/metrics", key, "Connection: close"))
         text = b""

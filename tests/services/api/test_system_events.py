@@ -18,7 +18,7 @@ def audit(tmp_path):
     log.close()
 
 
-def said(audit: AuditLog) -> list[tuple[str, str, str]]:
+def audit_events(audit: AuditLog) -> list[tuple[str, str, str]]:
     return [
         (entry.event, entry.subject, entry.outcome) for entry in reversed(search(audit.path, Wanted(), 2000).entries)
     ]
@@ -29,12 +29,15 @@ def test_system_events_are_written_while_running_and_at_exit(audit):
         events = SystemEvents()
         events.tell("process.started", "theatre/engine", pid=7)
         async with events.written_to(audit):
-            while not said(audit):
+            while not audit_events(audit):
                 await asyncio.sleep(0.01)
             events.tell("process.ended", "theatre/engine", "failed", reason="killed by SIGKILL")
 
     asyncio.run(run())
-    assert said(audit) == [("process.started", "theatre/engine", "done"), ("process.ended", "theatre/engine", "failed")]
+    assert audit_events(audit) == [
+        ("process.started", "theatre/engine", "done"),
+        ("process.ended", "theatre/engine", "failed"),
+    ]
     newest = search(audit.path, Wanted(), 1).entries[0]
     assert (newest.actor, newest.detail) == ("system", {"reason": "killed by SIGKILL"})
 
@@ -50,7 +53,7 @@ def test_system_events_over_queue_limit_are_counted_as_missed(audit, monkeypatch
             pass
 
     asyncio.run(run())
-    assert len(said(audit)) == 21
+    assert len(audit_events(audit)) == 21
     assert search(audit.path, Wanted(), 1).entries[0].event == "audit.missed" and search(
         audit.path, Wanted(), 1
     ).entries[0].detail == {"events": 3}
@@ -64,7 +67,7 @@ def test_unwritable_system_event_is_logged_and_next_is_written(audit, caplog, mo
             events.tell("process.ended", "theatre/engine")
 
     asyncio.run(run())
-    assert said(audit) == [("process.ended", "theatre/engine", "done")]
+    assert audit_events(audit) == [("process.ended", "theatre/engine", "done")]
     assert "is not in the audit log" in caplog.text
     monkeypatch.setattr(audit, "append", lambda *_, **__: (_ for _ in ()).throw(AuditUnwritable("the disk is full")))
     asyncio.run(run())

@@ -36,8 +36,8 @@ def picture(value: int, height: int = 4, width: int = 6) -> np.ndarray:
     return np.full((height, width, 3), value, np.uint8)
 
 
-def received(socket: zmq.Socket):
-    """Return the next picture, skipping late ones of `connected`."""
+def next_picture(socket: zmq.Socket):
+    """Return the next picture, skipping late ones of `connect_readers`."""
     while socket.poll(300_000):
         picture = picture_from(socket.recv_multipart(copy=False))
         if picture.header["seq"] != -1:
@@ -45,7 +45,7 @@ def received(socket: zmq.Socket):
     pytest.fail("nothing came")
 
 
-def connected(publisher: PicturePublisher, *sockets: zmq.Socket) -> None:
+def connect_readers(publisher: PicturePublisher, *sockets: zmq.Socket) -> None:
     """Publish until every socket has received a picture, then empty the sockets."""
     for socket in sockets:
         while not socket.poll(10):
@@ -58,14 +58,14 @@ def test_picture_and_frame_arrive_unchanged(runtime, context):
     endpoint = runtime.stream("a").pictures("engine")
     publisher = PicturePublisher(endpoint, context)
     with subscribe(context.socket(zmq.SUB), endpoint) as socket:
-        connected(publisher, socket)
+        connect_readers(publisher, socket)
         image = np.arange(4 * 6 * 3, dtype=np.uint8).reshape(4, 6, 3)
         publisher.publish({"seq": 7, "state": "live"}, image[:, ::-1])
-        got = received(socket)
+        got = next_picture(socket)
         assert (got.header["seq"], got.header["state"]) == (7, "live")
         np.testing.assert_array_equal(got.image, image[:, ::-1])
         publisher.publish_frame({"run": 3}, Frame(8, 5, image, mask=image[..., 0], arrived_ns=7))
-        got = received(socket)
+        got = next_picture(socket)
         stated = {"seq": 8, "pts_ns": 5, "arrived_ns": 7, "damage": None, "status": "replay"}
         assert got.header == {"pixels": "frame", "run": 3, **stated}
         np.testing.assert_array_equal(got.image, image)
@@ -77,9 +77,9 @@ def test_subscriber_receives_from_later_publishers(runtime, context):
     with subscribe(context.socket(zmq.SUB), endpoint) as socket:
         for value in (1, 2):  # the second one after the first has gone
             publisher = PicturePublisher(endpoint, context)
-            connected(publisher, socket)
+            connect_readers(publisher, socket)
             publisher.publish({"seq": value}, picture(value))
-            assert received(socket).header["seq"] == value
+            assert next_picture(socket).header["seq"] == value
             publisher.close()
 
 
@@ -105,10 +105,10 @@ def test_stopped_reader_does_not_slow_other_reader(runtime, context):
             publisher.publish({"seq": -1}, image)
         process.send_signal(signal.SIGSTOP)
         with subscribe(context.socket(zmq.SUB), endpoint) as socket:
-            connected(publisher, socket)
+            connect_readers(publisher, socket)
             for seq in range(40):
                 publisher.publish({"seq": seq}, image)
-                assert received(socket).header["seq"] == seq
+                assert next_picture(socket).header["seq"] == seq
                 time.sleep(0.005)  # no camera is so fast that ZeroMQ does not come to take note of what was read
     finally:
         process.kill()
@@ -126,7 +126,7 @@ def test_slow_reader_queues_few_pictures(runtime, context):
     endpoint = runtime.stream("a").pictures("engine")
     publisher = PicturePublisher(endpoint, context)
     with subscribe(context.socket(zmq.SUB), endpoint) as socket:
-        connected(publisher, socket)
+        connect_readers(publisher, socket)
         image = np.zeros((256, 320, 3), np.uint8)
         for seq in range(100):
             publisher.publish({"seq": seq}, image)

@@ -12,7 +12,7 @@ from services.bus.messages import WatchedPublisher, picture_from, subscribe, wai
 IMAGE = np.zeros((2, 3, 3), np.uint8)
 
 
-def becomes(publisher: WatchedPublisher, watched: bool) -> None:
+def wait_until_watched(publisher: WatchedPublisher, watched: bool) -> None:
     until_s = time.monotonic() + 300
     while publisher.watched is not watched:
         assert time.monotonic() < until_s, f"watched did not become {watched}"
@@ -25,14 +25,14 @@ def test_publisher_is_watched_from_first_to_last_reader(runtime):
         publisher = WatchedPublisher(endpoint, context)
         assert not publisher.watched
         with subscribe(context.socket(zmq.SUB), endpoint) as one:
-            becomes(publisher, True)
+            wait_until_watched(publisher, True)
             with subscribe(context.socket(zmq.SUB), endpoint) as other:
                 while not other.poll(20):
                     publisher.publish({"seq": 1}, IMAGE)
                 assert picture_from(other.recv_multipart(copy=False)).header["seq"] == 1
             assert one.poll(300_000)
             assert publisher.watched
-        becomes(publisher, False)
+        wait_until_watched(publisher, False)
         publisher.close()
 
 
@@ -40,5 +40,5 @@ def test_publisher_is_watched_by_reader_that_subscribed_before(runtime):
     endpoint = runtime.stream("a").endpoint("orbit")
     with zmq.Context() as context, subscribe(context.socket(zmq.SUB), endpoint):
         publisher = WatchedPublisher(endpoint, context)
-        becomes(publisher, True)
+        wait_until_watched(publisher, True)
         publisher.close()

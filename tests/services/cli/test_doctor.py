@@ -12,7 +12,7 @@ NONE = doctor.Graphics(False, "none: this machine has no NVIDIA driver", "not ne
 
 
 @pytest.fixture
-def said(monkeypatch):
+def doctor_checks(monkeypatch):
     """Return a function that gives doctor's checks by name for a machine, a kernel build and an answer of the GPU."""
 
     def look(machine: doctor.Graphics, missing: str | None, refusal: str | None = None) -> dict[str, doctor.Check]:
@@ -27,32 +27,32 @@ def said(monkeypatch):
     return look
 
 
-def test_doctor_reports_working_cuda_kernels(said):
-    checks = said(GPU, None)
+def test_doctor_reports_working_cuda_kernels(doctor_checks):
+    checks = doctor_checks(GPU, None)
     assert all(check.ok for check in checks.values())
     assert checks["CUDA kernels"].value == "built by nvcc 13.0 for compute capability 8.0, 9.0"
     assert checks["ops on the GPU"].value == "2: adam_, composite"
 
 
-def test_doctor_advises_make_cuda_for_gpu_without_kernels(said):
-    checks = said(GPU, "not built")
+def test_doctor_advises_make_cuda_for_gpu_without_kernels(doctor_checks):
+    checks = doctor_checks(GPU, "not built")
     assert checks["GPU"].ok and not checks["CUDA kernels"].ok
     assert "make cuda" in checks["CUDA kernels"].advice
 
 
-def test_doctor_reports_kernels_that_gpu_refuses(said):
-    checks = said(GPU, None, "no kernel image is available for execution on the device")
+def test_doctor_reports_kernels_that_gpu_refuses(doctor_checks):
+    checks = doctor_checks(GPU, None, "no kernel image is available for execution on the device")
     assert not checks["CUDA kernels"].ok and "no kernel image" in checks["CUDA kernels"].value
     assert "--device cpu" in checks["CUDA kernels"].advice
 
 
-def test_doctor_does_not_run_kernels_without_gpu(said):
-    checks = said(NONE, None, "must not be asked")
+def test_doctor_does_not_run_kernels_without_gpu(doctor_checks):
+    checks = doctor_checks(NONE, None, "must not be asked")
     assert not checks["GPU"].ok and checks["CUDA kernels"].ok and "must not" not in checks["CUDA kernels"].value
 
 
-def test_doctor_gives_no_build_advice_without_gpu_and_kernels(said):
-    checks = said(NONE, "not built")
+def test_doctor_gives_no_build_advice_without_gpu_and_kernels(doctor_checks):
+    checks = doctor_checks(NONE, "not built")
     assert (
         "everything runs on the CPU" in checks["CUDA kernels"].advice
         and "make cuda" not in checks["CUDA kernels"].advice

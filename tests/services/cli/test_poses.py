@@ -46,14 +46,14 @@ def clip(tmp_path):
     return write
 
 
-def said_of(capsys, clip, *options):
+def run_poses(capsys, clip, *options):
     assert run(["poses", str(clip), "--out", str(clip / "poses.npy"), "--json", *options]) == OK
     return json.loads(capsys.readouterr().out)
 
 
 def test_poses_writes_file_that_recording_is_read_with(clip, capsys):
     folder = clip()
-    said = said_of(capsys, folder)
+    said = run_poses(capsys, folder)
     assert (said["path"], said["frames"], said["not_placed"]) == (str(folder / "poses.npy"), COUNT, [])
     assert said["way"] > 0 and said["points"] > 50 and said["explained"] > 0.9
     assert 0 < said["error_px"] < said["error_px_of_a_still_scope"]
@@ -64,7 +64,7 @@ def test_poses_writes_file_that_recording_is_read_with(clip, capsys):
 
 
 def test_poses_notes_that_lengths_have_no_scale(clip, capsys):
-    notes = said_of(capsys, clip())["notes"]
+    notes = run_poses(capsys, clip())["notes"]
     assert notes == ["lengths have no scale: the first frame's tissue is taken to be 60 away"]
 
 
@@ -78,12 +78,12 @@ def test_poses_without_json_prints_table_and_notes(clip, capsys):
 
 
 def test_poses_max_frames_limits_frames(clip, capsys):
-    assert said_of(capsys, clip(), "--max-frames", "5")["frames"] == 5
+    assert run_poses(capsys, clip(), "--max-frames", "5")["frames"] == 5
 
 
 @pytest.mark.slow
 def test_poses_notes_unknown_calibration(clip, capsys):
-    said = said_of(capsys, clip(calibrated=False))
+    said = run_poses(capsys, clip(calibrated=False))
     assert any("there is no calibration; a pinhole with f = 144.0 px" in note for note in said["notes"])
     assert any(
         "the pictures do not determine the focal length: tried values from 96 to 256 px" in note
@@ -97,7 +97,7 @@ def test_poses_uses_and_notes_estimated_focal_length(clip, capsys, monkeypatch):
     focal_length_found = FocalLength(144.0, FOCAL, (130.0, 150.0), True)
     monkeypatch.setattr(focal_length, "focal_length_of", lambda frames, camera, found: focal_length_found)
     folder = clip(calibrated=False)
-    said = said_of(capsys, folder)
+    said = run_poses(capsys, folder)
     assert (said["focal_px"], said["focal_px_from"], said["focal_px_range"]) == (FOCAL, "pictures", [130, 150])
     (note,) = (note for note in said["notes"] if "the focal length was found" in note)
     assert "140 px fits best, and values from 130 to 150 px fit almost equally well" in note
@@ -108,13 +108,13 @@ def test_poses_uses_and_notes_estimated_focal_length(clip, capsys, monkeypatch):
 
 
 def test_poses_uses_calibrated_focal_length(clip, capsys):
-    said = said_of(capsys, clip())
+    said = run_poses(capsys, clip())
     assert (said["focal_px"], said["focal_px_from"], said["focal_px_range"]) == (FOCAL, "calibration", [])
 
 
 @pytest.mark.slow
 def test_poses_notes_that_scope_may_be_at_rest(clip, capsys):
-    said = said_of(capsys, clip(STILL))
+    said = run_poses(capsys, clip(STILL))
     assert said["explained"] < 0.75
     assert any("it may be at rest in front of moving tissue" in note for note in said["notes"])
 
@@ -128,7 +128,7 @@ def test_poses_notes_breathing_frequencies_and_uncertainty(clip, capsys, monkeyp
         return replace(found, breathing=Breathing((0.294, 1.11), 0.02 * found.path))
 
     monkeypatch.setattr(recordings, "trajectory_of", trajectory)
-    said = said_of(capsys, clip())
+    said = run_poses(capsys, clip())
     assert (said["breathing_hz"], said["uncertain"]) == ([0.294, 1.11], 0.02)
     assert any("0.29 and 1.11 times a second" in note and "2.0% of the trajectory" in note for note in said["notes"])
 
@@ -136,13 +136,13 @@ def test_poses_notes_breathing_frequencies_and_uncertainty(clip, capsys, monkeyp
 def test_poses_notes_large_reprojection_error(clip, capsys, monkeypatch):
     plain = recordings.trajectory_of
     monkeypatch.setattr(recordings, "trajectory_of", lambda *given: replace(plain(*given), error_px=1.5))
-    said = said_of(capsys, clip())
+    said = run_poses(capsys, clip())
     assert (said["breathing_hz"], said["uncertain"]) == ([], None)
     assert any("points are off by 1.5 px: the tissue moves by itself" in note for note in said["notes"])
 
 
 def test_poses_notes_frames_without_texture(clip, capsys):
-    said = said_of(capsys, clip(blank=[4]))
+    said = run_poses(capsys, clip(blank=[4]))
     assert said["not_placed"] == [4]
     assert any("1 frames could not be placed" in note and "from frame 4 on" in note for note in said["notes"])
 

@@ -14,7 +14,7 @@ from services.exports.snapshots import Snapshot, SnapshotStore, StreamSnapshots,
 SAID = {"seq": 7, "model_version": 3, "gaussians": 12, "time_window_s": [1.0, 2.0], "pause_ms": 0.4, "more": 1}
 
 
-def taken(store: SnapshotStore, stream: str = "a", number: int = 0) -> Snapshot:
+def take_snapshot(store: SnapshotStore, stream: str = "a", number: int = 0) -> Snapshot:
     with store.new() as new:
         folder = new / "model"
         folder.mkdir()
@@ -27,7 +27,7 @@ def taken(store: SnapshotStore, stream: str = "a", number: int = 0) -> Snapshot:
 
 def test_snapshot_is_stored_with_its_description(tmp_path):
     store = SnapshotStore(tmp_path)
-    made = taken(store)
+    made = take_snapshot(store)
     assert store.get("a", made.id) == made and store.all("a") == [made]
     assert (made.seq, made.gaussians, made.size_bytes, made.taken_by) == (7, 12, 93, "somebody")
     names = {path.name for path in store.folder_of("a", made.id).iterdir()}
@@ -38,8 +38,8 @@ def test_snapshot_is_stored_with_its_description(tmp_path):
 
 def test_store_keeps_newest_snapshots_of_each_stream(tmp_path):
     store = SnapshotStore(tmp_path, most=3)
-    made = [taken(store, number=number) for number in range(5)]
-    other = taken(store, "b")
+    made = [take_snapshot(store, number=number) for number in range(5)]
+    other = take_snapshot(store, "b")
     assert {each.id for each in store.all("a")} <= {each.id for each in made}
     assert len(store.all("a")) == 3 and store.all("b") == [other]
     assert len({each.digest for each in made}) == 5
@@ -47,7 +47,7 @@ def test_store_keeps_newest_snapshots_of_each_stream(tmp_path):
 
 def test_snapshot_store_raises_for_unknown_or_invalid_id(tmp_path):
     store = SnapshotStore(tmp_path)
-    made = taken(store)
+    made = take_snapshot(store)
     store.delete("a", made.id)
     assert store.all("a") == store.all("nobody") == []
     for number in (made.id, "..", "../a", "x" * 16, ""):
@@ -70,19 +70,19 @@ def test_failed_snapshot_leaves_no_files(tmp_path):
 @pytest.mark.parametrize("damaged", ["", '{"id": ', "[]", "null", '{"id": "1"}', "\xff"])
 def test_damaged_snapshot_record_hides_only_its_snapshot(tmp_path, damaged):
     store = SnapshotStore(tmp_path)
-    lost, kept = taken(store), taken(store, number=1)
+    lost, kept = take_snapshot(store), take_snapshot(store, number=1)
     (store.folder_of("a", lost.id) / "snapshot.json").write_bytes(damaged.encode("latin-1"))
     assert store.all("a") == [kept]
     with pytest.raises(NoSnapshot):
         store.get("a", lost.id)
-    assert taken(store, number=2) in store.all("a")
+    assert take_snapshot(store, number=2) in store.all("a")
     store.delete("a", lost.id)
     assert not (tmp_path / "a" / lost.id).exists()
 
 
 def test_keep_succeeds_if_oldest_snapshot_is_deleted_concurrently(tmp_path, monkeypatch):
     store = SnapshotStore(tmp_path, most=1)
-    oldest = taken(store)
+    oldest = take_snapshot(store)
     listed = store.all
 
     def deleted_after_the_list(stream: str) -> list[Snapshot]:
@@ -91,7 +91,7 @@ def test_keep_succeeds_if_oldest_snapshot_is_deleted_concurrently(tmp_path, monk
         return found
 
     monkeypatch.setattr(store, "all", deleted_after_the_list)
-    newest = taken(store, number=1)
+    newest = take_snapshot(store, number=1)
     assert listed("a") == [newest]
 
 

@@ -20,7 +20,7 @@ def clock(monkeypatch):
     return at
 
 
-def of(store, owner, most_attempts=3, published=()):
+def claims_of(store, owner, most_attempts=3, published=()):
     return Claims(store.database, owner, 10, most_attempts, lambda folder: folder in published)
 
 
@@ -37,7 +37,7 @@ def test_concurrent_claims_take_each_job_once(new_store):
         while (claimed := claims.take()) is not None:
             taken.append(claimed.id)
 
-    threads = [threading.Thread(target=take_all, args=(of(new_store(), f"pool{n}"),)) for n in range(4)]
+    threads = [threading.Thread(target=take_all, args=(claims_of(new_store(), f"pool{n}"),)) for n in range(4)]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -48,7 +48,7 @@ def test_concurrent_claims_take_each_job_once(new_store):
 def test_renewed_lease_is_kept_and_expired_lease_is_lost(new_store, clock):
     store = new_store()
     (job_id,) = submitted(store)
-    first, second = of(store, "first"), of(store, "second")
+    first, second = claims_of(store, "first"), claims_of(store, "second")
     assert first.take().attempt == 1
     clock[0] += 9_000
     assert first.renew({job_id: JobProgress(5, 9, 30.0)}).lost == frozenset() and second.take() is None
@@ -65,7 +65,7 @@ def test_renewed_lease_is_kept_and_expired_lease_is_lost(new_store, clock):
 def test_job_fails_after_most_attempts(new_store):
     store = new_store()
     (job_id,) = submitted(store)
-    claims = of(store, "pool", most_attempts=2)
+    claims = claims_of(store, "pool", most_attempts=2)
     for _ in range(2):
         assert claims.take().id == job_id
         claims.give_back(job_id, counts=True)
@@ -76,7 +76,7 @@ def test_job_fails_after_most_attempts(new_store):
 def test_give_back_without_counts_keeps_attempt_number(new_store):
     store = new_store()
     (job_id,) = submitted(store)
-    claims = of(store, "pool", most_attempts=1)
+    claims = claims_of(store, "pool", most_attempts=1)
     for _ in range(3):
         assert claims.take().attempt == 1
         claims.give_back(job_id, counts=False)
@@ -85,16 +85,16 @@ def test_give_back_without_counts_keeps_attempt_number(new_store):
 def test_take_marks_published_job_done(new_store, clock):
     store = new_store()
     (job_id,) = submitted(store)
-    of(store, "dies between its rename and its note").take()
+    claims_of(store, "dies between its rename and its note").take()
     clock[0] += 11_000
-    assert of(store, "next", published={job_id}).take() is None
+    assert claims_of(store, "next", published={job_id}).take() is None
     assert store.get(job_id).state is JobState.DONE
 
 
 def test_renew_reports_cancelled_jobs(new_store):
     store = new_store()
     (job_id,) = submitted(store)
-    claims = of(store, "pool")
+    claims = claims_of(store, "pool")
     claims.take()
     store.cancel(job_id, "nurse")
     assert claims.renew({job_id: NOTHING}).cancelled == {job_id: "nurse"}
@@ -105,9 +105,9 @@ def test_renew_reports_cancelled_jobs(new_store):
 def test_free_releases_jobs_of_dead_owners(new_store):
     store = new_store()
     submitted(store, 2)
-    of(store, "dead").take()
-    of(store, "alive").take()
-    next_one = of(store, "next")
+    claims_of(store, "dead").take()
+    claims_of(store, "alive").take()
+    next_one = claims_of(store, "next")
     assert next_one.take() is None
     next_one.free(["dead"])
     assert next_one.take().attempt == 2 and next_one.take() is None

@@ -16,7 +16,7 @@ from services.jobs.pool import PoolKeeper, relayed
 
 
 @pytest.fixture
-def kept(monkeypatch):
+def run_keeper(monkeypatch):
     """Return a function that runs `_keep` with simulated job counts, exit codes and sleeps."""
 
     def run(jobs, codes):
@@ -54,14 +54,14 @@ def kept(monkeypatch):
     return run
 
 
-def test_keeper_runs_pool_while_jobs_are_open_and_delays_restarts(kept):
-    assert kept([0, 0], []) == (0, [keepers.POLL_S] * 2)
-    assert kept([1, 2], [0, 0]) == (2, [keepers.POLL_S] * 2)
-    assert kept([1], [3]) == (1, [7.5, keepers.POLL_S])
+def test_keeper_runs_pool_while_jobs_are_open_and_delays_restarts(run_keeper):
+    assert run_keeper([0, 0], []) == (0, [keepers.POLL_S] * 2)
+    assert run_keeper([1, 2], [0, 0]) == (2, [keepers.POLL_S] * 2)
+    assert run_keeper([1], [3]) == (1, [7.5, keepers.POLL_S])
 
 
-def test_keeper_retries_unavailable_store(kept):
-    assert kept([StoreUnavailable("locked"), 1], [0]) == (1, [keepers.POLL_S] * 2)
+def test_keeper_retries_unavailable_store(run_keeper):
+    assert run_keeper([StoreUnavailable("locked"), 1], [0]) == (1, [keepers.POLL_S] * 2)
 
 
 @pytest.fixture

@@ -43,7 +43,7 @@ def task(folder: Path, name: str = "a", **fields) -> Task:
     return Task(name, str(folder / "recordings" / "one"), str(folder / name), **fields)
 
 
-def ends(forks: Forks, count: int) -> Mapping[str, str]:
+def wait_for_ends(forks: Forks, count: int) -> Mapping[str, str]:
     found: dict[str, str] = {}
     deadline = time.monotonic() + 60
     while len(found) < count and time.monotonic() < deadline:
@@ -67,7 +67,7 @@ def test_fork_has_own_session_log_and_priority(forks, body, tmp_path):
 
     body(told)
     forks.start(task(tmp_path, niceness=3))
-    assert ends(forks, 1) == {"a": "exit code 0"} and forks.ended() == {}
+    assert wait_for_ends(forks, 1) == {"a": "exit code 0"} and forks.ended() == {}
     about = json.loads((tmp_path / "a" / "about").read_text())
     nice = min(19, os.nice(0) + 3)
     assert about == {"leads": True, "nice": nice, "core": [0, 0], "input": "", "signals": [True] * 3}
@@ -82,7 +82,7 @@ def test_fork_that_raises_exits_1_with_traceback_in_log(forks, body, tmp_path):
 
     body(failing)
     forks.start(task(tmp_path))
-    assert ends(forks, 1) == {"a": "exit code 1"}
+    assert wait_for_ends(forks, 1) == {"a": "exit code 1"}
     assert "KeyboardInterrupt: no such thing" in (tmp_path / "a" / "log").read_text()
 
 
@@ -96,9 +96,9 @@ def test_kill_ends_only_named_fork(forks, body, tmp_path):
         forks.start(task(tmp_path, name))
     forks.kill("a")
     forks.kill("nothing")
-    assert ends(forks, 1) == {"a": "killed by SIGKILL"}
+    assert wait_for_ends(forks, 1) == {"a": "killed by SIGKILL"}
     (tmp_path / "b" / "go").touch()
-    assert ends(forks, 1) == {"b": "exit code 0"}
+    assert wait_for_ends(forks, 1) == {"b": "exit code 0"}
 
 
 def is_running(pid: int) -> bool:
@@ -108,7 +108,7 @@ def is_running(pid: int) -> bool:
         return False
 
 
-def noted(path: Path) -> int:
+def wait_for_pid(path: Path) -> int:
     """Wait for the process id that an attempt writes, and return it."""
     deadline = time.monotonic() + 60
     while not path.exists() and time.monotonic() < deadline:
@@ -127,7 +127,7 @@ def test_close_ends_running_forks(body, tmp_path):
     body(endless)
     forks = Forks()
     forks.start(task(tmp_path))
-    pid = noted(tmp_path / "a" / "pid")
+    pid = wait_for_pid(tmp_path / "a" / "pid")
     assert is_running(pid)
     forks.close()
     assert not is_running(pid)
@@ -139,7 +139,7 @@ def test_forks_end_when_pool_process_dies(body, tmp_path):
     if pool == 0:
         Forks().start(task(tmp_path))
         signal.pause()
-    pid = noted(tmp_path / "a" / "pid")
+    pid = wait_for_pid(tmp_path / "a" / "pid")
     os.kill(pool, signal.SIGKILL)
     os.waitpid(pool, 0)
     deadline = time.monotonic() + 60

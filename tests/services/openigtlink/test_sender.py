@@ -95,7 +95,7 @@ def test_client_can_reconnect_after_all_clients_left(runtime):
         for _ in range(2):
             with connected(server) as client:
                 assert client.wait_for_message("theatre", SOON_S) is not None
-            until(lambda: server.clients == 0)
+            wait_until(lambda: server.clients == 0)
 
 
 def test_stalled_client_does_not_slow_other_client(runtime):
@@ -137,7 +137,7 @@ def test_no_picture_state_is_sent_once_per_second(runtime, monkeypatch):
     assert sent == [12, 23, 34]
 
 
-def until(what) -> None:
+def wait_until(what) -> None:
     until_s = time.monotonic() + SOON_S
     while not what():
         assert time.monotonic() < until_s

@@ -22,7 +22,7 @@ from services.reports.build import REMEDIES, require_shown
 CAMERA = Camera.from_focal(60.0, 64, 48)
 
 
-def ended(command, *parts, interrupted=False, wall_s=3.0, stop_reason="end of stream"):
+def run_outcome(command, *parts, interrupted=False, wall_s=3.0, stop_reason="end of stream"):
     """Return the outcome of a run with the given parts."""
     return RunOutcome(
         command=command,
@@ -52,7 +52,7 @@ def withheld(**counts):
     return TrainingCounts(withheld={reason.replace("_", " "): count for reason, count in counts.items()})
 
 
-def sentence(outcome):
+def error_sentence(outcome):
     with pytest.raises(NothingShown) as error:
         require_shown(outcome)
     assert exit_code_of(error.value) == NOTHING_SHOWN == 3
@@ -61,7 +61,7 @@ def sentence(outcome):
 
 def test_nothing_shown_counts_withheld_frames_by_reason_with_remedies():
     gate = OutOfBodyFrames("withhold", 10, {"even light, no red": 30, "not yet certain again": 10})
-    said = sentence(ended("live", source(50), withheld(out_of_body=40, no_tissue=6, blur=4), gate))
+    said = error_sentence(run_outcome("live", source(50), withheld(out_of_body=40, no_tissue=6, blur=4), gate))
     assert said == (
         "nothing was shown: 50 frames came, 50 withheld (out of body, mostly for even light, no red: 40, no tissue: 6, blur: 4);"
         " --out-of-body off lets these frames pass; --tool-mask none takes every pixel for tissue;"
@@ -70,30 +70,30 @@ def test_nothing_shown_counts_withheld_frames_by_reason_with_remedies():
 
 
 def test_nothing_shown_names_remedies_of_occurred_reasons_only():
-    said = sentence(ended("live", source(1), withheld(black=1)))
+    said = error_sentence(run_outcome("live", source(1), withheld(black=1)))
     assert said == "nothing was shown: 1 frame came, 1 withheld (black: 1); check what the source sends"
 
 
 def test_nothing_shown_states_source_state_if_no_frame_came():
-    said = sentence(ended("live", source(0, state_sentence="no data since 3 s"), withheld()))
+    said = error_sentence(run_outcome("live", source(0, state_sentence="no data since 3 s"), withheld()))
     assert said.startswith(
         "nothing was shown: no frame came from theatre 3 in 3.0 s (no data since 3 s); check that it"
     )
-    assert "(end of stream)" in sentence(ended("live", source(0), withheld()))
-    assert sentence(ended("replay", source(0))).endswith("check that it holds frames")
+    assert "(end of stream)" in error_sentence(run_outcome("live", source(0), withheld()))
+    assert error_sentence(run_outcome("replay", source(0))).endswith("check that it holds frames")
 
 
 def test_nothing_shown_if_run_ended_before_first_picture():
-    said = sentence(ended("live", source(3), withheld(), stop_reason="end of the time asked for"))
+    said = error_sentence(run_outcome("live", source(3), withheld(), stop_reason="end of the time asked for"))
     assert "3 frames came, and the run ended before one was on the screen (end of the time asked for)" in said
 
 
 def test_nothing_shown_in_replay_names_frames_withheld_in_recording():
-    said = sentence(ended("replay", source(8, withheld={"out of body": 8}), DisplayResult(0)))
+    said = error_sentence(run_outcome("replay", source(8, withheld={"out of body": 8}), DisplayResult(0)))
     assert said.startswith(
         "nothing was shown: 8 frames came, 8 withheld when they were recorded (out of body: 8); record"
     )
-    assert "check the connection, or the file" in sentence(ended("replay", source(2, damaged=2)))
+    assert "check the connection, or the file" in error_sentence(run_outcome("replay", source(2, damaged=2)))
 
 
 @pytest.mark.parametrize(
@@ -105,13 +105,13 @@ def test_nothing_shown_in_replay_names_frames_withheld_in_recording():
     ],
 )
 def test_require_shown_accepts_run_that_showed_frame(parts):
-    require_shown(ended("live", source(5), withheld(blur=4), *parts))
+    require_shown(run_outcome("live", source(5), withheld(blur=4), *parts))
 
 
 def test_require_shown_accepts_interrupted_run_without_withheld_frames():
-    require_shown(ended("live", source(0), withheld(), interrupted=True))
-    require_shown(ended("live", source(2), withheld(), interrupted=True))
-    assert "withheld (blur: 2)" in sentence(ended("live", source(2), withheld(blur=2), interrupted=True))
+    require_shown(run_outcome("live", source(0), withheld(), interrupted=True))
+    require_shown(run_outcome("live", source(2), withheld(), interrupted=True))
+    assert "withheld (blur: 2)" in error_sentence(run_outcome("live", source(2), withheld(blur=2), interrupted=True))
 
 
 def test_invalid_setting_exits_with_bad_input(capsys):
@@ -150,9 +150,9 @@ def test_every_withholding_reason_has_remedy():
     ("command", "hint"), [("live", "give more --seconds"), ("replay", "check that it holds frames")]
 )
 def test_nothing_shown_if_run_ended_before_source_was_read(command, hint):
-    said = sentence(ended(command, stop_reason="a failure"))
+    said = error_sentence(run_outcome(command, stop_reason="a failure"))
     assert said.startswith("nothing was shown: no frame came from the source in 3.0 s (a failure)") and hint in said
-    assert hint not in sentence(ended("replay", source(2))) and "check the recording" in sentence(
-        ended("replay", source(2))
+    assert hint not in error_sentence(run_outcome("replay", source(2))) and "check the recording" in error_sentence(
+        run_outcome("replay", source(2))
     )
-    assert "give more --seconds, or a smaller --scale" in sentence(ended("live", source(2), withheld()))
+    assert "give more --seconds, or a smaller --scale" in error_sentence(run_outcome("live", source(2), withheld()))

@@ -11,7 +11,7 @@ from services.errors import SettingsInvalid
 from services.settings import _keys, load_settings
 
 
-def refused(file: Path | None = None, flags: dict[str, str] | None = None) -> str:
+def settings_error(file: Path | None = None, flags: dict[str, str] | None = None) -> str:
     with pytest.raises(SettingsInvalid) as error:
         load_settings(file, flags)
     return str(error.value)
@@ -20,22 +20,22 @@ def refused(file: Path | None = None, flags: dict[str, str] | None = None) -> st
 def test_settings_error_names_overriding_source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = tmp_path / "settings.yaml"
     file.write_text("log:\n  level: x\nserver:\n  port: no\n")
-    assert "settings.yaml, line 4: server.port" in refused(file)
+    assert "settings.yaml, line 4: server.port" in settings_error(file)
     monkeypatch.setenv("INTRASPLAT_SERVER__PORT", "seven")
-    assert "INTRASPLAT_SERVER__PORT: server.port" in refused(file)
-    assert "--set server.port: server.port" in refused(file, {"server.port": "none"})
+    assert "INTRASPLAT_SERVER__PORT: server.port" in settings_error(file)
+    assert "--set server.port: server.port" in settings_error(file, {"server.port": "none"})
 
 
 @pytest.mark.parametrize("name", ["server", "server.port.more"])
 def test_settings_error_names_flag_of_section_or_inner_key(name: str) -> None:
     value = "{port: none}" if name == "server" else "1"
-    assert refused(None, {name: value}).startswith(f"--set {name}: server.port")
+    assert settings_error(None, {name: value}).startswith(f"--set {name}: server.port")
 
 
 def test_settings_error_names_file_if_flag_has_longer_name(tmp_path: Path) -> None:
     file = tmp_path / "settings.yaml"
     file.write_text("server:\n  por: 1\n")
-    said = refused(file, {"server.port": "8080"})
+    said = settings_error(file, {"server.port": "8080"})
     assert said.endswith("settings.yaml, line 2: there is no key 'por' in server; the nearest is 'port'")
 
 
@@ -49,7 +49,7 @@ def test_settings_error_names_file_if_flag_has_longer_name(tmp_path: Path) -> No
     ],
 )  # fmt: skip
 def test_settings_error_suggests_nearest_key(flags: dict[str, str], said: str) -> None:
-    assert said in refused(None, flags)
+    assert said in settings_error(None, flags)
 
 
 @pytest.mark.parametrize(
@@ -61,7 +61,7 @@ def test_only_variables_with_prefix_and_section_are_checked(
 ) -> None:
     monkeypatch.setenv(variable, "1")
     if is_refused:
-        assert refused() == f"{variable}: there is no key 'servr'; the nearest is 'server'"
+        assert settings_error() == f"{variable}: there is no key 'servr'; the nearest is 'server'"
     else:
         load_settings()
 

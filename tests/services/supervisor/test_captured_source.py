@@ -57,7 +57,7 @@ def first(source: CapturedSource, capture: StandIn, seq: int = 0, **changes) -> 
     raise AssertionError("no frame came")
 
 
-def until(what) -> None:
+def wait_until(what) -> None:
     until_s = time.monotonic() + SOON_S
     while not what():
         assert time.monotonic() < until_s, "condition not met in time"
@@ -85,13 +85,13 @@ def test_captured_source_continues_numbers_and_times_after_restart(folder):
     source.open()
     last = first(source, capture, seq=100)
     capture.close()
-    until(lambda: source.state is SourceState.RECONNECTING)
+    wait_until(lambda: source.state is SourceState.RECONNECTING)
     assert "capture process" in source.state_sentence
     capture = StandIn(folder, run=2)
     following = first(source, capture, seq=0)
     assert following.seq > last.seq
     assert following.pts_ns > last.pts_ns
-    until(lambda: source.state is SourceState.LIVE)
+    wait_until(lambda: source.state is SourceState.LIVE)
     source.close()
     capture.close()
 
@@ -108,7 +108,7 @@ def test_captured_source_reports_state_of_capture_process(folder, said, state):
     capture.said = {"state": said, "reason": "the cable is out"}
     while source.read(0) is not None:
         pass
-    until(lambda: source.state is state and source.state_sentence == "the cable is out")
+    wait_until(lambda: source.state is state and source.state_sentence == "the cable is out")
     source.close()
     capture.close()
 
@@ -121,9 +121,9 @@ def test_captured_source_counts_malformed_messages(folder, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr("services.bus.messages.encode", lambda frame: [b"nonsense"])
         capture.send(1)
-    until(lambda: source.counts().get("bad_messages") == 1)
+    wait_until(lambda: source.counts().get("bad_messages") == 1)
     capture.publisher.publish({"seq": 1}, np.zeros((4, 6, 3), np.uint8))
-    until(lambda: source.counts().get("bad_messages") == 2)
+    wait_until(lambda: source.counts().get("bad_messages") == 2)
     source.close()
     capture.close()
 

@@ -84,7 +84,7 @@ def show(runtime, monkeypatch):
     models.close()
 
 
-def until(what) -> None:
+def wait_until(what) -> None:
     until_s = time.monotonic() + SOON_S
     while not what():
         assert time.monotonic() < until_s, "condition not met in time"
@@ -102,7 +102,7 @@ def command(bundles, version: int, **more) -> dict:
 def test_pictures_match_model_version_of_their_header(show, bundles):
     for version in (1, 2, 3, 1, 2):
         show.models.show(command(bundles, version))
-        until(lambda version=version: versions(show)[-1:] == [version])
+        wait_until(lambda version=version: versions(show)[-1:] == [version])
     assert {header["model"] for header in show.out.headers} == {"wall"}
     for header, image in zip(show.out.headers, show.out.images, strict=True):
         colour = image.reshape(-1, 3).mean(0)
@@ -116,7 +116,7 @@ def test_show_previous_swaps_current_and_previous_model(show, bundles):
         show.models.show_previous({})
     show.models.show(command(bundles, 2))
     assert show.models.show_previous({}) == {"version": 1}
-    until(lambda: versions(show)[-1:] == [1])
+    wait_until(lambda: versions(show)[-1:] == [1])
     assert show.models.show_previous({}) == {"version": 2}
 
 
@@ -134,9 +134,9 @@ def fails_from_now_on(monkeypatch, version: int) -> None:
 def test_model_with_non_finite_picture_is_replaced_by_previous(show, bundles, monkeypatch):
     show.models.show(command(bundles, 1))
     show.models.show(command(bundles, 2))
-    until(lambda: versions(show)[-1:] == [2])
+    wait_until(lambda: versions(show)[-1:] == [2])
     fails_from_now_on(monkeypatch, 2)
-    until(lambda: versions(show)[-1] == 1)
+    wait_until(lambda: versions(show)[-1] == 1)
     figures = show.models.figures()
     assert figures["model"] == {"name": "wall", "version": 1}
     assert [(each["version"], "not finite" in each["reason"]) for each in figures["gave_way"]] == [(2, True)]
@@ -145,19 +145,19 @@ def test_model_with_non_finite_picture_is_replaced_by_previous(show, bundles, mo
 
 def test_failed_model_without_previous_is_replaced_by_live(show, bundles, monkeypatch):
     show.models.show(command(bundles, 2))
-    until(lambda: versions(show)[-1:] == [2])
+    wait_until(lambda: versions(show)[-1:] == [2])
     fails_from_now_on(monkeypatch, 2)
-    until(lambda: show.screen.wanted == "live")
-    until(lambda: show.models.figures()["model"] is None)
+    wait_until(lambda: show.screen.wanted == "live")
+    wait_until(lambda: show.models.figures()["model"] is None)
     assert not (show.worker.folder.path / "engine.show").exists()
 
 
 def test_model_over_most_ms_is_replaced_by_previous(show, bundles):
     show.models.show(command(bundles, 1))
-    until(lambda: versions(show)[-1:] == [1])
+    wait_until(lambda: versions(show)[-1:] == [1])
     show.models.show(command(bundles, 2, most_ms=1e-6))
-    until(lambda: show.models.figures()["gave_way"])
-    until(lambda: versions(show)[-1] == 1)
+    wait_until(lambda: show.models.figures()["gave_way"])
+    wait_until(lambda: versions(show)[-1] == 1)
     assert versions(show).count(2) <= LATE_IN_A_ROW
     assert "in a row" in show.models.figures()["gave_way"][0]["reason"]
 
@@ -171,17 +171,17 @@ def test_finished_model_picture_raises_for_non_finite_values(bundles):
 
 def test_show_live_keeps_model_until_first_live_picture(show, bundles):
     show.models.show(command(bundles, 1))
-    until(lambda: versions(show)[-1:] == [1])
+    wait_until(lambda: versions(show)[-1:] == [1])
     show.models.show_live({})
     count = len(show.out.headers)
-    until(lambda: len(show.out.headers) > count + 3)  # nothing live is there yet: the model goes on
+    wait_until(lambda: len(show.out.headers) > count + 3)  # nothing live is there yet: the model goes on
     live = {"new": True, "state": "live", "age_ms": 1.0, "model_version": 99, "psnr_db": None}
     assert show.screen.publish("live", live, np.zeros((2, 2, 3), np.uint8))
-    until(lambda: show.models.figures()["model"] is None)
+    wait_until(lambda: show.models.figures()["model"] is None)
     shows = [header["show"] for header in show.out.headers]
     assert shows[shows.index("live") :] == ["live"]
     show.models.show(command(bundles, 2))
-    until(lambda: versions(show)[-1] == 2)
+    wait_until(lambda: versions(show)[-1] == 2)
     assert not show.screen.publish("live", live, np.zeros((2, 2, 3), np.uint8))
 
 

@@ -316,7 +316,7 @@ def test_running_process_with_other_spec_is_replaced(runtime, monkeypatch):
     assert signal.SIGTERM in identity.signals and len(process._start.started) == 1
 
 
-def kept(
+def supervise_ends(
     process: ManagedProcess, monkeypatch: pytest.MonkeyPatch, how: list[str | None], *, other: bool = False
 ) -> Any:
     """Supervise a process through given ends (None: failed start). Return the waits between them in seconds."""
@@ -347,7 +347,7 @@ def kept(
 
 def test_repeated_ends_lengthen_wait_before_restart(runtime, monkeypatch, clock):
     process = managed(runtime)
-    waits = kept(process, monkeypatch, ["signal 9"] * 9)
+    waits = supervise_ends(process, monkeypatch, ["signal 9"] * 9)
     assert waits[0] == 0 and waits[1:] == sorted(waits[1:]) and waits[1] > 0
     assert waits[-1] == waits[-2] == processes.MOST_S
     assert process.causes and sum(process.causes.values()) == 9
@@ -358,9 +358,9 @@ def test_repeated_ends_lengthen_wait_before_restart(runtime, monkeypatch, clock)
 def test_process_that_ran_well_is_restarted_immediately(runtime, monkeypatch, clock):
     process = managed(runtime)
     process._well_s = clock.s - 3600
-    assert kept(process, monkeypatch, ["signal 9"]) == [0.0]
+    assert supervise_ends(process, monkeypatch, ["signal 9"]) == [0.0]
     assert process.state.state == "down"
-    assert kept(managed(runtime), monkeypatch, [None])[0] == 0.0
+    assert supervise_ends(managed(runtime), monkeypatch, [None])[0] == 0.0
 
 
 def test_unrecoverable_end_reports_last_words_of_log(runtime, monkeypatch, clock):
@@ -368,10 +368,10 @@ def test_unrecoverable_end_reports_last_words_of_log(runtime, monkeypatch, clock
     process._folder.log("engine").write_text("Traceback\nValueError: the last words\n", encoding="utf-8")
     monkeypatch.setattr(processes, "is_of_no_use", lambda how: True)
     monkeypatch.setattr(processes, "last_words", lambda log: log.read_text().splitlines()[-1])
-    assert kept(process, monkeypatch, ["exit code 2"]) == [processes.MOST_S]
+    assert supervise_ends(process, monkeypatch, ["exit code 2"]) == [processes.MOST_S]
     assert process.state.state == "failed" and process.state.reason == "ValueError: the last words"
     monkeypatch.setattr(processes, "last_words", lambda log: None)
-    assert kept(process, monkeypatch, ["exit code 2"]) == [processes.MOST_S]
+    assert supervise_ends(process, monkeypatch, ["exit code 2"]) == [processes.MOST_S]
     assert process.state.reason == "exit code 2"
 
 

@@ -71,7 +71,7 @@ def parts():
     )
 
 
-def looks(parts, times=1):
+def show_active_times(parts, times=1):
     async def look():
         for _ in range(times):
             await parts.models.show_active(parts.stream)
@@ -80,13 +80,13 @@ def looks(parts, times=1):
 
 
 def test_show_active_sends_command_only_for_new_version_or_engine(parts):
-    looks(parts, 3)
+    show_active_times(parts, 3)
     assert parts.engine.asked == [("show_model", "/models/wall/1")]
     parts.registry.current = 2
-    looks(parts, 2)
+    show_active_times(parts, 2)
     assert parts.engine.asked[1:] == [("show_model", "/models/wall/2")]
     parts.engine.figures = {"model": None, "gave_way": []}
-    looks(parts, 2)
+    show_active_times(parts, 2)
     assert len(parts.engine.asked) == 3
 
 
@@ -100,36 +100,36 @@ def test_show_active_sends_no_command_if_live_stopped_or_inactive(parts, why):
         parts.engine.engine_state = "starting"
     else:
         parts.registry.current = None
-    looks(parts)
+    show_active_times(parts)
     assert parts.engine.asked == []
 
 
 def test_version_given_up_by_engine_is_rolled_back_once(parts):
     parts.registry.current = 2
-    looks(parts)
+    show_active_times(parts)
     parts.engine.gives_up(2, "its picture is not finite", instead=1)
-    looks(parts, 3)
+    show_active_times(parts, 3)
     assert parts.registry.rolled_back == [("wall", "engine", 2, "its picture is not finite")]
     assert parts.registry.current == 1 and len(parts.engine.asked) == 1
     parts.registry.current = 2
-    looks(parts, 3)
+    show_active_times(parts, 3)
     assert len(parts.registry.rolled_back) == 1 and parts.engine.asked[-1][1] == "/models/wall/2"
     parts.engine.gives_up(2, "it took 300.0 ms", instead=1)
-    looks(parts)
+    show_active_times(parts)
     assert len(parts.registry.rolled_back) == 2
 
 
 def test_first_version_given_up_by_engine_raises_conflict(parts):
-    looks(parts)
+    show_active_times(parts)
     parts.engine.gives_up(1, "its picture is not finite", instead=None)
     with pytest.raises(Conflict):
-        looks(parts)
+        show_active_times(parts)
 
 
 def test_show_active_does_not_repeat_refused_command(parts):
     parts.engine.refuses = True
     with pytest.raises(CommandRefused):
-        looks(parts)
+        show_active_times(parts)
 
     async def look_twice():
         with pytest.raises(CommandRefused):
@@ -141,7 +141,7 @@ def test_show_active_does_not_repeat_refused_command(parts):
     assert len(parts.engine.asked) == 2
 
 
-def follows(parts, times):
+def follow_times(parts, times):
     async def follow():
         for _ in range(times):
             await parts.models.follow(parts.stream)
@@ -151,15 +151,15 @@ def follows(parts, times):
 
 def test_model_fault_is_kept_and_logged_once(parts, caplog):
     parts.registry.active = lambda name: (_ for _ in ()).throw(NotFound(f"there is no model {name!r}"))
-    follows(parts, 5)
+    follow_times(parts, 5)
     assert parts.stream.model_fault == "there is no model 'wall'"
     assert caplog.text.count("there is no model 'wall'") == 1
     del parts.registry.active
     parts.registry.current = None
-    follows(parts, 1)
+    follow_times(parts, 1)
     assert parts.stream.model_fault == "no version of 'wall' is active; activate one"
     parts.registry.current = 1
-    follows(parts, 2)
+    follow_times(parts, 2)
     assert parts.stream.model_fault is None
 
 

@@ -37,7 +37,7 @@ def spec(address: str = SMALL, **limits) -> ProcessSpec:
     return ProcessSpec(stream="a", capture=SourceSpec(address=address), limits=ProcessLimits(**limits))
 
 
-async def until(what) -> None:
+async def wait_until(what) -> None:
     async with asyncio.timeout(SOON_S):
         while not what():
             await asyncio.sleep(0.02)
@@ -89,10 +89,10 @@ def test_killed_capture_is_restarted_with_reason(runtime):
         events: list[StreamEvent] = []
         async with capturing(runtime, events) as capture:
             headers = Headers(runtime.stream("a").pictures("capture"))
-            await until(lambda: capture.state.state == "live" and headers.seen)
+            await wait_until(lambda: capture.state.state == "live" and headers.seen)
             pid, run = capture.state.pid, headers.seen[-1]["run"]
             kill(pid)
-            await until(lambda: headers.seen[-1]["run"] != run)
+            await wait_until(lambda: headers.seen[-1]["run"] != run)
             assert capture.state.pid != pid and capture.state.restarts == 1
             assert [event.kind for event in events] == ["started", "ended", "started"]
             assert "SIGKILL" in events[1].reason
@@ -107,10 +107,10 @@ def test_hung_capture_is_replaced(runtime):
     async def scenario() -> None:
         events: list[StreamEvent] = []
         async with capturing(runtime, events, heartbeat_s=1.0) as capture:
-            await until(lambda: capture.state.state == "live")
+            await wait_until(lambda: capture.state.state == "live")
             pid = capture.state.pid
             kill(pid, signal.SIGSTOP)
-            await until(lambda: capture.state.pid not in (pid, None) and capture.state.state == "live")
+            await wait_until(lambda: capture.state.pid not in (pid, None) and capture.state.state == "live")
             assert "said nothing" in next(event.reason for event in events if event.kind == "ended")
 
     asyncio.run(scenario())
@@ -121,7 +121,7 @@ def test_capture_with_missing_file_fails_with_its_path(runtime):
         wrong = spec("/nowhere/to/be/found.mp4")
         process = ManagedProcess(wrong, runtime.stream("a"), Direct(), lambda event: None)
         process.open()
-        await until(lambda: process.state.state == "failed")
+        await wait_until(lambda: process.state.state == "failed")
         assert "/nowhere/to/be/found.mp4" in process.state.reason
         await process.close("over")
 
@@ -212,22 +212,22 @@ def test_processes_survive_kills_of_control_plane_and_each_other(runtime, bundle
         specs = specs_of("a", settings, ProcessLimits(orphan_after_s=600.0))
         stream = Stream(settings, specs, runtime, start=launcher, on_event=events.append)
         try:
-            await until(lambda: len(shown.seen) > 3)
+            await wait_until(lambda: len(shown.seen) > 3)
 
             # The control plane is killed: both processes go on, and the next one adopts them.
             before = {role: folder.record(role) for role in ("capture", "engine")}
             control.kill()
             control.wait()
             seen = len(shown.seen)
-            await until(lambda: len(shown.seen) > seen + 3)
+            await wait_until(lambda: len(shown.seen) > seen + 3)
             launcher.open()
             await stream.start()
-            await until(lambda: stream.engine.state.state == "running" and stream.capture.state.state == "live")
+            await wait_until(lambda: stream.engine.state.state == "running" and stream.capture.state.state == "live")
             assert {event.role: event.kind for event in events} == {"capture": "adopted", "engine": "adopted"}
             for role, record in before.items():
                 assert record is not None and stream.processes[role].state.pid == record.identity.pid
             assert (await stream.engine.command("ping"))["pid"] == stream.engine.state.pid
-            await until(launcher.ready.is_set)
+            await wait_until(launcher.ready.is_set)
 
             # The engine is killed twice: raw pictures go on, and it comes back.
             raw.seen.clear()
@@ -235,7 +235,7 @@ def test_processes_survive_kills_of_control_plane_and_each_other(runtime, bundle
                 pid = stream.engine.state.pid
                 kill(pid)
                 at_ns = time.monotonic_ns()
-                await until(lambda at_ns=at_ns: shown.seen[-1]["arrived_ns"] > at_ns)
+                await wait_until(lambda at_ns=at_ns: shown.seen[-1]["arrived_ns"] > at_ns)
                 assert stream.engine.state.pid != pid
             assert of_one_process(raw.seen)
             assert [event.kind for event in events if event.role == "engine"][1:] == ["ended", "started"] * 2
@@ -247,9 +247,9 @@ def test_processes_survive_kills_of_control_plane_and_each_other(runtime, bundle
             for _ in range(2):
                 run = raw.seen[-1]["run"]
                 kill(stream.capture.state.pid)
-                await until(lambda run=run: raw.seen[-1]["run"] != run)
-            await until(lambda: any(header["state"] == "source lost" for header in shown.seen[seen:]))
-            await until(lambda: shown.seen[-1]["state"] != "source lost")
+                await wait_until(lambda run=run: raw.seen[-1]["run"] != run)
+            await wait_until(lambda: any(header["state"] == "source lost" for header in shown.seen[seen:]))
+            await wait_until(lambda: shown.seen[-1]["state"] != "source lost")
             assert stream.engine.state.pid == pid
             numbers = [header["seq"] for header in shown.seen[seen:] if header["new"]]
             assert numbers == sorted(numbers)
@@ -257,14 +257,14 @@ def test_processes_survive_kills_of_control_plane_and_each_other(runtime, bundle
             # A finished model takes over from the live reconstruction, outlasts the engine, and gives way again.
             answer = await stream.engine.command("show_model", timeout_s=SOON_S, folder=str(bundle), version=7)
             assert answer["version"] == 7
-            await until(lambda: shown.seen[-1]["show"] == "model")
+            await wait_until(lambda: shown.seen[-1]["show"] == "model")
             kill(stream.engine.state.pid)
             at_ns, seen = time.monotonic_ns(), len(shown.seen)
-            await until(lambda: shown.seen[-1]["arrived_ns"] > at_ns)
+            await wait_until(lambda: shown.seen[-1]["arrived_ns"] > at_ns)
             assert {(each["show"], each["model_version"]) for each in shown.seen[seen:]} == {("model", 7)}
-            await until(lambda: stream.engine.state.state == "running")
+            await wait_until(lambda: stream.engine.state.state == "running")
             await stream.engine.command("show_live")
-            await until(lambda: shown.seen[-1]["show"] == "live")
+            await wait_until(lambda: shown.seen[-1]["show"] == "live")
 
             # Everything is ended: nothing is left.
             pids = [stream.engine.state.pid, stream.capture.state.pid]
@@ -290,7 +290,7 @@ def test_state_and_log_omit_password_of_source_address(runtime, what):
     async def scenario() -> None:
         process = ManagedProcess(secret, runtime.stream("a"), Direct(), lambda event: None)
         process.open()
-        await until(lambda: process.state.state == "opening")
+        await wait_until(lambda: process.state.state == "opening")
         said = json.dumps([process.state.reason, *map(str, process.state.figures.items())])
         log = runtime.stream("a").log("capture").read_text()
         await process.close("over")
