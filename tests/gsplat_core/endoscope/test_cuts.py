@@ -34,7 +34,7 @@ def verdicts(images, withheld=()):
 @pytest.mark.parametrize("name", PLACES)
 @pytest.mark.parametrize("every", [1, 4, 8])
 @pytest.mark.slow
-def test_no_recording_has_a_cut_even_with_frames_left_out(recordings_dir, name, every):
+def test_cut_detector_reports_no_cut_in_recordings_with_omitted_frames(recordings_dir, name, every):
     assert verdicts(clip(recordings_dir, name)[::every]) == {}
 
 
@@ -71,13 +71,13 @@ EVENTS = {
 @pytest.mark.recordings
 @pytest.mark.parametrize("name", PLACES)
 @pytest.mark.parametrize("event", EVENTS)
-def test_what_happens_in_a_scene_is_no_cut(recordings_dir, name, event):
+def test_cut_detector_ignores_events_within_scene(recordings_dir, name, event):
     assert verdicts(EVENTS[event](clip(recordings_dir, name)[:24])) == {}
 
 
 @pytest.mark.recordings
 @pytest.mark.parametrize("first, second", OTHERS)
-def test_a_splice_and_the_way_back_are_cuts(recordings_dir, first, second):
+def test_cut_detector_reports_splice_and_return_as_cuts(recordings_dir, first, second):
     before = list(clip(recordings_dir, first)[:20])
     between = resized(clip(recordings_dir, second)[5:20], before[0])
     found = verdicts([*before, *between, *before[10:]])
@@ -86,7 +86,7 @@ def test_a_splice_and_the_way_back_are_cuts(recordings_dir, first, second):
 
 @pytest.mark.recordings
 @pytest.mark.parametrize("first, second", OTHERS)
-def test_another_scene_after_withheld_frames_is_a_cut_and_the_same_one_is_not(recordings_dir, first, second):
+def test_cut_detector_after_withheld_frames_reports_only_different_scene(recordings_dir, first, second):
     before = list(clip(recordings_dir, first))
     other = resized(clip(recordings_dir, second)[5:20], before[0])
     assert verdicts([*before[:20], *other], range(15, 24)) == {24: "in doubt", 25: "cut"}
@@ -95,19 +95,19 @@ def test_another_scene_after_withheld_frames_is_a_cut_and_the_same_one_is_not(re
 
 @pytest.mark.recordings
 @pytest.mark.parametrize("name", PLACES)
-def test_one_odd_frame_is_no_cut(recordings_dir, name):
+def test_cut_detector_marks_single_noise_frame_in_doubt_only(recordings_dir, name):
     images, noise = list(clip(recordings_dir, name)[:20]), np.random.default_rng(0)
     images[10] = noise.integers(0, 256, images[10].shape, np.uint8)
     assert verdicts(images) == {10: "in doubt"}
 
 
-def test_scenes_that_change_with_every_frame_are_cut_after_a_while():
+def test_cut_detector_reports_cut_after_six_unrelated_frames():
     rng = np.random.default_rng(0)
     unrelated = [rng.integers(0, 256, (48, 64, 3), np.uint8) for _ in range(7)]
     assert list(verdicts([*texture(1, 5, 64, 48), *unrelated]).values()) == ["in doubt"] * 6 + ["cut"]
 
 
-def test_a_frame_like_a_kept_view_of_the_scene_is_not_in_doubt():
+def test_cut_detector_accepts_frame_similar_to_kept_view():
     present, elsewhere = texture(1, 40, 64, 48), texture(2, 1, 64, 48)
     assert verdicts([*present, *elsewhere, present[14]]) == {40: "in doubt"}
     detector = CutDetector()
@@ -118,7 +118,7 @@ def test_a_frame_like_a_kept_view_of_the_scene_is_not_in_doubt():
     assert (verdict.new_scene, verdict.in_doubt) == (None, False)
 
 
-def test_the_frame_that_confirms_a_cut_is_compared_with_two_frames_only(monkeypatch):
+def test_cut_detector_compares_confirming_frame_with_two_frames_only(monkeypatch):
     """It is displayed, and comparing it with all kept views would delay its picture."""
     detector = CutDetector()
     for k, image in enumerate([*texture(1, 80, 64, 48), texture(2, 2, 64, 48)[0]]):
@@ -130,25 +130,25 @@ def test_the_frame_that_confirms_a_cut_is_compared_with_two_frames_only(monkeypa
     assert len(compared) == 2
 
 
-def test_a_stream_of_unrelated_pictures_passes_after_a_while(rng):
+def test_cut_detector_eventually_accepts_stream_of_unrelated_frames(rng):
     pictures = [rng.integers(0, 256, (48, 64, 3), np.uint8) for _ in range(30)]
     detector = CutDetector()
     doubts = [detector.observe(picture, k, k * FRAME_NS).in_doubt for k, picture in enumerate(pictures)]
     assert doubts == [False, *[True] * 6, False, *[True] * 3, False, True, *[False] * 17]
 
 
-def test_at_a_low_rate_a_cut_is_in_doubt_for_a_quarter_of_a_second(rng):
+def test_cut_detector_at_low_frame_rate_is_in_doubt_for_quarter_second(rng):
     pictures = [rng.integers(0, 256, (48, 64, 3), np.uint8) for _ in range(4)]
     detector = CutDetector()
     doubts = [detector.observe(picture, k, k * 200_000_000).in_doubt for k, picture in enumerate(pictures)]
     assert doubts == [False, True, True, False]
 
 
-def test_another_size_is_a_new_scene_at_once():
+def test_cut_detector_starts_new_scene_at_size_change():
     assert verdicts([*texture(1, 5), *texture(1, 5, 120, 90)]) == {5: "resized"}
 
 
-def test_another_frame_rate_is_a_new_scene_and_lost_frames_are_not():
+def test_frame_rate_detects_rate_change_but_not_lost_frames():
     rate = FrameRate()
     every = [rate.changed(k, k * 40) for k in range(60)]
     lossy = [rate.changed(60 + 3 * k, 2400 + 120 * k) for k in range(40)]
@@ -157,7 +157,7 @@ def test_another_frame_rate_is_a_new_scene_and_lost_frames_are_not():
     assert sum(later) == 1
 
 
-def test_an_unsteady_clock_is_no_other_frame_rate():
+def test_frame_rate_ignores_clock_jitter():
     rate, rng, now = FrameRate(), np.random.default_rng(0), 0
     found = []
     for k in range(500):
@@ -169,7 +169,7 @@ def test_an_unsteady_clock_is_no_other_frame_rate():
 @pytest.mark.slow
 @settings(deadline=None, max_examples=40)
 @given(st.integers(1, 40), st.integers(1, 40), st.integers(0, 2**32))
-def test_no_picture_of_any_size_raises(height, width, seed):
+def test_cut_detector_accepts_images_of_any_size(height, width, seed):
     rng = np.random.default_rng(seed)
     shapes = [(height, width, 3), (width, height, 3)]
     images = [rng.integers(0, rng.integers(1, 257), shapes[k // 4], np.uint8) for k in range(8)]
@@ -183,7 +183,7 @@ def test_no_picture_of_any_size_raises(height, width, seed):
 @pytest.mark.parametrize(
     ("usual", "now", "is_other"), [(10, 14, False), (10, 15, True), (14, 10, False), (14, 9, True), (10, 10, False)]
 )
-def test_a_rate_is_another_one_beyond_a_factor_of_1_4(usual, now, is_other, monkeypatch):
+def test_frame_rate_changes_beyond_factor_1_4(usual, now, is_other, monkeypatch):
     monkeypatch.setattr(changes, "RATE_FRAMES", 3)
     rate, seq, at = FrameRate(), 0, 0
     said = [rate.changed(seq, at)]
@@ -208,12 +208,12 @@ def likeness_of(monkeypatch, difference, structure=0.0, moved=0.0, colours=0.0):
         ({"difference": 0.201, "colours": 0.65}, True, False), ({"difference": 0.2, "colours": 0.649}, True, False),
     ],
 )  # fmt: skip
-def test_limits_of_the_same_scene(monkeypatch, found, gap, same):
+def test_cut_detector_same_scene_thresholds(monkeypatch, found, gap, same):
     likeness_of(monkeypatch, **found)
     assert CutDetector()._same(None, None, gap) == same
 
 
-def test_six_frames_like_no_other_are_in_doubt_and_the_seventh_is_a_cut(monkeypatch):
+def test_cut_detector_doubts_six_unmatched_frames_and_cuts_at_seventh(monkeypatch):
     likeness_of(monkeypatch, 1.0)
     detector, image = CutDetector(), np.zeros((32, 40, 3), np.uint8)
     said = [detector.observe(image, k, k * FRAME_NS) for k in range(9)]
@@ -221,7 +221,7 @@ def test_six_frames_like_no_other_are_in_doubt_and_the_seventh_is_a_cut(monkeypa
     assert said[7].new_scene == "cut"
 
 
-def test_every_fifteenth_frame_is_a_view_of_its_scene_and_four_are_kept(monkeypatch):
+def test_cut_detector_keeps_every_fifteenth_frame_up_to_four_views(monkeypatch):
     likeness_of(monkeypatch, 0.0)
     detector, image = CutDetector(), np.zeros((32, 40, 3), np.uint8)
     counts = []
@@ -232,7 +232,7 @@ def test_every_fifteenth_frame_is_a_view_of_its_scene_and_four_are_kept(monkeypa
     assert (detector._views.maxlen, detector._rate._recent.maxlen) == (4, 15)
 
 
-def test_colours_agree_by_the_share_of_pixels_of_equal_hue():
+def test_colours_returns_share_of_pixels_with_equal_hue():
     """Half of each picture is red, the other half green or blue."""
     red, green, blue = (220, 60, 60), (60, 220, 60), (60, 60, 220)
 
@@ -246,7 +246,7 @@ def test_colours_agree_by_the_share_of_pixels_of_equal_hue():
     assert changes.colours(view(red, green), view(red, blue)) == pytest.approx(0.5)
 
 
-def test_structure_is_that_of_the_blocks_up_to_a_shift_of_eight_pixels():
+def test_structure_matches_blocks_shifted_by_up_to_eight_pixels():
     """Blocks of a shifted picture are found again, those of other tissue are not, and a flat picture has none."""
     image = texture(1, 1, 200, 160)[0]
     one, shifted = image[:128, :160], image[4:132, 6:166]
@@ -257,7 +257,7 @@ def test_structure_is_that_of_the_blocks_up_to_a_shift_of_eight_pixels():
     assert changes.structure(changes.View(np.full_like(one, 120)), changes.View(one)) == 0
 
 
-def test_a_quarter_that_moved_far_is_found_anywhere():
+def test_moved_finds_quarter_of_image_after_large_motion():
     image = texture(1, 1, 260, 208)[0]
     one, moved = changes.View(image[:128, :160]), changes.View(image[60:188, 76:236])
     assert changes.moved(one, moved) == changes.moved(moved, one) > 0.8

@@ -55,14 +55,14 @@ FIELDS = {
 
 @pytest.mark.parametrize("shape", FIELDS)
 @pytest.mark.parametrize("level", [0, 22])
-def test_a_field_is_found_in_the_first_frame_and_stays(shape, level):
+def test_field_of_view_found_in_first_frame_and_kept(shape, level):
     found = masks(seen_through(FIELDS[shape], count=65, level=level))
     assert overlap(found[0], FIELDS[shape]) > 0.92
     assert (found[0].astype(bool) & ~FIELDS[shape]).mean() < 0.004
     assert found[-1] is found[0]
 
 
-def test_video_that_fills_the_picture_has_no_limited_field():
+def test_field_of_view_full_frame_video_has_no_mask():
     assert set(map(type, masks(texture(2, 65, WIDTH, HEIGHT)))) == {type(None)}
 
 
@@ -73,20 +73,20 @@ def dark_cave(image, centre, radius=50):
 
 
 @pytest.mark.parametrize("centre", [(160, 128), (200, 60), (260, 128)])
-def test_a_dark_cave_in_the_middle_or_at_the_rim_takes_nothing_away(centre):
+def test_field_of_view_keeps_dark_cavity_inside_round_view(centre):
     found = masks([dark_cave(image, centre) for image in seen_through(disc(), count=65)])
     assert overlap(found[-1], disc()) > 0.91
 
 
 @pytest.mark.parametrize("centre", [(160, 128), (0, 128), (320, 256)])
-def test_a_dark_cave_in_a_full_picture_is_no_surround(centre):
+def test_field_of_view_ignores_dark_cavity_in_full_frame(centre):
     images = [dark_cave(image, centre, 90) for image in texture(3, 65, WIDTH, HEIGHT)]
     assert masks(images)[-1] is None
 
 
 @pytest.mark.parametrize("turned", range(4))
 @pytest.mark.parametrize("width", [60, 120, 200])
-def test_lit_tissue_beside_a_black_corner_is_never_left_out(turned, width):
+def test_field_of_view_keeps_lit_tissue_beside_black_corner(turned, width):
     """A black corner and one that is cut off by a curve: an ellipse through both rims would leave out half of a lit picture."""
     y, x = np.mgrid[:HEIGHT, :WIDTH]
     black = x / WIDTH - y / HEIGHT > 1 - width / WIDTH
@@ -110,17 +110,17 @@ def rendered_bowel(seed):
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_dark_folds_from_edge_to_edge_cut_no_lit_tissue_off(seed):
+def test_field_of_view_keeps_lit_tissue_beyond_dark_folds(seed):
     mask = masks([rendered_bowel(seed)])[0]
     assert mask is None or mask[180:, :60].all()
 
 
-def test_a_field_that_is_gone_is_gone_with_the_next_picture_that_is_lit_outside_of_it():
+def test_field_of_view_dropped_at_first_image_lit_outside():
     found = masks([*seen_through(disc(radius=90), count=12), *texture(4, 2, WIDTH, HEIGHT)])
     assert found[11] is not None and found[12] is None
 
 
-def test_text_that_appears_in_the_surround_leaves_the_field_as_it_is():
+def test_field_of_view_unchanged_by_text_appearing_in_surround():
     images = seen_through(disc(), count=70)
     for image in images[20:]:
         image[4:60, 4:40] = 220
@@ -132,7 +132,7 @@ def test_text_that_appears_in_the_surround_leaves_the_field_as_it_is():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("colour", [(10, 10, 12), (190, 195, 200)])
-def test_a_tool_at_the_rim_takes_nothing_away(colour):
+def test_field_of_view_unchanged_by_tool_at_rim(colour):
     images = seen_through(disc(), count=95)
     for image in images[20:]:
         tool = np.zeros((HEIGHT, WIDTH), bool)
@@ -141,7 +141,7 @@ def test_a_tool_at_the_rim_takes_nothing_away(colour):
     assert overlap(masks(images)[-1], disc()) > 0.91
 
 
-def test_text_in_the_surround_is_not_in_the_field():
+def test_field_of_view_excludes_text_in_surround():
     images = seen_through(disc(), count=35)
     for image in images:
         cv2.putText(image, "12:34", (4, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1)
@@ -149,7 +149,7 @@ def test_text_in_the_surround_is_not_in_the_field():
 
 
 @pytest.mark.slow
-def test_a_larger_field_is_taken_soon_and_a_smaller_one_after_a_while():
+def test_field_of_view_grows_soon_and_shrinks_late():
     small, large = disc(radius=80), disc(radius=120)
     found = masks([*seen_through(small, count=60), *seen_through(large, count=60), *seen_through(small, count=150)])
     assert overlap(found[59], small) > 0.91 and overlap(found[119], large) > 0.92
@@ -157,12 +157,12 @@ def test_a_larger_field_is_taken_soon_and_a_smaller_one_after_a_while():
 
 
 @pytest.mark.slow
-def test_a_field_that_is_gone_is_gone_after_a_while():
+def test_field_of_view_removed_after_sustained_full_frame_video():
     found = masks([*seen_through(disc(), count=30), *texture(4, 160, WIDTH, HEIGHT)])
     assert found[29] is not None and found[-1] is None
 
 
-def test_another_size_is_looked_at_anew():
+def test_field_of_view_recomputed_after_size_change():
     other = disc((64, 64), 60, 128, 128)
     view = FieldOfView()
     for image in [*seen_through(disc(), count=5), *seen_through(other, count=5)]:
@@ -171,14 +171,14 @@ def test_another_size_is_looked_at_anew():
 
 
 @pytest.mark.recordings
-def test_in_sinus_it_is_the_valid_mask(recordings_dir):
+def test_field_of_view_of_sinus_equals_valid_mask(recordings_dir):
     valid = cv2.imread(str(recordings_dir / "sinus" / "valid_mask.png"), cv2.IMREAD_GRAYSCALE) > 0
     found = masks(clip(recordings_dir, "sinus"))
     assert overlap(found[0], valid) > 0.95 and overlap(found[-1], valid) > 0.95
 
 
 @pytest.mark.recordings
-def test_in_colon_the_four_corners_are_left_out(recordings_dir):
+def test_field_of_view_of_colon_excludes_four_corners(recordings_dir):
     mask = masks(clip(recordings_dir, "colon"))[-1]
     assert 0.85 < mask.mean() < 0.93
     assert not mask[[2, 2, -3, -3], [2, -3, 2, -3]].any() and mask[[0, 223, 223, 445], [223, 0, 445, 223]].all()
@@ -186,7 +186,7 @@ def test_in_colon_the_four_corners_are_left_out(recordings_dir):
 
 @pytest.mark.recordings
 @pytest.mark.parametrize("name", ["cutting", "heart", "resting_bowel", "laparoscopy", "stereomis_like"])
-def test_recordings_that_fill_the_picture_have_none(recordings_dir, name):
+def test_field_of_view_of_full_frame_recordings_is_none(recordings_dir, name):
     assert set(map(type, masks(clip(recordings_dir, name)))) == {type(None)}
 
 
@@ -195,14 +195,14 @@ def test_recordings_that_fill_the_picture_have_none(recordings_dir, name):
     "name",
     ["hamlyn_pair/f7_dynamic_deint_L_0100.png", "hamlyn_pair/f7_dynamic_deint_R_0100.png", "scared_pair/left.png"],
 )
-def test_a_dark_surrounding_of_the_tissue_is_no_field(recordings_dir, name):
+def test_field_of_view_ignores_dark_surroundings_of_tissue(recordings_dir, name):
     image = cv2.imread(str(recordings_dir / name))
     assert masks([image] * 3)[-1] is None
 
 
 @settings(deadline=None, max_examples=40)
 @given(st.integers(1, 40), st.integers(1, 40), st.integers(0, 2**32))
-def test_no_picture_of_any_size_raises(height, width, seed):
+def test_field_of_view_accepts_images_of_any_size(height, width, seed):
     rng = np.random.default_rng(seed)
     view = FieldOfView()
     with pytest.MonkeyPatch.context() as patch:
@@ -215,7 +215,7 @@ def test_no_picture_of_any_size_raises(height, width, seed):
 
 
 @pytest.mark.parametrize(("windows", "is_taken"), [(1, False), (2, False), (3, True)])
-def test_a_smaller_field_is_accepted_after_three_windows(monkeypatch, windows, is_taken):
+def test_field_of_view_shrinks_after_three_windows(monkeypatch, windows, is_taken):
     monkeypatch.setattr(artefacts, "WINDOW_FRAMES", 2)
     large, small = disc(radius=120), disc(radius=80)
     # The first frame is a window of its own, and the window after a change still contains frames before it.
@@ -224,7 +224,7 @@ def test_a_smaller_field_is_accepted_after_three_windows(monkeypatch, windows, i
     assert overlap(found[-1], small if is_taken else large) > 0.9
 
 
-def test_a_window_of_thirty_frames_is_judged_by_the_brightest_and_darkest_level_of_each_pixel(monkeypatch):
+def test_field_of_view_uses_pixel_extremes_of_thirty_frame_windows(monkeypatch):
     judged = []
     monkeypatch.setattr(artefacts, "find_outline", lambda *levels: judged.append(levels))
     view, levels = FieldOfView(), np.random.default_rng(0).integers(30, 220, (61, 12, 16))
@@ -245,7 +245,7 @@ def polygon(corners, radii=(100.0, 90.0), centre=(160.0, 128.0)):
 
 
 @pytest.mark.parametrize("radii", [(100.0, 90.0), (90.0, 100.0), (150.0, 140.0)])
-def test_a_round_outline_becomes_the_ellipse_within_its_bounding_box(radii):
+def test_as_ellipse_turns_round_outline_into_inscribed_ellipse(radii):
     """The hull of 24 corners is at most 0.9 % of the radius inside of the ellipse."""
     hull = polygon(24, radii)
     hull = np.clip(hull, 0, [WIDTH - 1, HEIGHT - 1])  # a larger field is cut off by the picture
@@ -267,12 +267,12 @@ def test_a_round_outline_becomes_the_ellipse_within_its_bounding_box(radii):
     ],
     ids=["rectangle", "triangle", "long", "small"],
 )
-def test_another_outline_stays_as_it_is(hull):
+def test_as_ellipse_keeps_other_outlines(hull):
     assert artefacts._as_ellipse(hull, (HEIGHT, WIDTH)) is hull
 
 
 @pytest.mark.parametrize(("dented", "is_round"), [(0.2, True), (0.5, False)])
-def test_an_ellipse_needs_seven_tenths_of_the_outline(dented, is_round):
+def test_as_ellipse_requires_seven_tenths_of_outline(dented, is_round):
     """A straight side cuts off a share of the outline."""
     angles = np.linspace(-np.pi * (1 - dented), np.pi * (1 - dented), 200)
     hull = np.stack([160 + 100 * np.cos(angles), 128 + 100 * np.sin(angles)], 1)
@@ -317,7 +317,7 @@ WIDE, NARROW, OTHER = box(0.1, 0.9), box(0.2, 0.8), box(0.3, 0.7)
     ],
     ids=["smaller", "interrupted", "inconsistent", "larger", "joined", "gone", "appears", "nearly the same", "hardly larger"],
 )  # fmt: skip
-def test_a_field_grows_at_once_and_shrinks_after_three_consistent_windows(monkeypatch, outlines, taken):
+def test_field_of_view_grows_at_once_and_shrinks_after_three_equal_windows(monkeypatch, outlines, taken):
     found, view = decided(monkeypatch, outlines)
     expected = [(0, 159) if each is None else (round(160 * each[0, 0]), round(160 * each[1, 0]) - 1) for each in taken]
     assert np.abs(np.array(found) - expected).max() <= 1
@@ -328,7 +328,7 @@ def test_a_field_grows_at_once_and_shrinks_after_three_consistent_windows(monkey
 @pytest.mark.parametrize(
     ("level", "share", "is_more"), [(52, 0.5, False), (53, 0.5, True), (200, 0.24, False), (200, 0.26, True)]
 )
-def test_a_picture_that_is_lit_outside_shows_more(level, share, is_more):
+def test_shows_more_requires_lit_share_outside_field(level, share, is_more):
     view = FieldOfView()
     view._reduced = np.zeros((10, 100), bool)
     view._reduced[5:] = True
@@ -340,7 +340,7 @@ def test_a_picture_that_is_lit_outside_shows_more(level, share, is_more):
 
 
 @pytest.mark.parametrize(("size", "margin"), [((160, 320), 3), ((40, 45), 0), ((60, 80), 1)])
-def test_a_hundredth_of_the_longer_side_is_left_out_except_at_the_pictures_edge(monkeypatch, size, margin):
+def test_field_of_view_margin_is_hundredth_of_longer_side_except_at_border(monkeypatch, size, margin):
     view = FieldOfView()
     monkeypatch.setattr(artefacts, "find_outline", lambda *_: box(0.25, 1.0))
     mask = view.observe(np.full((*size, 3), 90, np.uint8))
@@ -350,7 +350,7 @@ def test_a_hundredth_of_the_longer_side_is_left_out_except_at_the_pictures_edge(
     assert not mask[:, : round(0.25 * size[1]) + margin - 1].any()
 
 
-def test_a_recording_s_field_is_all_that_the_scope_saw():
+def test_seen_in_recording_is_union_of_all_windows():
     """A field found in the first picture alone does not count once there is a whole window."""
     small, large = disc(radius=80), disc(radius=120)
     pictures = seen_through(small, count=1) + seen_through(large, count=40)
@@ -363,7 +363,7 @@ def test_a_recording_s_field_is_all_that_the_scope_saw():
     assert seen_in_recording(later[:35] + whole) is None
 
 
-def test_strips_of_a_recording_are_not_seen():
+def test_seen_in_recording_excludes_strips():
     pictures = drawn_into(seen_through(FIELDS["disc"], count=FRAMES, level=30), strip_below)
     seen = seen_in_recording(pictures).astype(bool)
     assert not (seen & ~FIELDS["disc"]).any() and seen[-14:].mean() < 0.2 * FIELDS["disc"][-14:].mean()

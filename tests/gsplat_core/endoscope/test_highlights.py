@@ -28,37 +28,37 @@ def spots(height=128, width=160, grown=0):
     return field.astype(bool)
 
 
-def test_reflections_are_left_out_with_a_narrow_rim():
+def test_without_highlights_excludes_reflections_with_narrow_rim():
     kept = without_highlights(with_spots(texture(1, 1)[0])).astype(bool)
     assert not (kept & spots()).any()
     assert kept[~spots(grown=4)].all()
 
 
-def test_tissue_without_reflections_is_kept_whole():
+def test_without_highlights_returns_none_without_reflections():
     assert without_highlights(texture(1, 1)[0]) is None
 
 
-def test_a_saturated_colour_is_tissue():
+def test_without_highlights_keeps_saturated_colour():
     assert without_highlights(with_spots(texture(1, 1)[0], (255, 235, 60))) is None
 
 
-def test_pale_tissue_that_is_bright_all_over_is_kept():
+def test_without_highlights_keeps_uniformly_bright_pale_tissue():
     pale = np.clip(texture(2, 1)[0].astype(np.float32) * 0.12 + np.array([225, 190, 180]), 0, 255).astype(np.uint8)
     assert without_highlights(pale) is None
 
 
-def test_an_overexposed_half_is_not_a_highlight():
+def test_without_highlights_keeps_overexposed_half():
     image = texture(3, 1)[0].copy()
     image[:, 60:] = 250
     kept = without_highlights(image)
     assert kept is None or kept[:, 80:].all()
 
 
-def test_a_white_picture_has_none():
+def test_without_highlights_white_image_returns_none():
     assert without_highlights(np.full((64, 64, 3), 255, np.uint8)) is None
 
 
-def test_a_large_picture_has_the_same_ones():
+def test_without_highlights_independent_of_image_size():
     image = with_spots(texture(1, 1)[0])
     large = cv2.resize(image, (1600, 1280), interpolation=cv2.INTER_CUBIC)
     small, found = (1 - without_highlights(each) for each in (image, large))
@@ -69,7 +69,7 @@ def test_a_large_picture_has_the_same_ones():
 @pytest.mark.slow
 @pytest.mark.recordings
 @pytest.mark.parametrize("name", PLACES)
-def test_in_recordings_they_are_small_and_white(recordings_dir, name):
+def test_without_highlights_in_recordings_removes_small_white_areas_only(recordings_dir, name):
     for image in clip(recordings_dir, name)[::10]:
         kept = without_highlights(image)
         assert kept is not None and 0.95 < kept.mean() < 1
@@ -80,7 +80,7 @@ def test_in_recordings_they_are_small_and_white(recordings_dir, name):
 
 
 @pytest.mark.recordings
-def test_the_overexposed_wall_of_sinus_stays(recordings_dir):
+def test_without_highlights_keeps_overexposed_wall_of_sinus(recordings_dir):
     for image in clip(recordings_dir, "sinus")[20::5]:
         assert image[300, 480].min() > 180
         assert without_highlights(image)[260:360, 440:500].mean() > 0.9
@@ -88,14 +88,14 @@ def test_the_overexposed_wall_of_sinus_stays(recordings_dir):
 
 @settings(deadline=None, max_examples=40)
 @given(st.integers(1, 60), st.integers(1, 60), st.integers(0, 2**32), st.booleans())
-def test_no_picture_of_any_size_raises(height, width, seed, bright):
+def test_without_highlights_accepts_images_of_any_size(height, width, seed, bright):
     rng = np.random.default_rng(seed)
     kept = without_highlights(rng.integers(128 if bright else 0, 256, (height, width, 3), np.uint8))
     assert kept is None or (kept.shape == (height, width) and kept.max() <= 1)
 
 
 @pytest.mark.parametrize("shape", [(1, 3000), (3000, 1), (801, 799)])
-def test_long_pictures_are_no_exception(shape):
+def test_without_highlights_accepts_elongated_images(shape):
     image = np.zeros((*shape, 3), np.uint8)
     image[shape[0] // 2, shape[1] // 2] = 255
     kept = without_highlights(image)
@@ -125,12 +125,12 @@ def spotted(colour, tissue=(200, 150, 150), size=(256, 320), side=9):
         ((240, 175, 175), (200, 150, 150), False),
     ],
 )
-def test_a_highlight_is_bright_nearly_white_and_brighter_than_its_surroundings(colour, tissue, found):
+def test_without_highlights_colour_and_contrast_thresholds(colour, tissue, found):
     assert (without_highlights(spotted(colour, tissue)) is not None) == found
 
 
 @pytest.mark.parametrize(("size", "grown"), [((64, 80), 1), ((512, 640), 2), ((64, 640), 2), ((640, 64), 2)])
-def test_highlights_grow_by_a_pixel_at_least_and_by_two_of_640(size, grown):
+def test_without_highlights_grows_regions_by_two_of_640_pixels(size, grown):
     kept = without_highlights(spotted(255, (180, 90, 90), size))
     rows, columns = np.nonzero(kept == 0)
     assert (np.ptp(rows) + 1, np.ptp(columns) + 1) == (9 + 2 * grown, 9 + 2 * grown)
@@ -138,7 +138,7 @@ def test_highlights_grow_by_a_pixel_at_least_and_by_two_of_640(size, grown):
 
 
 @pytest.mark.parametrize(("apart", "found"), [(12, True), (7, False)])
-def test_white_dots_all_over_are_no_highlights(apart, found):
+def test_without_highlights_keeps_dense_white_dots(apart, found):
     """Dots of 4 x 4 pixels cover a ninth of the picture 12 apart, and a third 7 apart."""
     image = np.full((256, 320, 3), (180, 20, 20), np.uint8)
     for y in range(0, 256, apart):
@@ -147,7 +147,7 @@ def test_white_dots_all_over_are_no_highlights(apart, found):
     assert (without_highlights(image) is not None) == found
 
 
-def test_what_is_black_beyond_the_field_of_view_does_not_make_pale_tissue_a_highlight():
+def test_without_highlights_keeps_pale_tissue_in_black_surround():
     image = np.zeros((256, 320, 3), np.uint8)
     cv2.circle(image, (160, 128), 80, (240, 190, 190), -1)
     kept, inside = without_highlights(image), cv2.circle(np.zeros((256, 320), np.uint8), (160, 128), 70, 1, -1)
@@ -156,7 +156,7 @@ def test_what_is_black_beyond_the_field_of_view_does_not_make_pale_tissue_a_high
 
 @pytest.mark.parametrize("level", [250, 254, 255])
 @pytest.mark.parametrize("size", [(256, 320), (1024, 1280)])
-def test_a_white_area_wider_than_the_surroundings_is_kept_in_its_middle(level, size):
+def test_without_highlights_keeps_middle_of_wide_white_area(level, size):
     unit = size[0] // 256
     kept = without_highlights(spotted(level, (180, 90, 90), size, side=80 * unit))
     rows, columns = (slice(side // 2 + 30 * unit, side // 2 + 50 * unit) for side in size)
@@ -167,6 +167,6 @@ def test_a_white_area_wider_than_the_surroundings_is_kept_in_its_middle(level, s
 
 
 @pytest.mark.parametrize("level", [226, 240, 254])
-def test_saturated_spots_on_overexposed_tissue_are_no_highlights(level):
+def test_without_highlights_keeps_saturated_spots_on_overexposed_tissue(level):
     """A saturated level exceeds its surroundings by less than the required 30 levels."""
     assert without_highlights(spotted(255, (level, level, level))) is None

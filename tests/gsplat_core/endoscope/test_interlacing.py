@@ -28,7 +28,7 @@ def psnr_db(images, true):
 
 @pytest.mark.recordings
 @pytest.mark.parametrize("name", PLACES)
-def test_progressive_video_is_not_touched(recordings_dir, name):
+def test_deinterlacer_returns_progressive_video_unchanged(recordings_dir, name):
     deinterlacer = Deinterlacer()
     for image in clip(recordings_dir, name):
         assert deinterlacer.process(image) is image
@@ -38,7 +38,7 @@ def test_progressive_video_is_not_touched(recordings_dir, name):
 @pytest.mark.slow
 @pytest.mark.recordings
 @pytest.mark.parametrize("name", PLACES)
-def test_interlaced_video_is_found_and_comes_nearer_to_its_even_field(recordings_dir, name):
+def test_deinterlacer_detects_interlacing_and_improves_psnr(recordings_dir, name):
     images = clip(recordings_dir, name)
     deinterlacer, given_images = Deinterlacer(), woven(images)
     repaired = [deinterlacer.process(image) for image in given_images]
@@ -48,7 +48,7 @@ def test_interlaced_video_is_found_and_comes_nearer_to_its_even_field(recordings
     assert all(np.array_equal(after[::2], before[::2]) for after, before in zip(repaired, given_images, strict=True))
 
 
-def test_where_nothing_moves_interlaced_video_keeps_its_lines():
+def test_without_combs_keeps_lines_of_static_areas():
     images = [image.copy() for image in texture(1, 20, 320, 256)]
     for image in images:
         image[:, :160] = images[0][:, :160]
@@ -58,7 +58,7 @@ def test_where_nothing_moves_interlaced_video_keeps_its_lines():
 
 
 @pytest.mark.parametrize("pattern", ["lines", "noise", "chequers"])
-def test_a_single_odd_picture_does_not_make_a_stream_interlaced(pattern):
+def test_deinterlacer_ignores_single_patterned_image(pattern):
     rows, columns = np.indices((256, 320))
     odd = {
         "lines": np.where(rows % 2, 200, 40),
@@ -70,14 +70,14 @@ def test_a_single_odd_picture_does_not_make_a_stream_interlaced(pattern):
     assert all(deinterlacer.process(image) is image for image in images)
 
 
-def test_sensor_noise_is_no_comb():
+def test_comb_share_of_sensor_noise_below_threshold():
     rng = np.random.default_rng(0)
     for image in texture(3, 20, 320, 256):
         noisy = np.clip(image + rng.normal(0, 12, image.shape), 0, 255).astype(np.uint8)
         assert comb_share(noisy) < artefacts.COMB_SHARE
 
 
-def test_a_stream_that_has_become_progressive_is_left_alone_again(monkeypatch):
+def test_deinterlacer_stops_after_stream_becomes_progressive(monkeypatch):
     monkeypatch.setattr(artefacts, "FORGOTTEN_FRAMES", 15)
     images = [np.roll(image, 5 * k, axis=1) for k, image in enumerate(texture(4, 30, 320, 256))]
     deinterlacer = Deinterlacer()
@@ -90,7 +90,7 @@ def test_a_stream_that_has_become_progressive_is_left_alone_again(monkeypatch):
 
 @settings(deadline=None, max_examples=40)
 @given(st.integers(1, 70), st.integers(1, 70), st.integers(0, 2**32))
-def test_no_picture_of_any_size_raises(height, width, seed):
+def test_deinterlacer_accepts_images_of_any_size(height, width, seed):
     rng = np.random.default_rng(seed)
     deinterlacer = Deinterlacer()
     with pytest.MonkeyPatch.context() as patch:
@@ -110,30 +110,30 @@ def lines(amplitude, slope=0, rows=34, columns=128):
 
 
 @pytest.mark.parametrize(("amplitude", "share"), [(4, 0.0), (6, 0.5), (60, 0.5)])
-def test_the_share_of_combs_is_that_of_the_picture_with_visible_combs(amplitude, share):
+def test_comb_share_equals_share_of_image_with_visible_combs(amplitude, share):
     assert comb_share(lines(amplitude)) == share
 
 
 @pytest.mark.parametrize(("slope", "share"), [(4, 0.5), (6, 0.0)])
-def test_a_vertical_gradient_hides_combs_that_are_weaker_than_it(slope, share):
+def test_comb_share_ignores_combs_weaker_than_vertical_gradient(slope, share):
     """Lines two apart differ by twice the slope, and neighbouring lines by the amplitude on average."""
     assert comb_share(lines(12, slope)) == share
 
 
 @pytest.mark.parametrize(("rows", "columns", "share"), [(33, 128, 0.0), (34, 60, 0.0), (34, 64, 0.5)])
-def test_a_picture_of_less_than_two_blocks_has_no_combs(rows, columns, share):
+def test_comb_share_zero_below_two_blocks(rows, columns, share):
     assert comb_share(lines(60, 0, rows, columns)) == share
 
 
 @pytest.mark.parametrize(("combed", "interlaced"), [((0, 4, 8), False), ((0, 4, 8, 11), True), ((0, 4, 8, 12), False)])
-def test_four_combed_pictures_among_twelve_make_a_stream_interlaced(combed, interlaced):
+def test_deinterlacer_requires_four_combed_images_of_twelve(combed, interlaced):
     deinterlacer = Deinterlacer()
     for k in range(20):
         deinterlacer.process(lines(60 if k in combed else 0))
     assert deinterlacer.interlaced == interlaced
 
 
-def test_an_interlaced_stream_stays_so_for_six_hundred_pictures_without_combs():
+def test_deinterlacer_remembers_interlacing_for_600_images_without_combs():
     deinterlacer = Deinterlacer()
     for _ in range(4):
         deinterlacer.process(lines(60))
@@ -141,7 +141,7 @@ def test_an_interlaced_stream_stays_so_for_six_hundred_pictures_without_combs():
     assert after == [True] * 599 + [False]
 
 
-def test_a_pixel_that_stands_out_from_both_lines_is_replaced_with_two_beside_it():
+def test_without_combs_replaces_outlier_pixel_and_two_neighbours():
     image = np.full((12, 40, 3), 100, np.uint8)
     image[6] = 110
     image[5, 17:24] = 113
@@ -156,7 +156,7 @@ def test_a_pixel_that_stands_out_from_both_lines_is_replaced_with_two_beside_it(
 
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize(("levels", "replaced"), [(4, False), (5, True)])
-def test_an_excess_over_both_lines_must_exceed_the_limit(sign, levels, replaced):
+def test_without_combs_excess_threshold(sign, levels, replaced):
     image = np.full((9, 20, 3), 100, np.uint8)
     image[3, 10] = 100 + sign * levels
     assert (without_combs(image)[3, 10, 0] == 100) == replaced

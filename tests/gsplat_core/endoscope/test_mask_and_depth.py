@@ -16,19 +16,19 @@ def mask(tool_columns, size=40):
     return plane
 
 
-def test_a_frame_full_of_tool_has_no_tissue():
+def test_mask_check_reports_no_tissue_for_frame_full_of_tool():
     check = MaskCheck()
     assert [check.fault(mask(columns), 0) for columns in (8, 40, 8)] == [None, "no tissue", None]
 
 
 @pytest.mark.parametrize(("fps", "lost"), [(60, 5), (30, 5), (25, 4), (5, 0)])
-def test_a_tool_that_is_gone_at_once_is_a_lost_mask_for_some_frames_only(fps, lost):
+def test_mask_check_reports_lost_mask_for_limited_time(fps, lost):
     check = MaskCheck()
     found = [check.fault(mask(columns), round(k * 1e9 / fps)) for k, columns in enumerate((12, 12, *[0] * 12, 12))]
     assert found == [None, None] + ["tool mask lost"] * lost + [None] * (13 - lost)
 
 
-def test_a_tool_that_leaves_over_some_frames_is_no_fault():
+def test_mask_check_accepts_tool_leaving_gradually():
     check = MaskCheck()
     assert {check.fault(mask(columns, 160), 0) for columns in (48, 36, 20, 4, 0, 0)} == {None}
 
@@ -37,14 +37,14 @@ def plane(value=60.0):
     return np.full((40, 40), value, np.float32)
 
 
-def test_good_depth_is_passed_on_as_it_is():
+def test_depth_check_returns_valid_depth_unchanged():
     depth = plane()
     depth[:10] = 0
     assert DepthCheck().checked(depth).depth is depth
 
 
 @pytest.mark.parametrize("wrong", [np.nan, np.inf, -np.inf, -5.0, 1e6])
-def test_some_wrong_values_become_unknown(wrong):
+def test_depth_check_sets_some_invalid_values_to_unknown(wrong):
     depth = plane()
     depth[4:8, 4:8] = wrong
     found = DepthCheck().checked(depth)
@@ -53,17 +53,17 @@ def test_some_wrong_values_become_unknown(wrong):
 
 
 @pytest.mark.parametrize("wrong", [np.nan, -5.0, 1e6])
-def test_depth_that_is_mostly_wrong_is_left_out(wrong):
+def test_depth_check_drops_mostly_invalid_depth(wrong):
     assert DepthCheck().checked(plane(wrong)).depth is None
 
 
-def test_another_scale_is_left_out_until_it_stays():
+def test_depth_check_drops_changed_scale_until_stable():
     check = DepthCheck()
     found = [check.checked(plane(value)).finding for value in (60, 62, *[0.06] * 12, 60)]
     assert found == [None, None] + ["depth at another scale"] * 10 + [None, None] + ["depth at another scale"]
 
 
-def test_a_scope_that_comes_closer_is_no_other_scale():
+def test_depth_check_accepts_approaching_scope():
     check = DepthCheck()
     assert {check.checked(plane(value)).finding for value in np.geomspace(80, 5, 60)} == {None}
 
@@ -72,7 +72,7 @@ def test_a_scope_that_comes_closer_is_no_other_scale():
 @given(
     st.integers(1, 20), st.integers(1, 20), st.sampled_from([np.float16, np.float32, np.float64]), st.integers(0, 2**32)
 )
-def test_nothing_raises(height, width, dtype, seed):
+def test_depth_and_mask_checks_accept_any_values(height, width, dtype, seed):
     rng = np.random.default_rng(seed)
     with np.errstate(all="ignore"):
         depth = np.array(rng.normal(size=(height, width)) * 10.0 ** rng.integers(-5, 5), dtype)
@@ -83,7 +83,7 @@ def test_nothing_raises(height, width, dtype, seed):
 
 
 @pytest.mark.parametrize("shape", [(1024, 4096), (4096, 1024), (40, 60)])
-def test_samples_of_a_large_plane_are_counted_along_its_shorter_side(shape):
+def test_some_samples_plane_by_shorter_side(shape):
     rows, columns = np.mgrid[: shape[0], : shape[1]]
     found = _some(rows * 10_000 + columns)
     assert min(found.shape) == min(SAMPLES, min(shape) // 4)

@@ -14,7 +14,7 @@ from .networks import external_weights, grey_network
 
 
 @pytest.mark.parametrize("location", ["weights.bin", "../weights.bin", "/etc/hostname", ""])
-def test_weights_in_another_file_are_refused_wherever_it_lies(tmp_path, location):
+def test_onnx_weights_in_external_file_rejected(tmp_path, location):
     (tmp_path / "weights.bin").write_bytes(np.zeros(3, np.float32).tobytes())
     path = external_weights(tmp_path / "net.onnx", location)
     with pytest.raises(InvalidSetting, match=r"keeps data in other files, which are not opened;.*external_data=False"):
@@ -51,15 +51,15 @@ def inside_sparse() -> bytes:
 
 
 @pytest.mark.parametrize("make", [inside_attribute, inside_branch, inside_function, inside_sparse])
-def test_data_elsewhere_are_seen_wherever_they_are_named(make):
+def test_has_external_data_finds_every_location_in_model(make):
     assert has_external_data(make())
 
 
-def test_a_whole_model_is_whole(tmp_path):
+def test_has_external_data_false_for_self_contained_model(tmp_path):
     assert not has_external_data(grey_network(tmp_path / "net.onnx").read_bytes())
 
 
-def test_operators_of_other_libraries_are_refused(tmp_path):
+def test_onnx_operators_of_custom_domain_rejected(tmp_path):
     node = helper.make_node("Steal", ["image"], ["mask"], domain="my.ops")
     graph = helper.make_graph(
         [node],
@@ -74,7 +74,7 @@ def test_operators_of_other_libraries_are_refused(tmp_path):
         OnnxToolFinder(path)
 
 
-def test_a_file_that_is_too_large_is_not_read_whole(tmp_path, monkeypatch):
+def test_read_model_rejects_oversized_file(tmp_path, monkeypatch):
     monkeypatch.setattr(onnx, "MOST_BYTES", 1000)
     path = tmp_path / "net.onnx"
     path.write_bytes(bytes(1001))
@@ -85,14 +85,14 @@ def test_a_file_that_is_too_large_is_not_read_whole(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     "data", [b"", b"\x00", b"hello world", b"\x3a\xff", b"\x3a\x05ab", b"\xff" * 40, b"\x0b", bytes(200)]
 )
-def test_bytes_that_are_no_model_are_refused(tmp_path, data):
+def test_onnx_finder_rejects_invalid_model_bytes(tmp_path, data):
     path = tmp_path / "net.onnx"
     path.write_bytes(data)
     with pytest.raises(InvalidSetting, match=r"is no ONNX model|cannot be loaded"):
         OnnxToolFinder(path)
 
 
-def test_a_model_cut_anywhere_is_refused(tmp_path):
+def test_onnx_finder_rejects_truncated_model(tmp_path):
     data = grey_network(tmp_path / "net.onnx").read_bytes()
     path = tmp_path / "cut.onnx"
     for end in range(0, len(data) - 1, 7):
@@ -110,7 +110,7 @@ def field(number: int, payload: bytes) -> bytes:
     return bytes([number << 3 | 2]) + coded + bytes([length]) + payload
 
 
-def test_graphs_inside_each_other_without_end_are_refused():
+def test_has_external_data_rejects_deeply_nested_graphs():
     graph = b""
     for _ in range(80):
         graph = field(1, field(5, field(6, graph)))  # a node's attribute that is a graph
@@ -118,7 +118,7 @@ def test_graphs_inside_each_other_without_end_are_refused():
         has_external_data(field(7, graph))
 
 
-def test_a_file_that_is_not_there_is_named(tmp_path):
+def test_onnx_finder_names_missing_file(tmp_path):
     with pytest.raises(
         InvalidSetting, match=r"tool network .*missing\.onnx cannot be read \(No such file or directory\)"
     ):
@@ -159,7 +159,7 @@ PATHS = {
 @pytest.mark.parametrize(
     "before", [b"", b"\x09" + bytes(8), b"\x0d" + bytes(4), b"\x08\xff\x01", tagged(9, bytes(300))]
 )
-def test_external_tensors_are_found_at_every_place_of_the_format(path, tensor, before):
+def test_has_external_data_finds_tensor_at_every_message_path(path, tensor, before):
     """Fields of every wire type before the tensor are skipped."""
     message = before + tensor
     for number in reversed(path):
@@ -171,12 +171,12 @@ def test_external_tensors_are_found_at_every_place_of_the_format(path, tensor, b
 @pytest.mark.parametrize(
     "data", [b"\x09" + bytes(7), b"\x0d" + bytes(3), b"\x0a\x03ab", b"\x08" + b"\xff" * 10, b"\x08\x80"]
 )
-def test_messages_that_end_within_a_field_are_refused(data):
+def test_has_external_data_rejects_truncated_messages(data):
     with pytest.raises(ValueError, match=r"ends too early|more than 64 bits"):
         has_external_data(data)
 
 
-def test_values_in_the_tensor_are_not_external():
+def test_has_external_data_false_for_embedded_values():
     assert not has_external_data(tagged(7, tagged(5, bytes([14 << 3, 0]))))
 
 
@@ -190,7 +190,7 @@ def encoded(number: int, length: int = 0) -> bytes:
 
 
 @pytest.mark.parametrize("number", [0, 1, 127, 128, 300, 2**35 + 5, 2**63, 2**64 - 1])
-def test_integers_of_variable_length_have_64_bits_at_most(number):
+def test_varint_limited_to_64_bits(number):
     assert onnx.varint(memoryview(b"x" + encoded(number) + b"y"), 1) == (number, 1 + len(encoded(number)))
     assert onnx.varint(memoryview(encoded(number, 10)), 0) == (number, 10)
     with pytest.raises(ValueError, match="more than 64 bits"):
@@ -199,7 +199,7 @@ def test_integers_of_variable_length_have_64_bits_at_most(number):
         onnx.varint(memoryview(encoded(number, 5)[:-1]), 0)
 
 
-def test_fields_of_all_wire_types_are_read_in_order():
+def test_fields_reads_all_wire_types_in_order():
     message = b"".join(
         (
             encoded(3 << 3 | 0), encoded(300), encoded(4 << 3 | 1), b"8 bytes!", encoded(5 << 3 | 2), encoded(4), b"text",
@@ -220,7 +220,7 @@ def test_fields_of_all_wire_types_are_read_in_order():
         list(onnx.fields(memoryview(encoded(0 << 3 | 2) + encoded(0))))  # there is no field 0
 
 
-def test_values_are_those_of_all_messages_on_a_path():
+def test_values_collects_all_messages_on_path():
     inner = encoded(1 << 3) + encoded(5) + encoded(1 << 3) + encoded(6) + encoded(2 << 3) + encoded(9)
     outer = (encoded(7 << 3 | 2) + encoded(len(inner)) + inner) * 2
     assert onnx.values(memoryview(outer), 7, 1) == [5, 6, 5, 6]

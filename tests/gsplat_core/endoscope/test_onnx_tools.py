@@ -33,14 +33,14 @@ def check(mask: np.ndarray, height: int = HEIGHT, width: int = WIDTH) -> None:
 
 @pytest.mark.parametrize("size", [(HEIGHT, WIDTH), (32, 40), (50, 33), ("height", "width")])
 @pytest.mark.parametrize("image_size", [(HEIGHT, WIDTH), (512, 640), (31, 47)])
-def test_logits_of_any_size_become_a_mask_of_the_picture(tmp_path, size, image_size):
+def test_onnx_finder_resizes_logits_to_image(tmp_path, size, image_size):
     finder = OnnxToolFinder(grey_network(tmp_path / "net.onnx", size=size))
     mask = finder.find(picture(*image_size))
     margin = max(2, round(2 * image_size[1] / (size[1] if isinstance(size[1], int) else 32)))
     assert mask[:, : image_size[1] // 2 - margin].all() and not mask[:, image_size[1] // 2 + margin :].any()
 
 
-def test_probabilities_are_recognised_and_the_threshold_is_the_users(tmp_path):
+def test_onnx_finder_recognises_probabilities_and_applies_threshold(tmp_path):
     nodes, parts = conv(*GREY, output="logits")
     nodes.append(helper.make_node("Sigmoid", ["logits"], ["mask"]))
     check(OnnxToolFinder(write(tmp_path / "a.onnx", nodes, parts)).find(picture()))
@@ -49,7 +49,7 @@ def test_probabilities_are_recognised_and_the_threshold_is_the_users(tmp_path):
     assert OnnxToolFinder(strict).find(picture()).all()
 
 
-def test_stated_logits_are_not_taken_for_probabilities(tmp_path):
+def test_onnx_finder_follows_declared_value_type(tmp_path):
     nodes, parts = conv([[-0.1, 0.05, 0.05]], [0.4])
     low = write(tmp_path / "net.onnx", nodes, parts, metadata={"values": "probability"})
     assert OnnxToolFinder(low).find(picture()).all()
@@ -60,19 +60,19 @@ def test_stated_logits_are_not_taken_for_probabilities(tmp_path):
 @pytest.mark.parametrize(
     ("tools", "expected"), [(None, "not red"), ((1,), "not red"), ((0,), "red"), ((1, 2), "not red")]
 )
-def test_scores_of_classes(tmp_path, tools, expected):
+def test_onnx_finder_selects_tool_classes_by_score(tmp_path, tools, expected):
     nodes, parts = conv([[20, -10, -10], [-20, 10, 10], [0, 0, 0]], [-3, 3, -9])
     metadata = {} if tools is None else {"tool_classes": tools}
     mask = OnnxToolFinder(write(tmp_path / "net.onnx", nodes, parts, metadata=metadata)).find(picture())
     check(mask if expected == "not red" else 1 - mask)
 
 
-def test_one_channel_can_be_that_of_tissue(tmp_path):
+def test_onnx_finder_single_channel_can_mean_tissue(tmp_path):
     check(1 - OnnxToolFinder(grey_network(tmp_path / "net.onnx", metadata={"tool_classes": [0]})).find(picture()))
 
 
 @pytest.mark.parametrize("squeeze", [False, True])
-def test_a_map_of_classes(tmp_path, squeeze):
+def test_onnx_finder_accepts_class_map(tmp_path, squeeze):
     nodes, parts = conv([[20, -10, -10], [-20, 10, 10]], [-3, 3], output="scores")
     nodes.append(helper.make_node("ArgMax", ["scores"], ["map" if squeeze else "mask"], axis=1, keepdims=0))
     if squeeze:
@@ -81,7 +81,7 @@ def test_a_map_of_classes(tmp_path, squeeze):
     check(OnnxToolFinder(path).find(picture()))
 
 
-def test_half_precision(tmp_path):
+def test_onnx_finder_accepts_half_precision(tmp_path):
     nodes, parts = conv(*GREY)
     parts = [numpy_helper.from_array(numpy_helper.to_array(part).astype(np.float16), part.name) for part in parts]
     path = write(tmp_path / "net.onnx", nodes, parts, input_type=TensorProto.FLOAT16, output_type=TensorProto.FLOAT16)
@@ -89,7 +89,7 @@ def test_half_precision(tmp_path):
 
 
 @pytest.mark.parametrize("beside", [False, True])
-def test_normalisation_and_order_of_channels_come_from_the_model_or_from_a_file_beside_it(tmp_path, beside):
+def test_onnx_finder_reads_normalisation_from_metadata_or_sidecar_file(tmp_path, beside):
     """Settings in the sidecar file override those in the model."""
     settings = {"white": 255, "mean": [10, 20, 30], "std": [2, 4, 5], "channels": "bgr", "values": "logits"}
     # Blue first: the value is zero for one colour, and both sides of it are tried.
@@ -103,7 +103,7 @@ def test_normalisation_and_order_of_channels_come_from_the_model_or_from_a_file_
     assert not finder.find(np.full((40, 40, 3), (255, 255, 151), np.uint8)).any()
 
 
-def test_a_stated_size_is_used_where_the_model_takes_any(tmp_path):
+def test_onnx_finder_uses_declared_size_for_dynamic_input(tmp_path):
     """The mask is as coarse as the size, which is how it shows."""
     finder = OnnxToolFinder(grey_network(tmp_path / "net.onnx", size=("h", "w"), metadata={"size": [16, 16]}))
     image = np.full((160, 160, 3), (200, 60, 50), np.uint8)
@@ -113,7 +113,7 @@ def test_a_stated_size_is_used_where_the_model_takes_any(tmp_path):
 
 
 @pytest.mark.parametrize("classes", [1, 3])
-def test_nan_is_tool_everywhere_and_is_stated_once(tmp_path, caplog, classes):
+def test_onnx_finder_treats_nan_as_tool_and_warns_once(tmp_path, caplog, classes):
     rows, bias = [[-20.0, 10.0, 10.0]] * classes, [3.0] * classes
     nodes, parts = conv(rows, bias, output="raw")
     nodes.append(helper.make_node("Sqrt", ["raw"], ["mask"]))  # of a negative number where the picture is red
@@ -142,12 +142,12 @@ def refused(path) -> str:
         ([1, 3, 5000, 40], "takes pictures of 5000x40; at most 4096x4096 are supported"),
     ],
 )
-def test_inputs_of_another_shape_are_refused(tmp_path, shape, sentence):
+def test_onnx_finder_rejects_input_shapes(tmp_path, shape, sentence):
     node = helper.make_node("Identity", ["image"], ["mask"])
     assert sentence in refused(write(tmp_path / "net.onnx", [node], [], input_shape=shape))
 
 
-def test_inputs_of_another_type_or_number_are_refused(tmp_path):
+def test_onnx_finder_rejects_input_type_and_count(tmp_path):
     node = helper.make_node("Identity", ["image"], ["mask"])
     path = write(tmp_path / "a.onnx", [node], [], input_type=TensorProto.UINT8, output_type=TensorProto.UINT8)
     assert "takes tensor(uint8)" in refused(path)
@@ -164,7 +164,7 @@ def test_inputs_of_another_type_or_number_are_refused(tmp_path):
         ("Shape", {}, "gives int64 [4]"),
     ],
 )
-def test_outputs_that_are_no_mask_are_refused(tmp_path, operator, options, sentence):
+def test_onnx_finder_rejects_outputs_without_mask_shape(tmp_path, operator, options, sentence):
     kind = TensorProto.INT64 if operator == "Shape" else TensorProto.FLOAT
     node = helper.make_node(operator, ["image"], ["mask"], **options)
     path = write(tmp_path / "net.onnx", [node], [], output_type=kind)
@@ -188,7 +188,7 @@ def test_outputs_that_are_no_mask_are_refused(tmp_path, operator, options, sente
         ([], "the object"),
     ],
 )
-def test_settings_that_do_not_fit_are_refused(tmp_path, metadata, sentence):
+def test_onnx_finder_rejects_invalid_settings(tmp_path, metadata, sentence):
     path = grey_network(tmp_path / "net.onnx", metadata=metadata)
     if sentence is None:
         OnnxToolFinder(path)
@@ -197,13 +197,13 @@ def test_settings_that_do_not_fit_are_refused(tmp_path, metadata, sentence):
 
 
 @pytest.mark.parametrize("text", ["", "{", "NaN", '{"mean": [NaN, 0, 0]}', "[" * 10_000, "x" * 100_000])
-def test_a_broken_file_of_settings_is_refused(tmp_path, text):
+def test_onnx_finder_rejects_broken_settings_file(tmp_path, text):
     path = grey_network(tmp_path / "net.onnx")
     (tmp_path / "net.onnx.json").write_text(text)
     refused(path)
 
 
-def test_a_network_that_fails_on_a_picture_says_so(tmp_path):
+def test_onnx_finder_reports_inference_failure(tmp_path):
     """The model declares any input size but accepts only one."""
     shape = numpy_helper.from_array(np.array([1, 3, 64, 64], np.int64), "shape")
     node = helper.make_node("Reshape", ["image", "shape"], ["mask"])
@@ -213,13 +213,13 @@ def test_a_network_that_fails_on_a_picture_says_so(tmp_path):
 @pytest.mark.parametrize(
     "image", [np.zeros((8, 8), np.uint8), np.zeros((8, 8, 3), np.float32), np.zeros((0, 8, 3), np.uint8)]
 )
-def test_other_arrays_are_refused(tmp_path, image):
+def test_onnx_finder_rejects_arrays_other_than_rgb_uint8(tmp_path, image):
     finder = OnnxToolFinder(grey_network(tmp_path / "net.onnx"))
     with pytest.raises(InvalidInput, match=r"image must be RGB uint8 \[H, W, 3\]"):
         finder.find(image)
 
 
-def test_without_the_runtime_the_extra_is_named(tmp_path, monkeypatch):
+def test_onnx_finder_without_onnxruntime_names_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     with pytest.raises(
         InvalidSetting, match=r"needs the package onnxruntime .*install intrasplat with the extra `onnx`"
@@ -228,9 +228,7 @@ def test_without_the_runtime_the_extra_is_named(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(("threshold", "tool_at"), [(0.5, 0.0), (0.9, np.log(9)), (0.1, -np.log(9))])
-def test_the_threshold_is_a_probability_of_the_best_tool_class_against_the_best_other_class(
-    tmp_path, threshold, tool_at
-):
+def test_onnx_finder_threshold_compares_best_tool_and_best_other_class(tmp_path, threshold, tool_at):
     """For two classes the probability is the logistic function of the difference of the scores."""
     finder = OnnxToolFinder(grey_network(tmp_path / "net.onnx", metadata={"threshold": threshold, "values": "logits"}))
     for margin, is_tool in ((-0.1, False), (0.1, True)):
@@ -241,7 +239,7 @@ def test_the_threshold_is_a_probability_of_the_best_tool_class_against_the_best_
         assert (finder._score(scores) >= 0).all() == is_tool
 
 
-def test_infinite_scores_are_compared_without_becoming_nan(tmp_path):
+def test_onnx_finder_compares_infinite_scores(tmp_path):
     finder = OnnxToolFinder(grey_network(tmp_path / "net.onnx"))
     scores = np.zeros((1, 3, 4, 4), np.float32)
     scores[0, 0], scores[0, 1:] = -np.inf, -np.inf
@@ -253,25 +251,25 @@ def test_infinite_scores_are_compared_without_becoming_nan(tmp_path):
     ("image", "expected"),
     [((1024, 1280), (512, 640)), ((50, 100), (64, 96)), ((10, 10), (32, 32)), ((1280, 640), (640, 320))],
 )
-def test_networks_of_any_size_get_multiples_of_32_of_at_most_640(tmp_path, image, expected):
+def test_onnx_network_dynamic_input_is_multiple_of_32_up_to_640(tmp_path, image, expected):
     network = OnnxToolFinder(grey_network(tmp_path / "net.onnx", size=("h", "w")))._network
     assert network.run(np.zeros((*image, 3), np.uint8)).shape[2:] == expected
 
 
-def test_large_pictures_are_averaged_on_reduction(tmp_path):
+def test_onnx_network_averages_when_reducing_image(tmp_path):
     nodes, parts = conv([[1.0, 0.0, 0.0]], [0.0])
     network = OnnxToolFinder(write(tmp_path / "net.onnx", nodes, parts))._network
     chequers = np.repeat(((np.indices((128, 160)).sum(0) % 2) * 255)[..., None], 3, axis=2).astype(np.uint8)
     np.testing.assert_allclose(network.run(chequers), 0.5, atol=0.01)
 
 
-def test_settings_of_any_length_are_not_read(tmp_path):
+def test_onnx_finder_rejects_oversized_settings(tmp_path):
     path = grey_network(tmp_path / "net.onnx", metadata={"values": "logits", "output": 70_000 * "x"})
     assert f"{path}: metadata" in refused(path) and "is larger than 64 KiB" in refused(path)
 
 
 @pytest.mark.parametrize(("threads", "opened"), [(1, [1]), (2, [1, 2]), (3, [1, 3])])
-def test_a_network_is_opened_again_only_for_more_threads(tmp_path, monkeypatch, threads, opened):
+def test_onnx_session_reopened_only_for_more_threads(tmp_path, monkeypatch, threads, opened):
     import onnxruntime
 
     made, real = [], onnxruntime.InferenceSession

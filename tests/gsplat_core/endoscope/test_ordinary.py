@@ -30,12 +30,12 @@ def judged(pictures, frame_ns=FRAME_NS, **constants):
         return [follower.is_ordinary(picture, k * frame_ns) for k, picture in enumerate(pictures)]
 
 
-def test_most_pictures_of_an_even_stream_are_ordinary(stream):
+def test_is_ordinary_accepts_most_images_of_uniform_stream(stream):
     found = judged(stream)[10:]
     assert sum(found) > 0.8 * len(found)
 
 
-def test_a_change_that_is_slower_than_what_pictures_are_compared_with_is_renewed_is_ordinary(stream):
+def test_is_ordinary_accepts_drift_slower_than_reference_renewal(stream):
     dimmed = [np.clip(picture * (1 - 0.001 * k), 0, 255).astype(np.uint8) for k, picture in enumerate(stream)]
     wide = {"MOST_CHANGE_RATIO": 50.0, "LEAST_CHANGE_RATIO": 0.01}
     renewed, kept = (judged(dimmed, CHECK_EVERY_S=every_s, **wide)[10:] for every_s in (0.2, 30.0))
@@ -57,19 +57,19 @@ def test_a_change_that_is_slower_than_what_pictures_are_compared_with_is_renewed
     ],
     ids=["black", "duplicate", "torn", "blurred", "noise", "brighter", "another picture", "another size"],
 )
-def test_no_faulty_picture_is_ordinary(stream, rng, fault):
+def test_is_ordinary_rejects_faulty_image(stream, rng, fault):
     for at in range(20, 50, 3):
         pictures = list(stream)
         pictures[at] = fault(stream[at], stream[at - 1], rng)
         assert not judged(pictures)[at]
 
 
-def test_a_slow_change_is_looked_at_before_it_is_large(stream):
+def test_is_ordinary_rejects_slow_change_before_large(stream):
     dimmed = [np.clip(picture * (1 - 0.004 * k), 0, 255).astype(np.uint8) for k, picture in enumerate(stream)]
     assert judged(dimmed, CHECK_EVERY_S=30.0).count(False) > 5
 
 
-def test_a_gap_or_a_step_back_in_time_is_not_ordinary(stream):
+def test_is_ordinary_rejects_time_gap_and_step_back(stream):
     for jump_ns in (10 * FRAME_NS, -5 * FRAME_NS):
         follower = OrdinaryPictures()
         times = [k * FRAME_NS + (jump_ns if k >= 30 else 0) for k in range(40)]
@@ -78,13 +78,13 @@ def test_a_gap_or_a_step_back_in_time_is_not_ordinary(stream):
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 50), (50, 1), (3, 2), (700, 9)])
-def test_pictures_of_any_size_and_content_are_taken(rng, size):
+def test_is_ordinary_accepts_images_of_any_size(rng, size):
     follower = OrdinaryPictures()
     for k in range(5):
         follower.is_ordinary(rng.integers(0, 256, (*size, 3), np.uint8), k * FRAME_NS)
 
 
-def test_a_closer_look_becomes_the_reference_after_two_tenths_of_a_second(monkeypatch):
+def test_is_ordinary_renews_reference_every_0_2_seconds(monkeypatch):
     """Ordinary frames are compared with the last look, which is renewed at 0.2 s and not before."""
     watch, colours = OrdinaryPictures(), iter(range(1000))
     small = np.zeros((32, 32, 3), np.uint8)

@@ -71,7 +71,7 @@ def outside_of(image):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", OUTSIDE)
-def test_every_picture_from_outside_is_withheld_at_once(name):
+def test_body_gate_withholds_every_outside_image_at_once(name):
     for seed in SEEDS:
         image = OUTSIDE[name](np.random.default_rng(seed))
         assert BodyGate().judge(image) is not None, seed
@@ -82,7 +82,7 @@ def test_every_picture_from_outside_is_withheld_at_once(name):
 
 
 @pytest.mark.parametrize("name", sorted({*OUTSIDE} - {"bars"}))
-def test_brightness_size_and_a_round_view_do_not_hide_the_outside(name):
+def test_outside_found_at_any_brightness_size_and_view_shape(name):
     """A round view replaces much of the wall by face and cuts half of the screen's windows."""
     for seed in range(3):
         rng = np.random.default_rng(seed)
@@ -97,14 +97,14 @@ def test_brightness_size_and_a_round_view_do_not_hide_the_outside(name):
 
 
 @pytest.mark.parametrize("name", WITHOUT_EVIDENCE)
-def test_pictures_without_evidence_pass(rng, name):
+def test_body_gate_passes_images_without_evidence(rng, name):
     gate = BodyGate()
     assert gate.judge(WITHOUT_EVIDENCE[name](rng)) is None and gate.inside
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("change", [*UNUSUAL, *HARD_TISSUE])
-def test_unusual_tissue_passes(change):
+def test_body_gate_passes_unusual_tissue(change):
     for seed in SEEDS:
         rng = np.random.default_rng(seed)
         # Tissue has a structure that the drawn patches lack: vessels, folds and wet highlights.
@@ -121,14 +121,14 @@ def test_unusual_tissue_passes(change):
 
 @pytest.mark.recordings
 @pytest.mark.parametrize("name", [*VIDEOS, *STILLS])
-def test_no_frame_of_a_recording_is_withheld(recordings_dir, name):
+def test_body_gate_withholds_no_frame_of_recordings(recordings_dir, name):
     assert {outside_of(image) for image in recorded(recordings_dir, name, every=2 if name in VIDEOS else 1)} == {None}
 
 
 @pytest.mark.slow
 @pytest.mark.recordings
 @pytest.mark.parametrize("name", [*VIDEOS, *STILLS])
-def test_no_frame_of_a_changed_recording_is_withheld(recordings_dir, name):
+def test_body_gate_withholds_no_frame_of_altered_recordings(recordings_dir, name):
     images = recorded(recordings_dir, name)
     for image in (images[0], images[len(images) // 2]):
         small = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
@@ -143,7 +143,7 @@ def test_no_frame_of_a_changed_recording_is_withheld(recordings_dir, name):
 
 @pytest.mark.recordings
 @pytest.mark.parametrize("name", ["0008", "0009", "0010"])
-def test_the_samples_from_outside_are_withheld(recordings_dir, name):
+def test_body_gate_withholds_recorded_outside_samples(recordings_dir, name):
     image = read(recordings_dir / f"out_of_body/{name}.png")
     rng = np.random.default_rng(0)
     for picture in (image, gains(0.7, 0.7, 0.7)(image, rng), cv2.resize(image, (960, 540)), round_view(image, rng)):
@@ -162,24 +162,24 @@ NOTHING = {"cool": 0.0, "cold": 0.0, "redness": 0.0, "even": 0.0, "smooth": 0.0,
         ({"even": 0.5, "smooth": ROOM_LIGHT - 0.5 + 1e-9, "cold": COLD_BESIDE_LIGHT}, "even light, no red"),
     ],
 )
-def test_each_kind_of_evidence_needs_all_of_its_measures(measures, outside):
+def test_evidence_outside_requires_all_measures(measures, outside):
     assert Evidence(**NOTHING | measures).outside == outside
     for name, value in measures.items():
         assert Evidence(**NOTHING | measures | {name: value - 0.01}).outside is None
 
 
-def test_no_light_and_no_shape_is_evidence_against_a_red_picture():
+def test_evidence_of_red_image_never_outside():
     assert Evidence(cool=0.39, cold=0.39, redness=1.0, even=1.0, smooth=1.0, straight=1.0).outside is None
 
 
-def test_clear_tissue_has_little_that_is_cool_and_enough_that_is_red():
+def test_evidence_tissue_thresholds_of_cool_share_and_redness():
     clear = NOTHING | {"cool": LITTLE_COOL - 0.01, "redness": REDNESS}
     assert Evidence(**clear).tissue
     assert not Evidence(**clear | {"cool": LITTLE_COOL}).tissue
     assert not Evidence(**clear | {"redness": REDNESS - 0.01}).tissue
 
 
-def test_measures_of_pictures_whose_values_are_known():
+def test_evidence_measures_of_known_images():
     grey = evidence_of(plain(120, 120, 120))
     assert (grey.cool, grey.cold, grey.even, grey.smooth, grey.redness) == (1.0, 1.0, 1.0, 1.0, 0.0)
     warm = evidence_of(plain(180, 70, 60))
@@ -196,7 +196,7 @@ def test_measures_of_pictures_whose_values_are_known():
 
 
 @pytest.mark.parametrize("degrees", [0, 17, 45, 73])
-def test_edges_at_right_angles_agree_however_they_are_turned(degrees):
+def test_evidence_straight_finds_right_angles_at_any_rotation(degrees):
     picture = plain(140, 145, 150)
     for k in range(-6, 14):
         cv2.line(picture, (30 * k, -200), (30 * k, 500), (40, 42, 45), 4)
@@ -210,7 +210,7 @@ def test_edges_at_right_angles_agree_however_they_are_turned(degrees):
     assert evidence_of(rings).straight < 0.15
 
 
-def test_the_border_of_a_square_view_is_no_straight_edge():
+def test_evidence_straight_ignores_border_of_square_view():
     """Grey tissue in a square window on black, as a recorder shows it."""
     rng = np.random.default_rng(2)
     soft = cv2.GaussianBlur(rng.normal(0, 1, SIZE).astype(np.float32), (0, 0), 8)
@@ -220,7 +220,7 @@ def test_the_border_of_a_square_view_is_no_straight_edge():
     assert evidence_of(picture).straight < STRAIGHT
 
 
-def test_one_picture_from_outside_is_enough_to_end_and_many_from_inside_are_needed_to_return(rng):
+def test_body_gate_closes_at_one_outside_image_and_reopens_after_many_inside(rng):
     gate, inside = BodyGate(), tissue(rng)
     assert gate.judge(inside) is None
     assert gate.judge(room(rng)) == "straight edges, little red"
@@ -231,7 +231,7 @@ def test_one_picture_from_outside_is_enough_to_end_and_many_from_inside_are_need
     assert answers == ["not yet certain again"] * (FRAMES_TO_RETURN - 1) + [None, None]
 
 
-def test_single_odd_pictures_of_a_stream_are_withheld_alone_and_some_close_the_gate(rng):
+def test_body_gate_withholds_single_outside_images_and_closes_after_several(rng):
     gate, inside, outside = BodyGate(), cloth(rng, 215, 180, 150), room(rng)
     for _ in range(RECENT_FRAMES):
         assert gate.judge(inside) is None
@@ -246,7 +246,7 @@ def test_single_odd_pictures_of_a_stream_are_withheld_alone_and_some_close_the_g
     assert not gate.inside and gate.judge(inside) == "not yet certain again"
 
 
-def test_unusual_tissue_returns_later_than_clear_tissue(rng):
+def test_body_gate_reopens_later_for_unusual_tissue(rng):
     gate, pale = BodyGate(), cloth(rng, 215, 180, 150)
     assert evidence_of(pale).outside is None and not evidence_of(pale).tissue
     gate.judge(room(rng))
@@ -254,7 +254,7 @@ def test_unusual_tissue_returns_later_than_clear_tissue(rng):
     assert answers == ["not yet certain again"] * (FRAMES_WITHOUT_EVIDENCE - 1) + [None]
 
 
-def test_pictures_that_cannot_be_judged_count_for_nothing(rng):
+def test_body_gate_ignores_unjudgeable_images(rng):
     gate, inside, dark = BodyGate(), tissue(rng), plain(0, 0, 0)
     assert gate.judge(dark) is None
     gate.judge(room(rng))
@@ -266,14 +266,14 @@ def test_pictures_that_cannot_be_judged_count_for_nothing(rng):
     assert gate.judge(inside) is None
 
 
-def test_clear_tissue_must_come_in_a_row(rng):
+def test_body_gate_requires_consecutive_tissue_images(rng):
     gate, inside, pale = BodyGate(), tissue(rng), cloth(rng, 215, 180, 150)
     gate.judge(room(rng))
     answers = [gate.judge(inside if k % FRAMES_TO_RETURN else pale) for k in range(FRAMES_WITHOUT_EVIDENCE)]
     assert answers.count(None) == 1 and answers[-1] is None
 
 
-def test_a_reset_forgets_the_stream(rng):
+def test_body_gate_reset_clears_history(rng):
     gate = BodyGate()
     gate.judge(room(rng))
     gate.reset()
@@ -281,12 +281,12 @@ def test_a_reset_forgets_the_stream(rng):
 
 
 @pytest.mark.parametrize("size", [(1, 1), (8, 400), (0, 10), (15, 15)])
-def test_a_picture_too_small_to_judge_holds_no_evidence(size):
+def test_evidence_of_too_small_image_is_none(size):
     assert evidence_of(np.full((*size, 3), 120, np.uint8)) is None
     assert evidence_of(np.full((16, 16, 3), 120, np.uint8)) is not None
 
 
-def test_dark_and_overexposed_pictures_hold_no_evidence():
+def test_evidence_of_dark_or_overexposed_image_is_none():
     assert evidence_of(plain(24, 24, 24)) is None
     assert evidence_of(plain(39, 39, 39)) is None and evidence_of(plain(41, 41, 41)).outside is not None
     assert evidence_of(plain(255, 252, 240)) is None and evidence_of(plain(251, 251, 251)).outside is not None
@@ -300,7 +300,7 @@ def test_dark_and_overexposed_pictures_hold_no_evidence():
 
 @settings(deadline=None, max_examples=60)
 @given(st.integers(1, 60), st.integers(1, 60), st.integers(0, 2**32))
-def test_no_picture_of_any_size_raises(height, width, seed):
+def test_evidence_of_accepts_images_of_any_size(height, width, seed):
     rng = np.random.default_rng(seed)
     image = rng.integers(0, rng.integers(1, 257), (height, width, 3), np.uint8)
     measures = evidence_of(image)
@@ -310,7 +310,7 @@ def test_no_picture_of_any_size_raises(height, width, seed):
 @pytest.mark.parametrize(
     "image", [np.zeros((40, 40), np.uint8), np.zeros((40, 40, 3), np.float32), np.zeros((40, 40, 4), np.uint8)]
 )
-def test_other_arrays_are_refused_and_close_the_gate(rng, image):
+def test_body_gate_rejects_other_arrays_and_closes(rng, image):
     gate = BodyGate()
     assert gate.judge(tissue(rng)) is None
     with pytest.raises(InvalidInput, match=r"image must be RGB uint8 \[H, W, 3\], got"):
@@ -328,15 +328,13 @@ def test_other_arrays_are_refused_and_close_the_gate(rng, image):
         ({"cool": 0.299, "redness": 0.339}, None, False),
     ],
 )  # fmt: skip
-def test_limits_of_evidence(measures, outside, tissue):
+def test_evidence_thresholds(measures, outside, tissue):
     found = Evidence(**(dict.fromkeys(("cool", "cold", "redness", "even", "smooth", "straight"), 0.0) | measures))
     assert (found.outside, found.tissue) == (outside, tissue)
 
 
 @pytest.mark.parametrize(("redness", "returns_after"), [(0.5, 10), (0.2, 30)])
-def test_after_the_outside_ten_pictures_of_tissue_or_thirty_without_evidence_open_the_gate(
-    monkeypatch, redness, returns_after
-):
+def test_body_gate_reopens_after_ten_tissue_or_thirty_neutral_images(monkeypatch, redness, returns_after):
     gate = BodyGate()
     gate.close()
     seen = Evidence(cool=0.0, cold=0.0, redness=redness, even=0.0, smooth=0.0, straight=0.0)
@@ -346,7 +344,7 @@ def test_after_the_outside_ten_pictures_of_tissue_or_thirty_without_evidence_ope
 
 
 @pytest.mark.parametrize(("red", "cold"), [(1.06, 0.0), (1.04, 1.0)])
-def test_cold_is_what_exceeds_green_and_blue_by_less_than_a_twentieth(red, cold):
+def test_evidence_cold_red_excess_threshold(red, cold):
     """exp(0.05) = 1.051, of channels with 6 added."""
     image = np.full((64, 80, 3), 100, np.uint8)
     image[..., 0] = round(red * 106 - 6)
@@ -354,17 +352,17 @@ def test_cold_is_what_exceeds_green_and_blue_by_less_than_a_twentieth(red, cold)
 
 
 @pytest.mark.parametrize(("level", "is_judged"), [(38, False), (42, True)])
-def test_a_picture_must_be_brighter_than_forty_levels(level, is_judged):
+def test_evidence_of_requires_brightness_above_forty_levels(level, is_judged):
     assert (evidence_of(np.full((64, 80, 3), level, np.uint8)) is not None) == is_judged
 
 
 @pytest.mark.parametrize(("side", "is_judged"), [(15, False), (16, True)])
-def test_a_picture_has_sixteen_pixels_a_side_at_least(side, is_judged):
+def test_evidence_of_requires_sixteen_pixels_per_side(side, is_judged):
     assert (evidence_of(np.full((side, 80, 3), 120, np.uint8)) is not None) == is_judged
 
 
 @pytest.mark.parametrize(("red", "cool"), [(1.13, 0.0), (1.11, 1.0)])
-def test_cool_is_what_exceeds_green_and_blue_by_less_than_an_eighth(red, cool):
+def test_evidence_cool_red_excess_threshold(red, cool):
     """exp(0.12) = 1.127, of channels with 6 added."""
     image = np.full((64, 80, 3), 100, np.uint8)
     image[..., 0] = round(red * 106 - 6)

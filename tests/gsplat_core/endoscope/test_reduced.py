@@ -11,7 +11,7 @@ from gsplat_core.endoscope.reduced import averaged, enlarged, median_of, reduced
 
 @pytest.mark.parametrize("size", [(1, 1), (3, 5), (40, 30)])
 @pytest.mark.parametrize("larger", [(1, 0, 0), (2, 0, 0), (3, 0, 0), (2, 1, 0), (2, 1, 1), (3, 2, 2)])
-def test_a_plane_is_enlarged_as_by_its_nearest_pixels(rng, size, larger):
+def test_enlarged_equals_nearest_neighbour_resize(rng, size, larger):
     step, right, below = larger
     plane = rng.integers(0, 256, size, np.uint8)
     width, height = step * size[1] + right, step * size[0] + below
@@ -22,7 +22,7 @@ def test_a_plane_is_enlarged_as_by_its_nearest_pixels(rng, size, larger):
 
 @pytest.mark.parametrize("kind", [np.uint8, np.bool_, np.float32, np.int64])
 @pytest.mark.parametrize("step", [1, 2, 7])
-def test_masks_of_any_type_are_sampled_alike(rng, kind, step):
+def test_sampled_mask_independent_of_dtype(rng, kind, step):
     mask = rng.random((33, 50)) > 0.4
     expected = sampled_mask(mask.astype(np.uint8) * 200, step)
     assert set(np.unique(expected)) <= {0, 1}
@@ -32,7 +32,7 @@ def test_masks_of_any_type_are_sampled_alike(rng, kind, step):
 
 @pytest.mark.parametrize("size", [(16, 16), (31, 47), (240, 320), (512, 640)])
 @pytest.mark.parametrize("samples", [1, 2, 3])
-def test_averages_keep_the_colour_and_lose_noise(rng, size, samples):
+def test_averaged_keeps_colour_and_reduces_noise(rng, size, samples):
     noisy = np.clip(rng.normal((150, 90, 60), 20, (*size, 3)), 0, 255).astype(np.uint8)
     small = averaged(noisy, (8, 8), samples)
     assert small.shape == (8, 8, 3)
@@ -43,12 +43,12 @@ def test_averages_keep_the_colour_and_lose_noise(rng, size, samples):
 
 @pytest.mark.parametrize("count", [1, 2, 3, 10, 101])
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9])
-def test_quantiles_are_values_with_as_many_below(rng, count, share):
+def test_median_of_returns_requested_quantile(rng, count, share):
     values = rng.random(count)
     assert median_of(values, share) == np.sort(values)[int(share * count)]
 
 
-def test_averages_are_those_of_the_sampled_pixels(rng):
+def test_averaged_equals_mean_of_sampled_pixels(rng):
     """Two samples per side of a result pixel are the upper left of every 2x2 pixels; a single one averages all of them."""
     image = rng.integers(0, 256, (32, 48, 3), np.uint8)
     mean = lambda some: some.reshape(8, some.shape[0] // 8, 12, some.shape[1] // 12, 3).mean(axis=(1, 3))

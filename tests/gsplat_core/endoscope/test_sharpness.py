@@ -56,14 +56,14 @@ FAULTS = {
 
 @pytest.mark.recordings
 @pytest.mark.parametrize("name", PLACES)
-def test_no_frame_of_a_recording_is_withheld(recordings_dir, name):
+def test_sharpness_gate_withholds_no_frame_of_recordings(recordings_dir, name):
     assert set(faults(clip(recordings_dir, name))) == {None}
 
 
 @pytest.mark.recordings
 @pytest.mark.parametrize("name", PLACES)
 @pytest.mark.parametrize("fault", FAULTS)
-def test_every_bad_frame_in_a_recording_is_found_and_the_next_good_one_is_good(recordings_dir, name, fault):
+def test_sharpness_gate_reports_all_bad_frames_and_accepts_next_good_frame(recordings_dir, name, fault):
     spoil, reasons = FAULTS[fault]
     images = clip(recordings_dir, name)[:30]
     found = faults([*images[:15], *map(spoil, images[15:22]), *images[22:]])
@@ -73,14 +73,14 @@ def test_every_bad_frame_in_a_recording_is_found_and_the_next_good_one_is_good(r
 
 @pytest.mark.recordings
 @pytest.mark.parametrize("name", ["cutting", "heart", "colon"])
-def test_smoke_is_called_smoke(recordings_dir, name):
+def test_sharpness_gate_reports_smoke_in_recordings(recordings_dir, name):
     images = clip(recordings_dir, name)[:20]
     assert faults([*images[:15], *map(smoky, images[15:])])[15:] == ["smoke"] * 5
 
 
 @pytest.mark.recordings
 @pytest.mark.parametrize("name", PLACES)
-def test_exposure_white_balance_and_a_tool_are_neither(recordings_dir, name):
+def test_sharpness_gate_ignores_exposure_white_balance_and_tool(recordings_dir, name):
     images = list(clip(recordings_dir, name)[:30])
     half = images[20].copy()
     half[:, : half.shape[1] // 2] = (126, 129, 133)
@@ -88,14 +88,14 @@ def test_exposure_white_balance_and_a_tool_are_neither(recordings_dir, name):
     assert set(faults([*images[:20], half, *others])) == {None}
 
 
-def test_smoke_that_gathers_slowly_is_found():
+def test_sharpness_gate_reports_slowly_gathering_smoke():
     images = texture(1, 90, 320, 256)
     found = faults([smoky(image, 0.6 * max(0, k - 30) / 60) for k, image in enumerate(images)])
     assert found[:30] == [None] * 30 and set(found[70:]) == {"smoke"}
 
 
 @pytest.mark.slow
-def test_between_the_limits_a_frame_stays_what_the_one_before_was():
+def test_sharpness_gate_between_limits_keeps_previous_verdict():
     sharp = texture(2, 40, 320, 256)
     usual = appearance(sharp[0]).rows
     soft = []
@@ -110,7 +110,7 @@ def test_between_the_limits_a_frame_stays_what_the_one_before_was():
 @pytest.mark.slow
 @pytest.mark.parametrize("fps", [5.0, 30.0, 60.0])
 @pytest.mark.parametrize("spoil", [defocused, smoky])
-def test_a_stream_that_changes_for_good_is_withheld_for_a_moment_only(fps, spoil):
+def test_sharpness_gate_permanent_change_withheld_two_seconds_at_most(fps, spoil):
     images = texture(3, 150, 320, 256)
     start = 20
     found = faults([*images[:start], *map(spoil, images[start:])], fps=fps)
@@ -122,7 +122,7 @@ def test_a_stream_that_changes_for_good_is_withheld_for_a_moment_only(fps, spoil
 
 @pytest.mark.slow
 @pytest.mark.parametrize("fps", [5.0, 30.0])
-def test_no_stretch_of_blur_however_it_comes_leaves_the_display_without_a_frame_for_a_second(fps):
+def test_sharpness_gate_longest_interval_without_frame_is_bounded(fps):
     rng = np.random.default_rng(5)
     images = texture(6, 160, 320, 256)
     soft = [image if rng.random() < 0.35 else defocused(image) for image in images]
@@ -135,7 +135,7 @@ def test_no_stretch_of_blur_however_it_comes_leaves_the_display_without_a_frame_
 @pytest.mark.recordings
 @pytest.mark.parametrize("width", [1.0, 2.5, 5.0])
 @pytest.mark.parametrize("name", PLACES)
-def test_a_recording_that_is_soft_throughout_passes_and_sudden_blur_in_it_does_not(recordings_dir, name, width):
+def test_sharpness_gate_passes_soft_recording_but_not_sudden_blur(recordings_dir, name, width):
     images = [
         cv2.GaussianBlur(image, (0, 0), width * max(image.shape) / 640) for image in clip(recordings_dir, name)[:30]
     ]
@@ -149,7 +149,7 @@ def test_a_recording_that_is_soft_throughout_passes_and_sudden_blur_in_it_does_n
 @pytest.mark.slow
 @pytest.mark.recordings
 @pytest.mark.parametrize(("name", "most"), [("laparoscopy", 4), ("stereomis_like", 4), ("resting_bowel", 0)])
-def test_few_frames_of_a_moving_scope_are_withheld_and_none_for_a_second(recordings_dir, name, most):
+def test_sharpness_gate_withholds_few_frames_of_moving_scope(recordings_dir, name, most):
     frames = list(open_recording(recordings_dir / "others" / name / "video.mp4"))
     gate = SharpnessGate()
     found = [gate.fault(frame.image, frame.pts_ns) for frame in frames]
@@ -159,12 +159,12 @@ def test_few_frames_of_a_moving_scope_are_withheld_and_none_for_a_second(recordi
 
 @pytest.mark.recordings
 @pytest.mark.parametrize("name", ["colonoscopy_a", "colonoscopy_b"])
-def test_a_short_recording_of_another_scope_passes(recordings_dir, name):
+def test_sharpness_gate_passes_short_colonoscopy_recordings(recordings_dir, name):
     paths = sorted((recordings_dir / "others" / name / "images").iterdir())
     assert set(faults([np.ascontiguousarray(cv2.imread(str(path))[..., ::-1]) for path in paths], fps=25.0)) == {None}
 
 
-def test_frames_that_cannot_be_measured_keep_the_fault_for_a_moment_only():
+def test_sharpness_gate_unmeasurable_frames_keep_fault_briefly():
     images = texture(3, 20, 320, 256)
     flat = [np.full_like(images[0], 90)] * 80
     found = faults([*images, defocused(images[0]), *flat])
@@ -172,7 +172,7 @@ def test_frames_that_cannot_be_measured_keep_the_fault_for_a_moment_only():
     assert set(faults([*images, *flat])) == {None}
 
 
-def test_the_usual_sharpness_is_of_the_recent_time_whatever_the_rate_of_looks():
+def test_sharpness_gate_usual_sharpness_window_is_time_not_frames():
     """Ordinary frames are examined a few times a second, all others each: the window is of time, not of frames."""
     images = texture(7, 80, 320, 256)
     gate = SharpnessGate()
@@ -184,7 +184,7 @@ def test_the_usual_sharpness_is_of_the_recent_time_whatever_the_rate_of_looks():
     assert [still.fault(image, 0) for image in [*images[:10], *map(defocused, images[10:30])]].count(None) >= 10
 
 
-def test_another_scene_has_its_own_usual():
+def test_sharpness_gate_start_scene_resets_usual_sharpness():
     images = texture(8, 20, 320, 256)
     gate = SharpnessGate()
     for k, image in enumerate(images):
@@ -193,7 +193,7 @@ def test_another_scene_has_its_own_usual():
     assert [gate.fault(defocused(image), (20 + k) * 33_000_000) for k, image in enumerate(images)] == [None] * 20
 
 
-def test_what_is_left_out_does_not_count():
+def test_sharpness_gate_ignores_masked_pixels():
     images = [image.copy() for image in texture(4, 20, 320, 256)]
     kept = np.ones(images[0].shape[:2], np.uint8)
     kept[:, :276] = 0
@@ -205,7 +205,7 @@ def test_what_is_left_out_does_not_count():
 
 @settings(deadline=None, max_examples=40)
 @given(st.integers(1, 60), st.integers(1, 60), st.integers(0, 2**32))
-def test_no_picture_of_any_size_raises(height, width, seed):
+def test_sharpness_gate_accepts_images_of_any_size(height, width, seed):
     rng = np.random.default_rng(seed)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(changes, "RECENT_FRAMES", 1)
@@ -226,7 +226,7 @@ def test_no_picture_of_any_size_raises(height, width, seed):
         ("smoke", 1, (0.5, 0.435, 20), None),
     ],
 )  # fmt: skip
-def test_limits_of_blur_and_smoke(before, sharpness, clear, said):
+def test_sharpness_gate_blur_and_smoke_thresholds(before, sharpness, clear, said):
     """Usual are a contrast of 1, a saturation of 0.5 and a haze of 20 levels."""
     gate = SharpnessGate()
     gate._clear[:5] = np.array([[0.2, 0.1, 1], [0.9, 0.45, 10], [1, 0.5, 20], [1.5, 0.8, 30], [2, 0.9, 90]])
@@ -244,21 +244,21 @@ def gate_of(monkeypatch, seen):
 SHARP = Appearance(0.4, 0.4, 1.0, 0.5, 20.0)
 
 
-def test_a_faulty_frame_keeps_its_fault_for_1_5_seconds_without_a_measure(monkeypatch):
+def test_sharpness_gate_keeps_fault_1_5_seconds_without_measurement(monkeypatch):
     blurred = Appearance(0.2, 0.4, 1.0, 0.5, 20.0)
     gate = gate_of(monkeypatch, [*[SHARP] * 10, blurred, *[None] * 20])
     said = [gate.fault(np.zeros((2, 2, 3), np.uint8), k * 140_000_000) for k in range(31)]
     assert said == [None] * 10 + ["blur"] * 11 + [None] * 10
 
 
-def test_the_first_five_frames_pass_and_the_sixth_is_compared(monkeypatch):
+def test_sharpness_gate_passes_first_five_frames_unconditionally(monkeypatch):
     blurred = Appearance(0.4, 0.2, 1.0, 0.5, 20.0)
     gate = gate_of(monkeypatch, [*[SHARP] * 4, blurred, blurred])
     said = [gate.fault(np.zeros((2, 2, 3), np.uint8), k * 30_000_000) for k in range(6)]
     assert said == [None] * 5 + ["blur"]
 
 
-def test_a_clock_that_stands_still_counts_a_millisecond_and_a_gap_three_tenths_of_a_second(monkeypatch):
+def test_sharpness_gate_clamps_intervals_to_1_ms_and_0_3_s(monkeypatch):
     gate = gate_of(monkeypatch, [SHARP] * 3)
     for pts_ns in (0, 0, 60_000_000_000):
         gate.fault(np.zeros((2, 2, 3), np.uint8), pts_ns)
@@ -266,7 +266,7 @@ def test_a_clock_that_stands_still_counts_a_millisecond_and_a_gap_three_tenths_o
 
 
 @pytest.mark.parametrize(("fps", "frames"), [(2, 5), (10, 15), (30, 45)])
-def test_usual_sharpness_is_that_of_a_second_and_a_half_and_of_five_frames_at_least(monkeypatch, fps, frames):
+def test_sharpness_gate_window_is_1_5_seconds_and_five_frames_at_least(monkeypatch, fps, frames):
     gate = gate_of(monkeypatch, [SHARP] * 120)
     for k in range(120):
         gate.fault(np.zeros((2, 2, 3), np.uint8), round(k * 1e9 / fps))
@@ -281,20 +281,20 @@ def waves(across, down, size=(256, 320), amplitude=50.0):
 
 
 @pytest.mark.parametrize(("across", "down"), [(32, 32), (40, 32), (64, 40)])
-def test_sharpness_of_sine_waves_is_the_ratio_of_their_differences(across, down):
+def test_appearance_sharpness_of_sine_waves_matches_closed_form(across, down):
     """The difference of a sine over d pixels has the amplitude 2 sin(pi d / period)."""
     seen = appearance(waves(across, down))
     expected = [np.sin(np.pi / period) / np.sin(8 * np.pi / period) for period in (down, across)]
     assert [seen.rows, seen.columns] == pytest.approx(expected, rel=0.06)
 
 
-def test_large_pictures_are_measured_at_320_pixels():
+def test_appearance_measures_large_images_at_320_pixels():
     large = np.repeat(np.repeat(waves(40, 40), 4, 0), 4, 1)
     small, seen = appearance(waves(40, 40)), appearance(large)
     assert (seen.rows, seen.columns) == pytest.approx((small.rows, small.columns), rel=0.02)
 
 
-def test_contrast_saturation_and_haze_of_two_colours():
+def test_appearance_contrast_saturation_and_haze_of_two_colours():
     image = waves(32, 32, amplitude=4)[..., :1] - 128.0
     image = np.concatenate([image[:, :160] + [120, 60, 80], image[:, 160:] + [200, 100, 150]], axis=1)
     seen = appearance(np.rint(image).astype(np.uint8))
@@ -304,7 +304,7 @@ def test_contrast_saturation_and_haze_of_two_colours():
 
 
 @pytest.mark.parametrize(("rows", "is_measured"), [(2, False), (26, True)])
-def test_a_picture_needs_some_usable_pixels(rows, is_measured):
+def test_appearance_requires_usable_pixels(rows, is_measured):
     kept = np.zeros((256, 320), np.uint8)
     kept[100 : 100 + rows] = 1
     assert (appearance(waves(32, 32), kept) is not None) == is_measured
@@ -313,12 +313,12 @@ def test_a_picture_needs_some_usable_pixels(rows, is_measured):
     assert (appearance(dark) is not None) == is_measured
 
 
-def test_a_flat_picture_has_no_sharpness():
+def test_appearance_of_flat_image_is_none():
     assert appearance(np.full((256, 320, 3), 120, np.uint8)) is None
     assert appearance(waves(32, 32, (16, 16))) is None and appearance(waves(32, 32, (18, 18))) is not None
 
 
-def test_usual_sharpness_is_the_median_weighted_by_the_intervals():
+def test_usual_sharpness_is_median_weighted_by_intervals():
     gate = SharpnessGate()
     gate._recent.extend([(0.1, 0.3, 0.9), (0.1, 0.4, 0.8), (1.0, 0.5, 0.2)])
     assert gate._usual_sharpness() == (0.5, 0.2)

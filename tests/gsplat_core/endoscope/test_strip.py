@@ -56,7 +56,7 @@ DRAWN = {
 
 
 @pytest.mark.parametrize("what", DRAWN)
-def test_what_is_drawn_is_left_out_and_little_else(what):
+def test_strip_detector_masks_overlays_and_little_else(what):
     draw, place = DRAWN[what]
     mask = last_mask(drawn_into(texture(1, FRAMES, WIDTH, HEIGHT), draw))
     there = np.zeros((HEIGHT, WIDTH), bool)
@@ -66,12 +66,12 @@ def test_what_is_drawn_is_left_out_and_little_else(what):
     assert (mask[~around] == 0).mean() < 0.002
 
 
-def test_tissue_alone_has_none():
+def test_strip_detector_finds_none_on_tissue():
     assert last_mask(texture(2, FRAMES, WIDTH, HEIGHT)) is None
 
 
 @pytest.mark.slow
-def test_a_strip_that_goes_away_is_gone_after_a_while():
+def test_strip_detector_drops_vanished_strip():
     images = texture(3, 2 * FRAMES, WIDTH, HEIGHT)
     detector = StripDetector()
     for image in drawn_into(images[:FRAMES], strip_below):
@@ -83,7 +83,7 @@ def test_a_strip_that_goes_away_is_gone_after_a_while():
 
 
 @pytest.mark.recordings
-def test_the_panels_below_cutting_are_found(recordings_dir):
+def test_strip_detector_finds_panels_below_cutting(recordings_dir):
     mask = last_mask(clip(recordings_dir, "cutting"))
     assert (mask[506:, 5:330] == 0).mean() > 0.9
     assert (mask[:495] == 0).mean() < 0.002
@@ -91,13 +91,13 @@ def test_the_panels_below_cutting_are_found(recordings_dir):
 
 @pytest.mark.recordings
 @pytest.mark.parametrize("name", [name for name in PLACES if name != "sinus"])
-def test_little_of_a_recording_is_taken_for_a_strip(recordings_dir, name):
+def test_strip_detector_masks_little_of_recordings(recordings_dir, name):
     mask = last_mask(clip(recordings_dir, name) * 2)
     assert mask is None or (mask == 0).mean() < 0.015
 
 
 @pytest.mark.recordings
-def test_a_recorder_with_text_over_a_beating_heart_is_found(recordings_dir):
+def test_strip_detector_finds_strip_and_text_over_beating_heart(recordings_dir):
     images = [cv2.resize(image, (WIDTH, HEIGHT)) for image in clip(recordings_dir, "heart")[:FRAMES]]
     mask = last_mask(drawn_into(images, lambda image: (strip_below(image), text_above(image))))
     assert (mask[-14:] == 0).mean() > 0.7 and (mask[5:14, 8:60] == 0).mean() > 0.7
@@ -106,7 +106,7 @@ def test_a_recorder_with_text_over_a_beating_heart_is_found(recordings_dir):
 
 @settings(deadline=None, max_examples=20)
 @given(st.integers(1, 90), st.integers(1, 90), st.integers(0, 2**32))
-def test_no_picture_of_any_size_raises(height, width, seed):
+def test_strip_detector_accepts_images_of_any_size(height, width, seed):
     rng = np.random.default_rng(seed)
     image = rng.integers(0, 256, (height, width, 3), np.uint8)
     with pytest.MonkeyPatch.context() as patch:

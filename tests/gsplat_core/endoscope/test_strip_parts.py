@@ -34,7 +34,7 @@ def detector_with(bands: list[Fixed], shape: tuple[int, int] = (100, 120)) -> tu
     return detector, image
 
 
-def test_each_border_is_examined_in_every_fourth_frame_and_a_strip_needs_two_decisions() -> None:
+def test_strip_detector_examines_borders_in_turn_and_needs_two_decisions() -> None:
     bands = [Fixed() for _ in range(4)]
     detector, image = detector_with(bands)
     bands[2].rows = slice(90, None)
@@ -53,7 +53,7 @@ def test_each_border_is_examined_in_every_fourth_frame_and_a_strip_needs_two_dec
 
 
 @pytest.mark.parametrize(("shift", "is_found"), [(2, True), (3, False)])
-def test_decisions_agree_within_two_pixels(shift: int, is_found: bool) -> None:
+def test_strip_decisions_agree_within_two_pixels(shift: int, is_found: bool) -> None:
     bands = [Fixed() for _ in range(4)]
     detector, image = detector_with(bands)
     for round_ in range(2):
@@ -66,7 +66,7 @@ def test_decisions_agree_within_two_pixels(shift: int, is_found: bool) -> None:
         assert np.flatnonzero((detector.mask == 0).any(1)).tolist() == [52]
 
 
-def test_the_same_overlays_keep_the_same_array_and_another_size_forgets_them() -> None:
+def test_strip_mask_array_reused_until_overlays_or_size_change() -> None:
     bands = [Fixed() for _ in range(4)]
     detector, image = detector_with(bands)
     bands[0].rows = slice(0, 5)
@@ -79,7 +79,7 @@ def test_the_same_overlays_keep_the_same_array_and_another_size_forgets_them() -
     assert detector.observe(np.zeros((60, 80, 3), np.uint8)) is None
 
 
-def test_a_large_picture_is_subsampled_and_its_mask_is_as_large_as_it_is() -> None:
+def test_strip_detector_subsamples_large_image_and_returns_full_size_mask() -> None:
     bands = [Fixed() for _ in range(4)]
     side = 2 * artefacts.LONG_SIDE_PX
     detector, image = detector_with(bands, (side // 2, side))
@@ -92,14 +92,14 @@ def test_a_large_picture_is_subsampled_and_its_mask_is_as_large_as_it_is() -> No
 
 
 @pytest.mark.parametrize(("side", "has_bands"), [(artefacts.SMALLEST_PX, True), (artefacts.SMALLEST_PX - 1, False)])
-def test_small_pictures_have_no_overlays(side: int, has_bands: bool) -> None:
+def test_strip_detector_skips_small_images(side: int, has_bands: bool) -> None:
     detector = StripDetector()
     for shape in ((side, 200), (200, side)):
         detector.observe(np.zeros((*shape, 3), np.uint8))
         assert bool(detector._bands) == has_bands
 
 
-def test_bands_are_a_twelfth_of_the_side_they_cut_and_eight_pixels_at_least() -> None:
+def test_strip_band_depth_is_twelfth_of_side_and_eight_pixels_at_least() -> None:
     detector = StripDetector()
     detector.observe(np.zeros((200, 300, 3), np.uint8))
     assert [band._depth_px for band in detector._bands] == [16, 24, 16, 24]
@@ -108,7 +108,7 @@ def test_bands_are_a_twelfth_of_the_side_they_cut_and_eight_pixels_at_least() ->
 
 
 @pytest.mark.parametrize("turns", range(4))
-def test_a_band_marks_its_own_border(turns: int) -> None:
+def test_band_marks_own_border(turns: int) -> None:
     band = _Band(turns, 6)
     plane = np.zeros((30, 40), bool)
     band._of(plane)[-2:] = True
@@ -125,7 +125,7 @@ def levels(*columns: int) -> np.ndarray:
     return made
 
 
-def test_means_of_gradients_are_those_of_all_frames_up_to_forty() -> None:
+def test_band_gradient_means_cover_up_to_forty_frames() -> None:
     rng = np.random.default_rng(0)
     values = rng.integers(0, 200, 40)
     band = _Band(0, 8)
@@ -141,7 +141,7 @@ def test_means_of_gradients_are_those_of_all_frames_up_to_forty() -> None:
 
 
 @pytest.mark.parametrize(("spread", "is_marked"), [(4, True), (60, False)])
-def test_an_edge_that_moves_is_no_strip(spread: int, is_marked: bool) -> None:
+def test_band_ignores_moving_edge(spread: int, is_marked: bool) -> None:
     """A horizontal step of 100 levels with a deviation of `spread`; it must be 2.5 times as large."""
     band, drawn = _Band(0, 20), np.zeros((60, 80), bool)
     for frame in range(40):
@@ -178,7 +178,7 @@ def below(first: int, columns: slice) -> np.ndarray:
     ],
     ids=str,
 )  # fmt: skip
-def test_a_strip_is_below_an_unbroken_edge(edge: Any, columns: slice) -> None:
+def test_band_strip_requires_unbroken_edge(edge: Any, columns: slice) -> None:
     """One pixel more, because edges may be tilted by a pixel."""
     np.testing.assert_array_equal(_Band(0, 20)._strips(*edge), below(11, columns))
 
@@ -198,7 +198,7 @@ def text(width: int, height: int, strength: float = 25.0, steadiness: float = 5.
     ],
     ids=str,
 )  # fmt: skip
-def test_text_has_a_width_of_a_fiftieth_of_the_band_and_a_height_of_three_pixels(given: Any, is_text: bool) -> None:
+def test_text_minimum_width_height_and_strength(given: Any, is_text: bool) -> None:
     found = _text(*given)
     assert found.any() == is_text
     if is_text:  # with two pixels around
@@ -208,14 +208,14 @@ def test_text_has_a_width_of_a_fiftieth_of_the_band_and_a_height_of_three_pixels
 
 
 @pytest.mark.parametrize(("gap", "height"), [(6, True), (7, False)])
-def test_letters_up_to_six_pixels_apart_are_one_text(gap: int, height: bool) -> None:
+def test_text_joins_letters_up_to_six_pixels_apart(gap: int, height: bool) -> None:
     strength = np.zeros((2, 30, 200), np.float32)
     for start in (50, 50 + 3 + gap):  # each letter is too narrow alone
         strength[0, 10:20, start : start + 3] = 30
     assert _text(strength, strength).any() == height
 
 
-def test_a_sparse_outline_is_no_text() -> None:
+def test_text_ignores_sparse_outline() -> None:
     """A diagonal line fills a small part of its bounding box."""
     strength = np.zeros((2, 40, 200), np.float32)
     for k in range(40):

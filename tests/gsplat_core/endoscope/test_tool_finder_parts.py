@@ -30,17 +30,17 @@ def peaks(grey: float, red: float, share: float = 0.3, width: float = 0.03) -> n
 
 
 @pytest.mark.parametrize(("grey", "red"), [(0.0, 0.3), (0.05, 0.4), (-0.05, 0.25)])
-def test_the_threshold_is_between_the_peaks_of_tools_and_tissue(grey, red):
+def test_valley_lies_between_tool_and_tissue_peaks(grey, red):
     threshold, found = valley(peaks(grey, red))
     assert found and grey + 0.06 < threshold < red - 0.06
 
 
-def test_without_two_peaks_the_threshold_is_the_usual_one():
+def test_valley_without_two_peaks_returns_default():
     for histogram in (None, peaks(0.3, 0.3), np.full(100, 0.01)):
         assert valley(histogram) == (NO_VALLEY, False)
 
 
-def test_the_nearer_of_two_valleys_to_the_expected_one_is_taken():
+def test_valley_prefers_candidate_nearest_to_expected():
     """Between three equal peaks at equal distances."""
     bell = lambda centre: np.exp(-0.5 * ((BIN_CENTRES - centre) / 0.02) ** 2)
     histogram = bell(-0.15) + bell(0.05) + bell(0.25)
@@ -48,20 +48,20 @@ def test_the_nearer_of_two_valleys_to_the_expected_one_is_taken():
     assert found and abs(threshold - EXPECTED_VALLEY) < 0.05
 
 
-def test_a_valley_beyond_pale_tissue_is_none():
+def test_valley_rejected_beyond_pale_tissue():
     assert valley(peaks(0.3, 0.65))[1] is False
     threshold, found = valley(peaks(0.15, 0.45))
     assert found and threshold <= HIGHEST_VALLEY
 
 
 @pytest.mark.parametrize(("share", "found"), [(0.001, False), (0.05, True)])
-def test_a_few_grey_pixels_are_no_peak(share, found):
+def test_valley_ignores_few_grey_pixels(share, found):
     """Three of a thousand pixels must be greyer than the threshold."""
     assert valley(peaks(0.0, 0.4, share))[1] == found
 
 
 @pytest.mark.parametrize("stretch", [1.0, 2.0, 4.0])
-def test_a_stretched_distribution_is_that_of_the_stretched_values(stretch):
+def test_histogram_with_stretch_equals_histogram_of_stretched_values(stretch):
     values = np.random.default_rng(0).normal(0.1 / stretch, 0.1 / stretch, 20_000)
     below = np.append(0.0, np.cumsum(np.histogram(values, FINE_EDGES)[0]))
     found = tools._histogram(below, stretch)
@@ -71,7 +71,7 @@ def test_a_stretched_distribution_is_that_of_the_stretched_values(stretch):
     assert tools._histogram(far, 1.0)[[0, -1]].tolist() == [0.25, 0.75], "values beyond count in the outer bins"
 
 
-def test_redness_is_the_logarithm_of_red_over_the_others():
+def test_redness_is_logarithm_of_red_over_green_and_blue():
     """Half against the mean of green and blue, half against the smaller of them, with an offset for dark pixels."""
     red, green, blue = 200, 80, 120
     view = view_of(np.full((60, 80, 3), (red, green, blue), np.uint8))
@@ -85,12 +85,12 @@ def test_redness_is_the_logarithm_of_red_over_the_others():
 
 
 @pytest.mark.parametrize(("size", "small"), [((80, 60), (80, 60)), ((320, 200), (160, 100)), ((200, 640), (50, 160))])
-def test_a_picture_is_reduced_to_its_longer_side(size, small):
+def test_view_of_reduces_image_by_longer_side(size, small):
     view = view_of(np.full((size[1], size[0], 3), 90, np.uint8))
     assert view.redness.shape == view.inside.shape == small[::-1] and max(small) <= LONG_SIDE_PX
 
 
-def test_the_field_of_view_is_what_is_not_dark_from_the_border_on():
+def test_field_of_view_excludes_darkness_connected_to_border():
     bright = np.full((40, 60), 200, np.uint8)
     bright[:, :10] = 23
     bright[15:25, 30:40] = 5  # a cavity
@@ -103,7 +103,7 @@ def test_the_field_of_view_is_what_is_not_dark_from_the_border_on():
 
 
 @pytest.mark.parametrize(("level", "is_dark"), [(8, True), (9, False)])
-def test_dark_is_less_than_a_seventh_of_the_brightest_pixel(level, is_dark):
+def test_field_of_view_dark_threshold(level, is_dark):
     bright = np.full((40, 60), 60, np.uint8)  # 0.15 times 60 levels are 9
     bright[:5] = level
     assert (field_of_view(bright)[0, 0] == 0) == is_dark
@@ -117,13 +117,13 @@ LIT = np.ones((80, 100), np.uint8)
 
 
 @pytest.mark.parametrize(("value", "stretch"), [(0.9, 1.0), (0.4, 2.0), (0.1, 4.0), (0.05, 4.0)])
-def test_pale_scenes_are_stretched_up_to_four_times(value, stretch):
+def test_tool_finder_stretches_pale_scenes_up_to_four_times(value, stretch):
     finder, plane = ToolFinder(), redness(value, 1e-4)
     np.testing.assert_allclose(finder._stretched(plane, LIT), stretch * plane, rtol=0.02)
     assert finder._histogram.sum() == pytest.approx(1)
 
 
-def test_a_distribution_adapts_by_a_tenth_and_starts_anew_in_another_scene():
+def test_tool_finder_histogram_adapts_by_tenth_and_restarts_in_new_scene():
     finder = ToolFinder()
     finder._stretched(redness(0.4, 0.3), LIT)
     first, stretch = finder._histogram.copy(), finder._stretch
@@ -159,21 +159,21 @@ def held(monkeypatch: pytest.MonkeyPatch, shares: list[float]) -> list[float]:
     return found
 
 
-def test_tools_that_lose_more_than_six_tenths_are_held_for_three_frames(monkeypatch):
+def test_tool_finder_holds_tools_three_frames_after_large_loss(monkeypatch):
     assert held(monkeypatch, [0.5, 0.2, 0.07, 0.07]) == [0.5, 0.2, 0.2, 0.2]
     assert held(monkeypatch, [0.5, 0.1, 0.1, 0.1, 0.1, 0.1]) == [0.5, 0.5, 0.5, 0.5, 0.1, 0.1]
     assert held(monkeypatch, [0.5, 0.0, 0.4, 0.0, 0.0, 0.0, 0.0]) == [0.5, 0.5, 0.4, 0.4, 0.4, 0.4, 0.0]
     assert held(monkeypatch, [0.1, 0.9, 0.3, 0.3]) == [0.1, 0.9, 0.9, 0.9]
 
 
-def test_a_dark_picture_has_no_tools_and_forgets_those_before(monkeypatch):
+def test_tool_finder_dark_image_has_no_tools_and_clears_previous(monkeypatch):
     finder = ToolFinder()
     finder._previous = LIT
     assert not finder._find(view(0)).any() and finder._previous is None
 
 
 @pytest.mark.parametrize(("side", "is_examined"), [(SMALLEST_PX, True), (SMALLEST_PX - 1, False)])
-def test_small_pictures_are_all_tissue(monkeypatch, side, is_examined):
+def test_tool_finder_treats_small_images_as_tissue(monkeypatch, side, is_examined):
     finder = ToolFinder()
     monkeypatch.setattr(finder, "_find", lambda view: np.ones(view.redness.shape, np.uint8))
     for shape in ((side, 40), (40, side)):

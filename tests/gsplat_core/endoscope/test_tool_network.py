@@ -28,7 +28,7 @@ def finder():
 
 
 @pytest.mark.parametrize("size", [(256, 320), (540, 540), (360, 640)])
-def test_an_instrument_is_found_in_pictures_of_any_size(finder, size):
+def test_network_finder_finds_instrument_at_any_image_size(finder, size):
     image, rod = with_rod(*size)
     found = finder.find(image)
     assert found.shape == size and found.dtype == np.uint8 and set(np.unique(found)) <= {0, 1}
@@ -36,11 +36,11 @@ def test_an_instrument_is_found_in_pictures_of_any_size(finder, size):
     assert overlap > 0.7
 
 
-def test_nothing_is_found_on_plain_tissue(finder):
+def test_network_finder_finds_nothing_on_plain_tissue(finder):
     assert finder.find(tissue(256, 320)).all()
 
 
-def test_equal_pictures_get_equal_masks_from_any_finder(finder):
+def test_network_finder_masks_are_deterministic(finder):
     image, _ = with_rod(256, 320)
     first = finder.find(image)
     finder.find(tissue(256, 320))
@@ -48,19 +48,19 @@ def test_equal_pictures_get_equal_masks_from_any_finder(finder):
     np.testing.assert_array_equal(NetworkToolFinder().find(image), first)
 
 
-def test_a_tiny_picture_is_all_tissue(finder):
+def test_network_finder_treats_tiny_image_as_tissue(finder):
     assert finder.find(np.full((20, 300, 3), 128, np.uint8)).all()
 
 
 @pytest.mark.parametrize(
     "image", [np.zeros((64, 64), np.uint8), np.zeros((64, 64, 3), np.float32), np.zeros((64, 64, 4), np.uint8)]
 )
-def test_an_array_that_is_no_picture_is_refused(finder, image):
+def test_network_finder_rejects_arrays_other_than_rgb_uint8(finder, image):
     with pytest.raises(InvalidInput, match=r"image must be RGB uint8 \[H, W, 3\], got"):
         finder.find(image)
 
 
-def test_small_regions_inside_the_view_are_no_tools():
+def test_remove_inner_regions_drops_small_regions_away_from_border():
     """A region at the border of the picture or of a round view stays, and so does a large one inside."""
     view = np.ones((96, 128), np.uint8)
     view[:, :20] = 0
@@ -75,7 +75,7 @@ def test_small_regions_inside_the_view_are_no_tools():
     np.testing.assert_array_equal(levels, wanted)
 
 
-def test_a_round_view_has_four_dark_corners():
+def test_round_view_requires_four_dark_corners():
     image, _ = in_round_view(tissue(96, 128))
     assert round_view(image)
     assert not round_view(tissue(96, 128))
@@ -86,7 +86,7 @@ def test_a_round_view_has_four_dark_corners():
     assert not round_view(printed)
 
 
-def test_pictures_with_a_round_view_have_a_network_of_their_own(finder):
+def test_network_finder_uses_separate_network_for_round_view(finder):
     """It finds the instrument inside of the view, and differs from the other network."""
     image, rod = with_rod(256, 320)
     image, inside = in_round_view(image)
@@ -97,11 +97,11 @@ def test_pictures_with_a_round_view_have_a_network_of_their_own(finder):
     assert (found != (NetworkToolFinder(NETWORK).find(image) == 0)).any()
 
 
-def test_nothing_is_found_on_plain_tissue_in_a_round_view(finder):
+def test_network_finder_finds_nothing_on_plain_tissue_in_round_view(finder):
     assert finder.find(in_round_view(tissue(256, 320))[0]).all()
 
 
-def test_round_views_and_full_pictures_each_have_their_own_network(finder):
+def test_network_finder_selects_network_by_view_shape(finder):
     full, _ = with_rod(256, 320)
     around = in_round_view(full)[0]
     only_full = NetworkToolFinder(NETWORK)
@@ -126,7 +126,7 @@ def barred(image, bars):
 
 
 @pytest.mark.parametrize("bars", BARS.values(), ids=BARS)
-def test_black_bars_do_not_change_what_is_found_between_them(finder, bars):
+def test_network_finder_result_independent_of_black_bars(finder, bars):
     image, _ = with_rod(256, 320)
     found = finder.find(barred(image, bars))
     np.testing.assert_array_equal(found, 1 - barred(1 - finder.find(image), bars))
@@ -134,7 +134,7 @@ def test_black_bars_do_not_change_what_is_found_between_them(finder, bars):
 
 
 @pytest.mark.parametrize("bars", [(20, 20, 0, 0), (0, 0, 60, 60), (30, 31, 40, 41)], ids=str)
-def test_black_bars_around_a_round_view_do_not_change_its_network(finder, bars):
+def test_network_finder_uses_round_network_with_black_bars(finder, bars):
     image = barred(in_round_view(with_rod(256, 320)[0])[0], bars)
     np.testing.assert_array_equal(finder.find(image), only_round().find(image))
 
@@ -144,7 +144,7 @@ def only_round():
 
 
 @pytest.mark.parametrize("bars", [(300, 300, 0, 0), (150, 451, 0, 0), (0, 0, 400, 400), (0, 0, 100, 601)], ids=str)
-def test_long_black_bars_around_a_round_view_do_not_change_what_is_found(finder, bars):
+def test_network_finder_round_view_result_independent_of_long_black_bars(finder, bars):
     """The view has the aspect ratio of the network's input."""
     view, _ = in_round_view(with_rod(240, 320)[0])
     found = finder.find(barred(view, bars))
@@ -154,7 +154,7 @@ def test_long_black_bars_around_a_round_view_do_not_change_what_is_found(finder,
     assert (squashed != found).any(), "a view that is resized with its bars is seen differently"
 
 
-def test_a_round_view_is_examined_whole_from_three_quarters_to_one_and_a_half_of_the_input_s_aspect_ratio():
+def test_around_view_crops_only_outside_supported_aspect_ratios():
     def examined(height, width, view=96):
         image = np.zeros((height, width, 3), np.uint8)
         top, left = (height - view) // 2, (width - view) // 2
@@ -170,7 +170,7 @@ def test_a_round_view_is_examined_whole_from_three_quarters_to_one_and_a_half_of
     assert examined(300, 120, view=60) == (slice(105, 195), slice(0, 120))
 
 
-def test_the_part_with_the_view_stays_within_the_picture():
+def test_around_view_stays_within_image():
     image = np.zeros((300, 120, 3), np.uint8)
     for top, rows in ((0, slice(0, 90)), (260, slice(210, 300))):
         shown = image.copy()
@@ -179,19 +179,19 @@ def test_the_part_with_the_view_stays_within_the_picture():
     assert around_view(image, (128, 96)) == (slice(0, 300), slice(0, 120))
 
 
-def test_text_in_a_black_bar_is_no_content():
+def test_between_bars_ignores_text_in_black_bar():
     image = barred(tissue(120, 160), (30, 20, 40, 10))
     image[5:12, 60:90] = 255
     assert between_bars(image) == (slice(30, 150), slice(40, 200))
 
 
-def test_a_black_picture_has_no_bars():
+def test_between_bars_of_black_image_is_whole_image():
     assert between_bars(np.zeros((96, 128, 3), np.uint8)) == (slice(None), slice(None))
 
 
-def test_a_black_picture_is_all_tissue(finder):
+def test_network_finder_treats_black_image_as_tissue(finder):
     assert finder.find(np.zeros((96, 128, 3), np.uint8)).all()
 
 
-def test_a_narrow_strip_between_black_bars_is_all_tissue(finder):
+def test_network_finder_treats_narrow_strip_between_bars_as_tissue(finder):
     assert finder.find(barred(with_rod(20, 320)[0], (100, 100, 0, 0))).all()

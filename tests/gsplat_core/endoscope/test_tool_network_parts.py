@@ -16,7 +16,7 @@ from gsplat_core.endoscope.tools import (
 )
 
 
-def test_the_planes_are_colours_and_logarithms_of_their_ratios():
+def test_features_are_colours_and_logarithms_of_ratios():
     small = np.random.default_rng(0).integers(0, 256, (30, 40, 3), np.uint8)
     planes = features(small, 8)[0]
     np.testing.assert_allclose(planes[:3], small.transpose(2, 0, 1) / 255 * 2 - 1, atol=1e-6)
@@ -30,7 +30,7 @@ def test_the_planes_are_colours_and_logarithms_of_their_ratios():
 
 
 @pytest.mark.parametrize(("level", "is_inside"), [(15, False), (16, True)])
-def test_means_are_those_of_the_field_of_view(level, is_inside):
+def test_features_means_cover_field_of_view_only(level, is_inside):
     small = np.full((30, 40, 3), 100, np.uint8)
     small[:15] = level
     assert (abs(features(small, 8)[0, 7, 20, 20]) > 0.1) == is_inside
@@ -51,18 +51,18 @@ def corners(share: float, level: int = 5) -> np.ndarray:
     ("share", "level", "is_round"),
     [(1.0, 5, True), (0.76, 5, True), (0.74, 5, False), (1.0, 15, True), (1.0, 16, False)],
 )
-def test_a_view_is_round_if_three_quarters_of_each_corner_are_dark(share, level, is_round):
+def test_round_view_requires_three_quarters_dark_per_corner(share, level, is_round):
     assert round_view(corners(share, level)) == is_round
 
 
 @pytest.mark.parametrize("corner", range(4))
-def test_one_bright_corner_is_enough_for_a_full_picture(corner):
+def test_round_view_false_with_one_bright_corner(corner):
     small = corners(1.0)
     small[np.s_[:10] if corner < 2 else np.s_[-10:], np.s_[:20] if corner % 2 else np.s_[-20:]] = 90
     assert not round_view(small)
 
 
-def test_logits_are_limited_smoothed_and_move_to_edges_of_the_picture():
+def test_along_edges_limits_logits_and_aligns_with_image_edges():
     small = np.full((40, 80, 3), (180, 60, 60), np.uint8)
     small[:, 41:] = 120
     logits = np.full((20, 40), -9.0, np.float32)
@@ -86,9 +86,7 @@ def levels_with(side: int, left: int, value: int = 200) -> np.ndarray:
         (14, 83, 200, False), (14, 84, 200, True), (14, 50, 129, False), (14, 50, 128, True),
     ],
 )  # fmt: skip
-def test_a_region_within_three_pixels_of_the_border_is_kept_and_one_inside_from_a_fiftieth_on(
-    side, left, value, is_kept
-):
+def test_remove_inner_regions_border_distance_and_size_thresholds(side, left, value, is_kept):
     """200 of 10,000 pixels. A level of 128 is no tool, and stays as it is."""
     assert NETWORK_INNER_REGION * 100 * 100 == 200
     levels = levels_with(side, left, value)
@@ -98,7 +96,7 @@ def test_a_region_within_three_pixels_of_the_border_is_kept_and_one_inside_from_
     np.testing.assert_array_equal(levels, before)
 
 
-def test_a_region_at_the_border_of_the_view_is_kept():
+def test_remove_inner_regions_keeps_region_at_view_border():
     view = np.zeros((100, 100), np.uint8)
     view[20:80, 20:80] = 1
     for left, is_kept in ((66, True), (62, False)):
@@ -108,7 +106,7 @@ def test_a_region_at_the_border_of_the_view_is_kept():
 
 
 @pytest.mark.parametrize(("logit", "is_tool"), [(-0.2, False), (0.2, True), (50.0, True)])
-def test_a_positive_logit_is_a_tool_inside_the_field_of_view(monkeypatch, logit, is_tool):
+def test_network_finder_positive_logit_in_field_of_view_is_tool(monkeypatch, logit, is_tool):
     logits = lambda planes: np.full((80, 80), logit, np.float32)
     network = tools._Network(logits, (160, 160), 5)
     monkeypatch.setattr(tools, "_loaded", lambda *_: network)

@@ -55,7 +55,7 @@ def noise(path, seed=0):
 
 
 @both_networks
-def test_logits_of_noise_are_those_of_opencv(path):
+def test_torch_network_logits_of_noise_equal_opencv(path):
     for seed in range(3):
         planes = noise(path, seed)
         wanted = in_opencv(path, planes)
@@ -66,14 +66,14 @@ def test_logits_of_noise_are_those_of_opencv(path):
 
 @both_networks
 @pytest.mark.parametrize("draw", [lambda: tissue(256, 320), lambda: with_rod(256, 320)[0]], ids=["tissue", "rod"])
-def test_logits_of_drawn_pictures_are_those_of_opencv(path, draw):
+def test_torch_network_logits_of_drawn_images_equal_opencv(path, draw):
     planes = features(averaged(draw(), INPUTS[path][0]), INPUTS[path][1])
     np.testing.assert_allclose(in_torch(path).logits(planes), in_opencv(path, planes), rtol=0, atol=BOUND)
 
 
 @pytest.mark.recordings
 @pytest.mark.parametrize("name", ["heart", "cutting", "others/colonoscopy_a"])
-def test_logits_and_masks_of_recordings_are_those_of_opencv(recordings_dir, in_both, name):
+def test_torch_network_logits_and_masks_of_recordings_equal_opencv(recordings_dir, in_both, name):
     """The colonoscopy has an octagonal view."""
     images = [frame.image for frame in open_recording(recordings_dir / name, max_frames=10)][::3]
     assert round_view(averaged(images[0], INPUT_PX)) == ("colonoscopy" in name)
@@ -101,7 +101,7 @@ def in_both(monkeypatch):
 
 
 @pytest.mark.parametrize("change", [lambda image: image, lambda image: in_round_view(image)[0]], ids=["full", "round"])
-def test_masks_of_drawn_instruments_are_those_of_opencv(in_both, change):
+def test_torch_network_masks_of_drawn_instruments_equal_opencv(in_both, change):
     by_torch, by_opencv = in_both
     image = change(with_rod(256, 320)[0])
     wanted = by_opencv.find(image)
@@ -109,7 +109,7 @@ def test_masks_of_drawn_instruments_are_those_of_opencv(in_both, change):
     assert (by_torch.find(image) != wanted).mean() <= BOUND
 
 
-def test_a_network_of_ones_own_is_run_on_the_same_device(in_both):
+def test_network_finder_runs_custom_network_on_requested_device(in_both):
     finder = NetworkToolFinder(ROUND_NETWORK, ROUND_INPUT_PX, ROUND_INPUTS, device="cuda")
     image = with_rod(256, 320)[0]
     wanted = NetworkToolFinder(ROUND_NETWORK, ROUND_INPUT_PX, ROUND_INPUTS).find(image)
@@ -117,19 +117,19 @@ def test_a_network_of_ones_own_is_run_on_the_same_device(in_both):
 
 
 @both_networks
-def test_equal_inputs_give_equal_bytes_that_later_calls_do_not_change(path):
+def test_torch_network_is_deterministic_and_keeps_earlier_results(path):
     first = in_torch(path).logits(noise(path))
     kept = first.tobytes()
     assert in_torch(path).logits(noise(path, 1)).tobytes() != kept
     assert first.tobytes() == kept == TorchToolNetwork(path, CPU).logits(noise(path)).tobytes()
 
 
-def test_an_input_of_another_size_is_refused():
+def test_torch_network_rejects_input_of_different_size():
     with pytest.raises(ValueError, match="broadcast"):
         in_torch(NETWORK).logits(noise(ROUND_NETWORK))
 
 
-def test_no_convolution_of_torch_is_called():
+def test_torch_network_calls_no_torch_convolution():
     """They would load cuDNN on a GPU."""
     called = []
 
@@ -154,7 +154,7 @@ def test_no_convolution_of_torch_is_called():
         ((3, 2), (2, 3), (1, 2), (3, 2)),
     ],
 )
-def test_convolutions_are_those_of_torch(generator, group, kernel_shape, dilations, padding, strides):
+def test_conv_operator_equals_torch_conv2d(generator, group, kernel_shape, dilations, padding, strides):
     options = {"generator": generator, "dtype": torch.float64}
     planes, bias = torch.randn(1, 8, 13, 16, **options), torch.randn(12, **options)
     weight = torch.randn(12, 8 // group, *kernel_shape, **options)
@@ -172,7 +172,7 @@ def test_convolutions_are_those_of_torch(generator, group, kernel_shape, dilatio
     torch.testing.assert_close(found, wanted)
 
 
-def test_different_padding_at_opposite_sides_is_refused():
+def test_conv_operator_rejects_asymmetric_padding():
     options = {"dilations": (1, 1), "group": 1, "kernel_shape": (3, 3), "strides": (1, 1)}
     tensors = torch.zeros(1, 1, 5, 5), torch.zeros(1, 1, 3, 3), torch.zeros(1)
     for pads in ((1, 1, 0, 1), (0, 1, 0, 0)):
@@ -203,26 +203,26 @@ def attribute_of(node, name):
     return next(attribute for attribute in node.attribute if attribute.name == name)
 
 
-def test_a_file_that_was_written_again_is_the_same_network(tmp_path):
+def test_torch_network_unchanged_by_rewriting_file(tmp_path):
     """Refused files below are refused for their changes."""
     planes = noise(NETWORK)
     path = changed(tmp_path, lambda graph: None)
     np.testing.assert_array_equal(TorchToolNetwork(path, CPU).logits(planes), in_torch(NETWORK).logits(planes))
 
 
-def test_a_missing_file_is_named(tmp_path):
+def test_torch_network_names_missing_file(tmp_path):
     with pytest.raises(InvalidSetting, match=r"tool network .*missing\.onnx cannot be read"):
         TorchToolNetwork(tmp_path / "missing.onnx", CPU)
 
 
-def test_a_file_without_a_graph_is_refused(tmp_path):
+def test_torch_network_rejects_file_without_graph(tmp_path):
     path = tmp_path / "empty.onnx"
     path.write_bytes(b"")
     with pytest.raises(InvalidSetting, match=r"tool network .*empty\.onnx cannot be run by torch"):
         TorchToolNetwork(path, CPU)
 
 
-def test_an_unknown_operator_is_named(tmp_path):
+def test_torch_network_names_unknown_operator(tmp_path):
     def change(graph):
         first_of(graph, "Relu").op_type = "Mish"
 
@@ -230,7 +230,7 @@ def test_an_unknown_operator_is_named(tmp_path):
 
 
 @pytest.mark.parametrize("operator", OPERATORS)
-def test_an_unknown_attribute_is_named(tmp_path, operator):
+def test_torch_network_names_unknown_attribute(tmp_path, operator):
     def change(graph):
         first_of(graph, operator).attribute.append(helper.make_attribute("extent", 2))
 
@@ -241,7 +241,7 @@ ATTRIBUTES = [(operator, name) for operator, known in OPERATORS.items() for name
 
 
 @pytest.mark.parametrize(("operator", "name"), sorted(ATTRIBUTES))
-def test_a_missing_attribute_is_named(tmp_path, operator, name):
+def test_torch_network_names_missing_attribute(tmp_path, operator, name):
     def change(graph):
         node = first_of(graph, operator)
         node.attribute.remove(attribute_of(node, name))
@@ -261,14 +261,14 @@ def test_a_missing_attribute_is_named(tmp_path, operator, name):
         ("Resize", "nearest_mode", "ceil", "floor"),
     ],
 )
-def test_another_value_of_an_attribute_is_named(tmp_path, operator, name, value, supported):
+def test_torch_network_names_unsupported_attribute_value(tmp_path, operator, name, value, supported):
     def change(graph):
         attribute_of(first_of(graph, operator), name).CopyFrom(helper.make_attribute(name, value))
 
     refused(tmp_path, change, f"{name} of its operator {operator} is {value}; it must be {supported}")
 
 
-def test_another_type_of_attribute_is_named(tmp_path):
+def test_torch_network_names_unsupported_attribute_type(tmp_path):
     def change(graph):
         first_of(graph, "Relu").attribute.append(helper.make_attribute("extents", [0.5, 1.5]))
 
@@ -283,7 +283,7 @@ def test_another_type_of_attribute_is_named(tmp_path):
     ],
     ids=["half precision", "not raw"],
 )
-def test_other_tensors_are_refused(tmp_path, make, kind):
+def test_torch_network_rejects_unsupported_tensors(tmp_path, make, kind):
     def change(graph):
         (bias,) = (tensor for tensor in graph.initializer if tensor.name == "stem.0.bias")
         bias.CopyFrom(make(numpy_helper.to_array(bias)))
@@ -291,7 +291,7 @@ def test_other_tensors_are_refused(tmp_path, make, kind):
     refused(tmp_path, change, f"the tensor 'stem.0.bias' of type {kind} is not supported; it must be raw float32 or")
 
 
-def test_a_finder_without_a_gpu_does_not_load_torch_networks(monkeypatch):
+def test_network_finder_without_gpu_loads_no_torch_network(monkeypatch):
     def fail(path, device):
         raise AssertionError(path)
 

@@ -14,7 +14,7 @@ from benchmarks.tool_network.train import INPUT_PX, Store, altered, export, from
 from gsplat_core.endoscope import tools
 
 
-def test_accessories_change_a_hollow_organ_only_under_their_mask():
+def test_accessory_changes_image_only_under_mask():
     covered = 0
     for seed in range(8):
         rng = np.random.default_rng(seed)
@@ -27,13 +27,13 @@ def test_accessories_change_a_hollow_organ_only_under_their_mask():
     assert covered >= 6
 
 
-def test_narrow_band_light_has_no_red():
+def test_narrow_band_removes_red():
     picture = np.zeros((4, 4, 3), np.float32)
     picture[..., 0] = 1
     assert not narrow_band(np.random.default_rng(0), picture).any()
 
 
-def test_new_pictures_replace_the_oldest():
+def test_store_replaces_oldest_images():
     store = Store(3, torch.device("cpu"))
     pictures = np.stack([np.full((128, 160, 4), value, np.uint8) for value in range(1, 5)])
     store.add(pictures[:2])
@@ -41,7 +41,7 @@ def test_new_pictures_replace_the_oldest():
     assert store.pictures[:, 0, 0, 0].tolist() == [4, 2, 3]
 
 
-def test_mirrored_and_turned_masks_follow_their_pictures():
+def test_altered_transforms_masks_with_images():
     """A picture that is bright exactly where the tool is stays so."""
     plain = torch.zeros((8, *INPUT_PX, 4))
     plain[:, 20:60, 30:80] = 1
@@ -51,7 +51,7 @@ def test_mirrored_and_turned_masks_follow_their_pictures():
     assert bright[cover == 0].max() < 0.4
 
 
-def test_the_product_computes_the_planes_of_training():
+def test_product_features_equal_training_features():
     """Also of a picture with a black surround, which the means leave out."""
     picture = np.random.default_rng(0).integers(0, 256, (*INPUT_PX, 3)).astype(np.uint8)
     picture[:, :40] = 3
@@ -59,7 +59,7 @@ def test_the_product_computes_the_planes_of_training():
     np.testing.assert_allclose(tools.features(picture, INPUTS), features(planes).numpy(), atol=1e-5)
 
 
-def test_opencv_computes_what_the_network_computes(tmp_path):
+def test_exported_network_in_opencv_equals_torch(tmp_path):
     torch.manual_seed(0)
     network = ToolNetwork().eval()
     picture = torch.randint(0, 256, (1, 128, 160, 4), dtype=torch.uint8)
@@ -73,7 +73,7 @@ def test_opencv_computes_what_the_network_computes(tmp_path):
     np.testing.assert_allclose(loaded.forward(), wanted, atol=1e-3 * float(np.abs(wanted).max()))
 
 
-def test_trainings_read_each_finished_file_of_a_folder_once(tmp_path):
+def test_from_files_reads_each_finished_file_once(tmp_path):
     pictures = np.full((2, 128, 160, 4), 7, np.uint8)
     for name in ("training_000_000000", "validation_000_000000", "training_001_000003.part"):
         np.save(tmp_path / f"{name}.npy", pictures)
@@ -86,7 +86,7 @@ def test_trainings_read_each_finished_file_of_a_folder_once(tmp_path):
     assert [validates for validates, _ in from_files(tmp_path, read)] == [False]
 
 
-def test_pale_dark_and_glaring_tissue_stays_a_picture():
+def test_pale_dark_and_glare_change_colour_in_expected_direction():
     """Pale tissue has less colour than before, black regions are darker, and highlights are brighter."""
     red = np.broadcast_to(np.float32([0.6, 0.15, 0.1]), (96, 120, 3)).copy()
     for seed in range(6):

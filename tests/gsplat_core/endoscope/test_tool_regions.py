@@ -53,32 +53,32 @@ def is_found(where, tissue=TISSUE, tool=TOOL, brightness=None, known=False):
         (patch(40, 50, 10, 10), True, True),
     ],
 )
-def test_a_region_inside_must_be_larger_than_one_at_the_border_and_a_known_one_may_be_smaller(where, known, found):
+def test_tool_regions_minimum_size_by_border_contact_and_known_tool(where, known, found):
     assert is_found(where, known=known) == found
 
 
 @pytest.mark.parametrize(("level", "found"), [(10, False), (15, False), (25, True), (90, True)])
-def test_colour_is_ignored_where_it_is_nearly_black(level, found):
+def test_tool_regions_ignore_colour_of_nearly_black_pixels(level, found):
     where = patch(30, 0, 20, 30)
     brightness = np.where(where, level, 120).astype(np.uint8)
     assert is_found(where, brightness=brightness) == found
 
 
 @pytest.mark.parametrize(("surroundings", "level", "found"), [(120, 250, False), (60, 100, False)])
-def test_glare_inside_the_picture_is_no_tool_at_any_exposure(surroundings, level, found):
+def test_tool_regions_ignore_inner_glare_at_any_exposure(surroundings, level, found):
     where = patch(40, 50, 16, 16)
     brightness = np.where(where, level, surroundings).astype(np.uint8)
     assert is_found(where, brightness=brightness) == found
 
 
-def test_glare_on_a_tool_that_reaches_the_border_or_on_a_part_of_it_is_tolerated():
+def test_tool_regions_tolerate_glare_at_border_or_on_part_of_tool():
     at_border = patch(40, 0, 16, 16)
     assert is_found(at_border, brightness=np.where(at_border, 250, 120).astype(np.uint8))
     inside = patch(40, 50, 16, 16)
     assert is_found(inside, brightness=np.where(patch(42, 50, 4, 16), 250, 120).astype(np.uint8))
 
 
-def test_glare_begins_a_tenth_below_the_brightest_pixels():
+def test_tool_regions_glare_threshold_relative_to_brightest_pixels():
     where = patch(40, 50, 16, 16)
     for level, found in ((235, False), (205, True)):
         brightness = np.where(where, level, 120).astype(np.uint8)
@@ -89,11 +89,11 @@ def test_glare_begins_a_tenth_below_the_brightest_pixels():
 @pytest.mark.parametrize(
     ("step", "known", "found"), [(0.3, False, False), (0.3, True, True), (0.22, True, False), (0.45, False, True)]
 )
-def test_the_outline_must_be_distinct_and_less_so_for_a_known_tool(step, known, found):
+def test_tool_regions_outline_contrast_threshold_lower_for_known_tool(step, known, found):
     assert is_found(patch(30, 0, 20, 30), tissue=step, known=known) == found
 
 
-def test_grey_tissue_without_an_edge_is_no_tool():
+def test_tool_regions_ignore_grey_tissue_without_edge():
     redness = np.tile(np.linspace(0, 0.8, WIDTH), (HEIGHT, 1))
     assert not tool_regions(view(redness)).any()
 
@@ -102,7 +102,7 @@ def test_grey_tissue_without_an_edge_is_no_tool():
     ("share", "known", "found"),
     [(0.0, False, False), (0.3, False, False), (0.3, True, True), (0.2, True, False), (0.4, False, True)],
 )
-def test_a_part_of_the_region_must_be_clearly_grey_and_less_of_a_known_tool(share, known, found):
+def test_tool_regions_clearly_grey_share_threshold_lower_for_known_tool(share, known, found):
     where = patch(30, 0, 20, 30)
     clearly = patch(30, 0, round(20 * share), 30)
     redness = np.where(clearly, 0.05, np.where(where, 0.16, 0.7))
@@ -115,7 +115,7 @@ def disc(radius):
     return ((y - 49.5) ** 2 + (x - 59.5) ** 2 < radius**2).astype(np.uint8)
 
 
-def test_the_rim_of_the_field_of_view_counts_as_the_border_of_the_picture_and_its_edge_is_no_outline():
+def test_tool_regions_rim_of_view_counts_as_border_and_not_as_outline():
     inside = disc(45)
     black = np.where(inside > 0, 120, 0).astype(np.uint8)
     assert not tool_regions(view(np.where(inside, TISSUE, 0.0), black, inside)).any()
@@ -130,16 +130,14 @@ def test_the_rim_of_the_field_of_view_counts_as_the_border_of_the_picture_and_it
     assert not tool_regions(view(fading, black, inside)).any()
 
 
-def test_the_mean_level_is_that_of_the_histogram():
+def test_mean_level_equals_mean_of_histogram():
     levels = np.zeros(256)
     levels[[10, 200]] = 3, 1
     assert mean_level(levels) == pytest.approx((3 * 10 + 200) / 4) and mean_level(np.zeros(256)) == 0
 
 
 @pytest.mark.parametrize(("redness", "columns"), [(0.3, 22), (0.38, 21)])
-def test_an_edge_pixel_nearer_to_the_tool_than_to_the_tissue_belongs_to_the_tool_and_one_pixel_is_added(
-    redness, columns
-):
+def test_whole_tools_adds_edge_pixels_nearer_to_tool_and_one_pixel(redness, columns):
     plane = np.full((HEIGHT, WIDTH), 0.5)
     plane[:, :20], plane[:, 20] = 0.1, redness
     found = (plane < 0.2).astype(np.uint8)
@@ -148,7 +146,7 @@ def test_an_edge_pixel_nearer_to_the_tool_than_to_the_tissue_belongs_to_the_tool
     )
 
 
-def test_a_tool_grows_by_four_pixels_at_most_and_does_not_leave_the_field_of_view():
+def test_whole_tools_grows_four_pixels_at_most_within_field_of_view():
     plane = np.full((HEIGHT, WIDTH), 0.5)
     plane[:, :26], plane[:, 26:40] = 0.1, 0.05
     grown = whole_tools(view(plane), (np.arange(WIDTH)[None] < np.full((HEIGHT, 1), 26)).astype(np.uint8))
@@ -163,7 +161,7 @@ def test_a_tool_grows_by_four_pixels_at_most_and_does_not_leave_the_field_of_vie
     assert not kept_in[:, 27:].any()
 
 
-def test_a_gap_of_a_few_pixels_in_a_tool_is_closed():
+def test_whole_tools_closes_small_gap():
     plane = np.full((HEIGHT, WIDTH), 0.5)
     found = np.zeros((HEIGHT, WIDTH), np.uint8)
     found[40:60, 20:40] = found[40:60, 43:60] = 1

@@ -65,7 +65,7 @@ CHANGES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 
 
 @pytest.mark.parametrize("change", CHANGES)
-def test_a_grey_tool_is_found_whatever_the_light(rng, change):
+def test_tool_finder_finds_grey_tool_in_any_light(rng, change):
     tool = shaft()
     image = CHANGES[change](with_tool(tissue(rng), tool))
     mask = ToolFinder().find(image)
@@ -77,41 +77,41 @@ def test_a_grey_tool_is_found_whatever_the_light(rng, change):
 @pytest.mark.slow
 @pytest.mark.parametrize("flip", [0, 1, -1])
 @pytest.mark.parametrize("size", [(128, 160), (257, 319), (512, 640), (1024, 1280), (576, 200)])
-def test_size_and_orientation_do_not_matter(rng, size, flip):
+def test_tool_finder_independent_of_size_and_orientation(rng, size, flip):
     tool = cv2.flip(shaft(size).astype(np.uint8), flip).astype(bool)
     image = with_tool(cv2.flip(tissue(rng, size), flip), tool)
     assert iou(ToolFinder().find(image), tool) > 0.75
 
 
 @pytest.mark.parametrize("colour", [(225, 228, 232), (40, 42, 46), (60, 110, 190), (60, 160, 80)])
-def test_tools_are_bright_or_dark_or_of_a_colour_that_tissue_has_not(rng, colour):
+def test_tool_finder_finds_tools_of_non_tissue_colours(rng, colour):
     tool = shaft()
     assert iou(ToolFinder().find(with_tool(tissue(rng), tool, colour)), tool) > 0.75
 
 
 @pytest.mark.parametrize("change", CHANGES)
-def test_where_there_is_no_tool_none_is_found(rng, change):
+def test_tool_finder_finds_nothing_without_tool(rng, change):
     finder = ToolFinder()
     shares = [float((finder.find(CHANGES[change](tissue(rng))) == 0).mean()) for _ in range(3)]
     # A white balance that is far off makes the palest patches grey, and their outlines are sharp.
     assert max(shares) <= (0.06 if change == "cold" else 0)
 
 
-def test_highlights_are_no_tools(rng):
+def test_tool_finder_ignores_highlights(rng):
     image = tissue(rng)
     for at in rng.integers(30, 220, (25, 2)):
         cv2.ellipse(image, (int(at[0]), int(at[1])), (int(rng.integers(2, 16)), 3), 30, 0, 360, (255, 255, 255), -1)
     assert (ToolFinder().find(image) == 0).mean() == 0
 
 
-def test_tissue_that_fades_to_grey_is_no_tool(rng):
+def test_tool_finder_ignores_tissue_fading_to_grey(rng):
     image = tissue(rng).astype(np.float32)
     pale = np.clip(np.linspace(-1, 1.5, SIZE[1]), 0, 1)[None, :, None]
     washed_out = (image * (1 - pale) + 225 * pale).astype(np.uint8)
     assert (ToolFinder().find(washed_out) == 0).mean() == 0
 
 
-def test_the_black_around_a_round_view_is_no_tool(rng):
+def test_tool_finder_ignores_black_around_round_view(rng):
     inside = np.zeros(SIZE, np.uint8)
     cv2.circle(inside, (160, 128), 120, 1, -1)
     tool = shaft() & (inside == 1)
@@ -121,7 +121,7 @@ def test_the_black_around_a_round_view_is_no_tool(rng):
     assert (ToolFinder().find(tissue(rng) * inside[..., None]) == 0).mean() == 0
 
 
-def test_a_stream_gives_the_same_masks_every_time_and_its_memory_does_not_grow(rng):
+def test_tool_finder_is_deterministic_with_constant_memory(rng):
     background = tissue(rng)
     images = [with_tool(background, shaft(shift_px=k)) for k in range(20)]
     finder, again = ToolFinder(), ToolFinder()
@@ -134,7 +134,7 @@ def test_a_stream_gives_the_same_masks_every_time_and_its_memory_does_not_grow(r
     assert {name: np.size(value) for name, value in vars(finder).items()} == size
 
 
-def test_after_a_cut_the_mask_is_that_of_a_new_stream(rng):
+def test_tool_finder_after_cut_or_reset_equals_new_finder(rng):
     red, finder = with_tool(tissue(rng), shaft()), ToolFinder()
     yellow = gained(0.9, 1.3, 0.5)(tissue(rng))
     other = with_tool(yellow, np.fliplr(shaft()), (150, 150, 150))
@@ -145,7 +145,7 @@ def test_after_a_cut_the_mask_is_that_of_a_new_stream(rng):
     np.testing.assert_array_equal(finder.find(red), ToolFinder().find(red))
 
 
-def test_tools_are_kept_for_a_few_frames_when_their_evidence_is_gone(rng):
+def test_tool_finder_holds_vanished_tool_for_few_frames(rng):
     background, tool, finder = tissue(rng), shaft(), ToolFinder()
     for _ in range(5):
         finder.find(with_tool(background, tool))
@@ -166,19 +166,19 @@ def test_tools_are_kept_for_a_few_frames_when_their_evidence_is_gone(rng):
     ],
     ids=["black", "white", "grey", "one pixel", "a line", "a band", "empty"],
 )
-def test_pictures_of_nothing_give_a_mask_of_their_size(image):
+def test_tool_finder_uniform_image_gives_full_mask(image):
     finder = ToolFinder()
     for _ in range(2):
         mask = finder.find(image)
         assert mask.shape == image.shape[:2] and mask.dtype == np.uint8 and mask.all()
 
 
-def test_noise_gives_a_mask_of_its_size(rng):
+def test_tool_finder_noise_gives_mask_of_image_size(rng):
     mask = ToolFinder().find(rng.integers(0, 256, (64, 96, 3), np.uint8))
     assert mask.shape == (64, 96) and set(np.unique(mask)) <= {0, 1}
 
 
-def test_a_stream_whose_size_changes_goes_on(rng):
+def test_tool_finder_continues_after_size_change(rng):
     finder = ToolFinder()
     for size in [SIZE, (128, 300), (40, 40), SIZE]:
         tool = shaft(size)
@@ -186,7 +186,7 @@ def test_a_stream_whose_size_changes_goes_on(rng):
         np.testing.assert_array_equal(finder.find(image), ToolFinder().find(image))
 
 
-def test_a_view_of_a_larger_array_is_taken(rng):
+def test_tool_finder_accepts_non_contiguous_image(rng):
     image = with_tool(tissue(rng), shaft())
     wide = np.concatenate([image, image], axis=1)
     np.testing.assert_array_equal(ToolFinder().find(wide[:, : SIZE[1]]), ToolFinder().find(image))
@@ -195,13 +195,13 @@ def test_a_view_of_a_larger_array_is_taken(rng):
 @pytest.mark.parametrize(
     "image", [np.zeros((8, 8), np.uint8), np.zeros((8, 8, 3), np.float32), np.zeros((8, 8, 4), np.uint8)]
 )
-def test_other_arrays_are_refused(image):
+def test_tool_finder_rejects_arrays_other_than_rgb_uint8(image):
     with pytest.raises(InvalidInput, match=r"image must be RGB uint8 \[H, W, 3\], got"):
         ToolFinder().find(image)
 
 
 @pytest.mark.parametrize("channel", [0, 1, 2])
-def test_the_brightness_of_a_picture_is_its_largest_channel(channel):
+def test_view_of_brightness_is_largest_channel(channel):
     image = np.full((48, 64, 3), 40, np.uint8)
     image[..., channel] = 200
     view = view_of(image)

@@ -29,7 +29,7 @@ def tool_ious(folder: Path, change) -> list[float]:
 @pytest.mark.parametrize(
     "gains", [(1, 1, 1), (0.4, 0.4, 0.4), (1.15, 1, 0.85), (0.8, 1, 1.1)], ids=["as it is", "dark", "warm", "cold"]
 )
-def test_the_tool_of_cutting_is_found(recordings_dir, gains):
+def test_tool_finder_finds_tool_in_cutting(recordings_dir, gains):
     found = tool_ious(
         recordings_dir / "cutting", lambda image: np.clip(image * np.array(gains), 0, 255).astype(np.uint8)
     )
@@ -38,7 +38,7 @@ def test_the_tool_of_cutting_is_found(recordings_dir, gains):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "most"), [("sinus", 0.0), ("colon", 0.0)])
-def test_no_tool_is_found_where_there_is_none(recordings_dir, name, most):
+def test_tool_finder_finds_nothing_in_recordings_without_tool(recordings_dir, name, most):
     finder = ToolFinder()
     assert max(float((finder.find(frame.image) == 0).mean()) for frame in open_recording(recordings_dir / name)) <= most
 
@@ -51,6 +51,6 @@ def test_no_tool_is_found_where_there_is_none(recordings_dir, name, most):
         ("scared_raw/Left_Image.png", 0.01),
     ],
 )
-def test_single_pictures_have_few_false_tools(recordings_dir, picture, most):
+def test_tool_finder_few_false_tools_in_single_images(recordings_dir, picture, most):
     image = np.ascontiguousarray(cv2.imread(str(recordings_dir / picture))[..., ::-1])
     assert (ToolFinder().find(image) == 0).mean() <= most

@@ -16,7 +16,7 @@ def taken(times_ns, checks=CHECKS):
 
 
 @pytest.mark.parametrize("fps", [10, 24, 30, 50, 60, 120])
-def test_each_check_runs_once_per_period_and_checks_are_distributed_over_the_pictures(fps):
+def test_turns_run_each_check_once_per_period_evenly_distributed(fps):
     seconds = 10
     due = taken([round(k * 1e9 / fps) for k in range(seconds * fps + 1)])
     for check in range(CHECKS):
@@ -25,12 +25,12 @@ def test_each_check_runs_once_per_period_and_checks_are_distributed_over_the_pic
     assert max(map(len, due[1:])) <= -(-CHECKS // max(1, int(EVERY_S * fps)))
 
 
-def test_jitter_of_arrival_adds_at_most_one_check_to_a_picture(rng):
+def test_turns_arrival_jitter_adds_at_most_one_check_per_image(rng):
     times = [round(k * 1e9 / 30 + float(rng.normal(0, 3e6))) for k in range(300)]
     assert max(map(len, taken(times))) <= 2
 
 
-def test_no_check_is_delayed_by_more_than_a_fifth_of_its_period(rng):
+def test_turns_delay_checks_by_fifth_of_period_at_most(rng):
     times = [round(k * 1e9 / 30) for k in range(300)]
     last = dict.fromkeys(range(CHECKS), times[0])
     for at, due in zip(times[1:], taken(times), strict=True):
@@ -38,20 +38,20 @@ def test_no_check_is_delayed_by_more_than_a_fifth_of_its_period(rng):
         assert all(at - before <= 1.2e9 * EVERY_S for before in last.values())
 
 
-def test_after_a_gap_every_check_runs_exactly_once():
+def test_turns_after_gap_run_every_check_once():
     turns = Turns(CHECKS, EVERY_S)
     turns.all_ran(0)
     assert turns.due(10**10) == frozenset(range(CHECKS))
     assert turns.due(10**10 + 1) == frozenset()
 
 
-def test_no_check_is_due_when_time_stands_still_or_goes_back():
+def test_turns_nothing_due_when_time_stops_or_goes_back():
     turns = Turns(CHECKS, EVERY_S)
     turns.all_ran(10**9)
     assert [turns.due(at) for at in (10**9, 0, 10)] == [frozenset()] * 3
 
 
-def test_without_checks_nothing_is_due():
+def test_turns_without_checks_nothing_due():
     turns = Turns(0, EVERY_S)
     turns.all_ran(0)
     assert turns.due(10**9) == frozenset()
