@@ -229,7 +229,7 @@ def test_ctl_watch_continues_after_failed_poll(service, monkeypatch, capsys):
     monkeypatch.setattr(ctl_module, "_status", sometimes)
     assert run(["ctl", "watch", "--looks", "3", "--every", "0.2"]) == OK
     out = capsys.readouterr().out
-    assert out.count("STREAM ") == 2 and out.count("no answer since the last look") == 1
+    assert out.count("STREAM ") == 2 and out.count("no answer since the last query") == 1
 
 
 def test_client_ready_returns_degraded_status(service, monkeypatch):
