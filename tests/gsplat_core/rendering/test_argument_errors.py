@@ -37,7 +37,7 @@ ANY_NUMBER_OF_CHANNELS = {("colors", "a longer end"), ("colors", "empty")}
     ("name", "wrong"),
     [(name, wrong) for wrong in WRONG for name in TENSORS if (name, wrong) not in ANY_NUMBER_OF_CHANNELS],
 )
-def test_a_wrong_tensor_is_named(name, wrong):
+def test_rasterization_names_invalid_tensor(name, wrong):
     given = arguments()
     given[name] = WRONG[wrong](given[name])
     with pytest.raises((InvalidInput, NotImplementedError), match=name) as refused:
@@ -47,7 +47,7 @@ def test_a_wrong_tensor_is_named(name, wrong):
 
 @pytest.mark.parametrize("name", ["width", "height", "tile_size"])
 @pytest.mark.parametrize("value", [0, -1, 1.5, 16.0, "16", True, [16], 10**30, np.float32(16)])
-def test_a_wrong_size_is_named(name, value):
+def test_rasterization_names_invalid_size(name, value):
     with pytest.raises(InvalidInput, match=name):
         gsplat_core.rasterization(**{**arguments(), name: value})
 
@@ -65,7 +65,7 @@ NUMBERS = {
 
 
 @pytest.mark.parametrize("render", [gsplat_core.rasterization, gsplat_core.rasterization_2dgs])
-def test_a_size_computed_from_the_intrinsics_is_truncated(render):
+def test_rasterization_truncates_size_tensor(render):
     """Programs give `width=K[0, 2] * 2`, a floating-point tensor, which gsplat truncates."""
     given = arguments()
     expected = render(**given)[0]
@@ -81,7 +81,7 @@ def test_a_size_computed_from_the_intrinsics_is_truncated(render):
 @pytest.mark.parametrize(
     "kind", [np.array, lambda v: np.float32(v) if isinstance(v, float) else np.int64(v), torch.tensor]
 )
-def test_numbers_of_numpy_and_torch_are_those_of_python(render, kind):
+def test_rasterization_accepts_numpy_and_torch_numbers(render, kind):
     given = {**arguments(), **NUMBERS, "colors": torch.ones(2, 1, 3), "packed": False, "render_mode": "RGB+ED"}
     other = render(**{**given, **{name: kind(value) for name, value in NUMBERS.items()}})
     expected = render(**given)
@@ -91,21 +91,21 @@ def test_numbers_of_numpy_and_torch_are_those_of_python(render, kind):
 
 
 @pytest.mark.parametrize("name", ["width", "height"])
-def test_a_size_that_is_none_is_named(name):
+def test_rasterization_names_missing_size(name):
     with pytest.raises(InvalidInput, match=name):
         gsplat_core.rasterization(**{**arguments(), name: None})
 
 
 @pytest.mark.parametrize("name", ["near_plane", "far_plane", "radius_clip", "eps2d"])
 @pytest.mark.parametrize("value", [None, "x", [1], True, float("nan"), torch.ones(2), "1", 10**400])
-def test_a_wrong_number_is_named(name, value):
+def test_rasterization_names_invalid_number(name, value):
     with pytest.raises(InvalidInput, match=name):
         gsplat_core.rasterization(**{**arguments(), name: value})
 
 
 @pytest.mark.parametrize("name", ["render_mode", "rasterize_mode", "camera_model", "constants", "sh_degree"])
 @pytest.mark.parametrize("value", ["x", [], 9, 1.5])
-def test_a_wrong_mode_is_named(name, value):
+def test_rasterization_names_invalid_mode(name, value):
     with pytest.raises(InvalidInput, match=name):
         gsplat_core.rasterization(**{**arguments(), name: value})
 
@@ -122,20 +122,20 @@ def test_a_wrong_mode_is_named(name, value):
         ("viewmat", "viewmats"),
     ],
 )
-def test_an_unknown_keyword_is_named_with_its_neighbours(keyword, close):
+def test_rasterization_names_unknown_keyword_and_similar_ones(keyword, close):
     with pytest.raises(TypeError, match=rf"^rasterization\(\) has no argument '{keyword}'; .*{close}"):
         gsplat_core.rasterization(**arguments(), **{keyword: 1})
 
 
 @pytest.mark.parametrize("name", list(arguments()))
-def test_a_missing_argument_is_named(name):
+def test_rasterization_names_missing_argument(name):
     given = arguments()
     del given[name]
     with pytest.raises(TypeError, match=rf"^rasterization\(\) needs {name}; "):
         gsplat_core.rasterization(**given)
 
 
-def test_too_many_and_doubled_arguments_are_named():
+def test_rasterization_names_surplus_and_duplicate_arguments():
     with pytest.raises(TypeError, match="by position, got 60"):
         gsplat_core.rasterization(*[None] * 60)
     given = arguments()
@@ -143,7 +143,7 @@ def test_too_many_and_doubled_arguments_are_named():
         gsplat_core.rasterization(given["means"], **given)
 
 
-def test_the_signature_and_the_call_by_position_stay():
+def test_rasterization_keeps_signature_and_positional_call():
     assert next(iter(inspect.signature(gsplat_core.rasterization).parameters)) == "means"
     image, _, _ = gsplat_core.rasterization(*arguments().values())
     assert image.shape == (1, 16, 16, 3) and float(image.max()) > 0.5

@@ -41,7 +41,7 @@ def scene(count: int = 2, z: float = 5.0) -> dict:
     }  # fmt: skip
 
 
-def test_equal_kinds_are_checked_once_and_values_are_not_remembered(operations, checks):
+def test_equal_calls_checked_once_without_caching_values(operations, checks):
     near, _, _ = operations.rasterization(**scene())
     hidden, _, meta = operations.rasterization(**scene(z=-5.0))
     assert checks == [2]
@@ -56,7 +56,7 @@ def test_equal_kinds_are_checked_once_and_values_are_not_remembered(operations, 
         {"with_ut": True}, {"global_z_order": False}, {"return_normals": True},
     ],
 )  # fmt: skip
-def test_another_kind_is_checked(operations, checks, change):
+def test_changed_call_is_checked_again(operations, checks, change):
     first, _, _ = operations.rasterization(**scene())
     changed, _, _ = operations.rasterization(**(scene() | change))
     again, _, _ = operations.rasterization(**scene())
@@ -75,7 +75,7 @@ def test_another_kind_is_checked(operations, checks, change):
         ({"quats": None}, "quats"), ({"opacities": torch.ones(2, device="meta")}, "opacities"),
     ],
 )  # fmt: skip
-def test_a_wrong_call_is_refused_after_a_right_one_and_again(operations, change, named):
+def test_invalid_call_rejected_repeatedly_after_valid_call(operations, change, named):
     right = scene() | {"eps2d": 0, "width": 1} if change.get("width") is True or "eps2d" in change else scene()
     if "sh_degree" in change:
         right |= {"sh_degree": 1, "colors": torch.ones(2, 4, 3)}
@@ -85,7 +85,7 @@ def test_a_wrong_call_is_refused_after_a_right_one_and_again(operations, change,
             operations.rasterization(**(right | change))
 
 
-def test_the_number_of_remembered_kinds_is_limited(operations, checks, monkeypatch):
+def test_number_of_cached_call_kinds_is_limited(operations, checks, monkeypatch):
     monkeypatch.setattr(pipeline, "MOST_CHECKED_CALLS", 2)
     for count in (1, 2, 3, 3, 1):
         operations.rasterization(**scene(count))
@@ -93,7 +93,7 @@ def test_the_number_of_remembered_kinds_is_limited(operations, checks, monkeypat
     assert checks == [1, 2, 3, 1]
 
 
-def test_a_native_call_is_chosen_once_and_gets_the_tensors_of_each_call():
+def test_native_call_selected_once_and_receives_tensors_of_each_call():
     chosen, rendered = [], []
 
     def native(arguments):
@@ -109,7 +109,7 @@ def test_a_native_call_is_chosen_once_and_gets_the_tensors_of_each_call():
     assert [arguments.means is call["means"] for arguments, call in zip(rendered, calls, strict=True)] == [True, True]
 
 
-def test_pictures_without_meta_choose_once_and_never_take_the_choice_of_a_call_with_meta(operations):
+def test_pictures_selects_native_call_once_independently_of_rasterization(operations):
     chosen = []
     operations = replace(operations, single_call=lambda arguments, settings: chosen.append(settings.width))
     call = scene()

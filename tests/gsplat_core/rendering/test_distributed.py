@@ -22,14 +22,14 @@ def render(**options):
 
 
 @pytest.mark.slow
-def test_two_processes_give_the_pictures_and_gradients_of_one():
+def test_two_processes_equal_single_process_images_and_gradients():
     found = differences(300, 4, 2, "cpu")
     assert len(found) == 14
     assert max(found.values()) < 1e-4
 
 
 @pytest.mark.parametrize("packed", [True, False])
-def test_one_process_of_one_gives_the_ordinary_picture(one_process, packed):
+def test_distributed_single_process_equals_ordinary_image(one_process, packed):
     background = torch.tensor([[0.1, 0.2, 0.3]]).repeat(2, 1)
     options = {"packed": packed, "backgrounds": background, "render_mode": "RGB+D", "global_z_order": False}
     image, alphas, meta = render(distributed=True, **options)
@@ -39,7 +39,7 @@ def test_one_process_of_one_gives_the_ordinary_picture(one_process, packed):
     assert torch.equal(meta["isect_offsets"], wanted_meta["isect_offsets"])
 
 
-def test_what_processes_cannot_share_is_refused(one_process):
+def test_distributed_rejects_unsupported_options(one_process):
     with pytest.raises(InvalidInput, match="absgrad is not available"):
         render(distributed=True, absgrad=True)
     with pytest.raises(NotImplementedError, match="use the render modes D and ED"):
@@ -52,6 +52,6 @@ def test_what_processes_cannot_share_is_refused(one_process):
         rasterization(**values, width=160, height=128, distributed=True)
 
 
-def test_a_process_group_is_needed():
+def test_distributed_requires_process_group():
     with pytest.raises(InvalidInput, match="needs a process group"):
         render(distributed=True)

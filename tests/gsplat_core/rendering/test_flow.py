@@ -80,7 +80,7 @@ def wall_depth(tilt_deg: float, camera: Camera = CAMERA) -> Tensor:
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 30.0])
 @pytest.mark.parametrize("axis", [(0, 0, 1), (1, 0, 0), (0.3, 1, -0.5)])
-def test_rigid_motion_is_exact(tilt_deg, axis, device):
+def test_flow_of_rigid_motion_is_exact(tilt_deg, axis, device):
     gaussians = wall(tilt_deg, thickness=0.002)
     quat = turn(10.0, axis)
     matrix, shift = rotations(quat)[0], torch.tensor([1.0, -0.5, 2.0]).double()
@@ -94,7 +94,7 @@ def test_rigid_motion_is_exact(tilt_deg, axis, device):
     assert float((found.flow.cpu() - wanted).abs().max()) < 1e-3
 
 
-def test_affine_motion_is_followed_where_the_gaussianflow_map_fails():
+def test_flow_follows_affine_motion_better_than_gaussianflow():
     gaussians = wall(20.0, thickness=0.002)
     stretch = torch.tensor([[1.05, 0.03, 0.0], [0.0, 0.97, 0.02], [0.01, 0.0, 1.04]]).double()
     spin = rotations(turn(10.0, (0, 0, 1)))[0]
@@ -106,7 +106,7 @@ def test_affine_motion_is_followed_where_the_gaussianflow_map_fails():
     assert float(off("gaussianflow").median()) > 0.03
 
 
-def test_gaussianflow_follows_translation_and_growth():
+def test_gaussianflow_follows_translation():
     gaussians = wall(0.0, thickness=0.002)
     shift = torch.tensor([2.0, -1.0, 0.0]).double()
     second = moved_by(gaussians, torch.eye(3).double(), shift, CENTRE)
@@ -114,12 +114,12 @@ def test_gaussianflow_follows_translation_and_growth():
     torch.testing.assert_close(found, torch.tensor([2.5, -1.25]).expand(found.shape), atol=5e-3, rtol=0)
 
 
-def test_depth_is_that_of_the_wall(device):
+def test_render_depth_equals_wall_depth(device):
     depth = render_depth(wall(35.0, thickness=0.002).to(device), CAMERA).cpu()
     assert float((depth / wall_depth(35.0) - 1).abs().max()) < 1e-3
 
 
-def test_a_surface_behind_another_one_or_outside_of_the_picture_is_occluded():
+def test_occluded_marks_hidden_and_outside_surfaces():
     far = wall(0.0, 44.0)
     near = wall(0.0, 40.0)
     tool = near.select((near.means[:, 0].abs() < 6) & (near.means[:, 1].abs() < 6))
@@ -139,7 +139,7 @@ def test_a_surface_behind_another_one_or_outside_of_the_picture_is_occluded():
     assert bool(outside.all())
 
 
-def test_gradients_reach_means_and_rotations_of_the_second_state_only():
+def test_flow_gradients_reach_second_state_only():
     first = wall(15.0)
     first.requires_grad_()
     second = moved_by(first.detach(), torch.eye(3).double(), torch.tensor([0.3, 0.1, 0.2]).double(), CENTRE)
@@ -157,7 +157,7 @@ def test_gradients_reach_means_and_rotations_of_the_second_state_only():
 
 
 @pytest.mark.slow
-def test_gradient_of_the_deformation_gradients():
+def test_deformation_gradients_pass_gradcheck():
     first = wall(15.0).select(slice(0, 30)).to(dtype=torch.float64)
     generator = torch.Generator().manual_seed(0)
     near = nearest_splats(first)
@@ -173,7 +173,7 @@ def test_gradient_of_the_deformation_gradients():
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
-def test_few_splats_move_with_their_own_rotation(count):
+def test_flow_of_few_splats_uses_own_rotation(count):
     few = wall(0.0).select(slice(2500, 2500 + count))
     quat = turn(20.0, (0, 0, 1))
     second = moved_by(few, rotations(quat)[0], torch.zeros(3).double(), CENTRE, quat)
@@ -184,7 +184,7 @@ def test_few_splats_move_with_their_own_rotation(count):
         torch.testing.assert_close(gradients, rotations(quat).float().expand(count, 3, 3), atol=1e-4, rtol=0)
 
 
-def test_wrong_requests_are_refused():
+def test_flow_rejects_invalid_requests():
     one = wall(0.0)
     with pytest.raises(InvalidSetting, match="mode of the flow is 'roots'; choose neighbours or gaussianflow"):
         render_flow(one, one, CAMERA, CAMERA, mode="roots")  # type: ignore[arg-type]

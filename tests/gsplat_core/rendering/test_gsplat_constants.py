@@ -16,7 +16,7 @@ from tests.gsplat_core.rendering.test_rasterization import run
 
 
 @pytest.mark.parametrize("channels", [1, 2, 3, 4, 5, 9])
-def test_another_ceiling_of_alpha(channels: int) -> None:
+def test_alpha_ceiling_matches_reference(channels: int) -> None:
     # Small splats, some opaque: many pixels lie where alpha is between the two ceilings or above both.
     s = scene(150, channels=channels, median_px=1.5, backgrounds=torch.rand(1, channels))
     s.opacities[:, ::2] = 1.0
@@ -32,7 +32,7 @@ def test_another_ceiling_of_alpha(channels: int) -> None:
     (0.99, 1.0, True), (0.99, 0.995, True), (0.99, 0.985, False),
     (0.999, 1.0, True), (0.999, 0.9995, True), (0.999, 0.995, False), (0.5, 0.6, True),
 ])  # fmt: skip
-def test_a_splat_on_its_pixels_centre_at_either_side_of_the_ceiling(most, opacity, clamped) -> None:
+def test_alpha_ceiling_clamps_value_and_gradient_at_pixel_centre(most, opacity, clamped) -> None:
     s = Scene(
         torch.full((1, 1, 2), 0.5), torch.tensor([[[0.5, 0, 0.5]]]), torch.ones(1, 1, 3), torch.full((1, 1), opacity),
         1, 1, max_alpha=most,
@@ -49,7 +49,7 @@ def test_a_splat_on_its_pixels_centre_at_either_side_of_the_ceiling(most, opacit
 @pytest.mark.parametrize("model", MODELS)
 @pytest.mark.parametrize("floor", [0.0, 0.005, 0.4])
 @pytest.mark.parametrize("with_opacities", [False, True])
-def test_floor_of_the_compensation(make_scene, assert_near, model, floor, with_opacities):
+def test_compensation_floor_matches_reference(make_scene, assert_near, model, floor, with_opacities):
     # From far below the blur to far above it: compensations on either side of 0.005 and of 0.4.
     scene = make_scene(200, model=model)
     scene.scales[:] *= torch.logspace(-3, 1, 200, dtype=torch.float64)[:, None]
@@ -71,7 +71,7 @@ def test_floor_of_the_compensation(make_scene, assert_near, model, floor, with_o
         assert_near(actual, wanted, relative=5e-3, of_largest=1e-4)
 
 
-def test_a_splat_without_area_has_a_compensation_of_zero_and_no_gradient_through_it(make_scene):
+def test_splat_without_area_has_zero_compensation_and_finite_gradient(make_scene):
     scene = make_scene(5).to(torch.float32)
     scene.scales.zero_()
     options = {"calc_compensations": True, "compensation_floor": 0.0, "opacities": None}
@@ -82,7 +82,7 @@ def test_a_splat_without_area_has_a_compensation_of_zero_and_no_gradient_through
         assert all(gradient.isfinite().all() for gradient in gradients)
 
 
-def test_a_floor_that_is_no_factor_of_an_opacity_is_refused(make_scene):
+def test_compensation_floor_outside_zero_to_one_rejected(make_scene):
     for floor in (-0.1, 1.1, math.nan):
         with pytest.raises(InvalidInput, match="compensation_floor must be from 0 to 1"):
             project(fully_fused_projection, make_scene(3).to(torch.float32), compensation_floor=floor)
@@ -98,7 +98,7 @@ def centred_ball(opacity, scale=0.5):
 
 
 @pytest.mark.parametrize("module", [gsplat, reference])
-def test_constants_of_either_version_of_gsplat(module):
+def test_constants_of_gsplat_versions(module):
     render = module.rasterization
     alpha = {version: render(**centred_ball(1.0), constants=version)[1][0, 15, 20, 0] for version in ("1.6", "1.5.3")}
     assert alpha["1.6"] == pytest.approx(0.99, abs=1e-6) and alpha["1.5.3"] == pytest.approx(0.999, abs=1e-6)
@@ -114,7 +114,7 @@ def test_constants_of_either_version_of_gsplat(module):
 
 
 @pytest.mark.parametrize("options", [{}, {"packed": False, "render_mode": "RGB+ED", "rasterize_mode": "antialiased"}])
-def test_image_and_gradients_with_either_versions_constants(make_scene, assert_near, options):
+def test_image_and_gradients_match_reference_for_both_constants(make_scene, assert_near, options):
     scene = make_scene(80)
     scene.opacities[::2] = 1.0
     scene.scales[:] *= torch.logspace(-2.5, 0.3, 80, dtype=torch.float64)[:, None]

@@ -50,7 +50,7 @@ def rays() -> Tensor:
     return torch.stack([x.expand(HEIGHT, -1), y[:, None].expand(-1, WIDTH), torch.ones(HEIGHT, WIDTH)], -1)
 
 
-def test_the_distance_to_a_tilted_plate_is_that_along_each_ray():
+def test_distance_to_tilted_plate_is_measured_along_ray():
     distance, alphas, meta = rasterization(
         **plate(2.0, 0.5), width=WIDTH, height=HEIGHT, render_mode="Ed", return_normals=True
     )
@@ -63,7 +63,7 @@ def test_the_distance_to_a_tilted_plate_is_that_along_each_ray():
 
 @pytest.mark.parametrize("packed", [False, True])
 @pytest.mark.parametrize("cameras", [1, 2])
-def test_no_gaussians_have_distances_and_normals_of_0(cameras: int, packed: bool):
+def test_distance_and_normals_without_gaussians_are_zero(cameras: int, packed: bool):
     given = scene(cameras=cameras)
     for name in ("means", "quats", "scales", "opacities", "colors"):
         given[name] = given[name][:0]
@@ -77,7 +77,7 @@ def test_no_gaussians_have_distances_and_normals_of_0(cameras: int, packed: bool
 
 @pytest.mark.parametrize("packed", [False, True])
 @pytest.mark.parametrize("mode", ["d", "RGB-Ed"])
-def test_pictures_and_gradients_are_the_references(mode: str, packed: bool):
+def test_distance_modes_match_reference(mode: str, packed: bool):
     results = []
     for function, dtype in ((rasterization, torch.float32), (reference.rasterization, torch.float64)):
         given = scene(dtype)
@@ -92,7 +92,7 @@ def test_pictures_and_gradients_are_the_references(mode: str, packed: bool):
         torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-4 * float(expected.abs().max()))
 
 
-def test_the_image_of_a_distance_mode_has_the_colours_of_rgb():
+def test_distance_mode_has_same_colours_as_rgb():
     plain, alphas, _ = rasterization(**scene(), width=WIDTH, height=HEIGHT)
     image, also, _ = rasterization(**scene(), width=WIDTH, height=HEIGHT, render_mode="RGB-d")
     divided, _, _ = rasterization(**scene(), width=WIDTH, height=HEIGHT, render_mode="RGB-Ed")
@@ -102,7 +102,7 @@ def test_the_image_of_a_distance_mode_has_the_colours_of_rgb():
     torch.testing.assert_close(divided[..., 3][seen], (image[..., 3] / alphas[..., 0])[seen])
 
 
-def test_a_fisheye_camera_has_the_distance_of_the_centres():
+def test_fisheye_distance_is_distance_of_centres():
     given = plate(2.0, 0.0) | {"means": torch.tensor([[1.0, 0.5, 2.0]]), "scales": torch.full((1, 3), 0.2)}
     image, alphas, _ = rasterization(**given, width=WIDTH, height=HEIGHT, render_mode="Ed", camera_model="fisheye")
     seen = alphas[..., 0] > 0.1
@@ -111,7 +111,7 @@ def test_a_fisheye_camera_has_the_distance_of_the_centres():
 
 
 @pytest.mark.parametrize("packed", [False, True])
-def test_extra_signals_are_blended_with_the_weights_of_the_colours(packed: bool):
+def test_extra_signals_blended_with_colour_weights(packed: bool):
     given, size = scene(), {"width": WIDTH, "height": HEIGHT, "packed": packed}
     plain, _, _ = rasterization(**given, **size)
     background = torch.full((2, 3), 0.7)
@@ -125,7 +125,7 @@ def test_extra_signals_are_blended_with_the_weights_of_the_colours(packed: bool)
     torch.testing.assert_close(image[..., :3], features)
 
 
-def test_harmonics_of_extra_signals_are_shifted_and_not_clamped():
+def test_extra_signal_harmonics_shifted_but_not_clamped():
     given = scene()
     coefficients = torch.randn(N, 4, 5, generator=torch.Generator().manual_seed(1))
     arguments = {**given, "width": WIDTH, "height": HEIGHT}
@@ -140,7 +140,7 @@ def test_harmonics_of_extra_signals_are_shifted_and_not_clamped():
     torch.testing.assert_close(meta["render_extra_signals"], expected)
 
 
-def test_splats_are_sorted_by_distance_without_global_z_order():
+def test_splats_sorted_by_distance_without_global_z_order():
     # The first splat has the smaller z and the larger distance.
     given = plate(2.0, 0.0) | {
         "means": torch.tensor([[3.0, 0, 2.0], [0.0, 0, 2.2]]), "quats": torch.tensor([[1.0, 0, 0, 0]]).repeat(2, 1),
@@ -152,7 +152,7 @@ def test_splats_are_sorted_by_distance_without_global_z_order():
         assert pixel.argmax() == nearer
 
 
-def test_depth_needs_no_colours():
+def test_depth_mode_accepts_missing_colours():
     given = scene()
     expected, _, _ = rasterization(**given, width=WIDTH, height=HEIGHT, render_mode="ED")
     found, _, _ = rasterization(**given | {"colors": None}, width=WIDTH, height=HEIGHT, render_mode="ED")
@@ -161,7 +161,7 @@ def test_depth_needs_no_colours():
         rasterization(**given | {"colors": None}, width=WIDTH, height=HEIGHT)
 
 
-def test_distance_is_refused_without_the_shape_of_the_gaussians():
+def test_distance_mode_requires_quats_and_scales():
     given = scene()
     covars, _ = reference.quat_scale_to_covar_preci(given["quats"], given["scales"])
     with pytest.raises(InvalidInput, match="'d' needs quats and scales"):
@@ -172,19 +172,19 @@ def test_distance_is_refused_without_the_shape_of_the_gaussians():
 
 
 @pytest.mark.parametrize("name", ["lidar_coeffs", "external_distortion_coeffs"])
-def test_cameras_of_vehicles_are_refused_with_a_camera_that_works(name: str):
+def test_vehicle_cameras_rejected_with_supported_models(name: str):
     with pytest.raises(NotImplementedError, match=f"{name}.*pinhole, ortho and fisheye"):
         rasterization(**scene(), width=WIDTH, height=HEIGHT, **{name: torch.zeros(3)})
 
 
-def test_the_choice_of_gsplats_kernels_has_no_effect():
+def test_renderer_config_has_no_effect():
     plain, _, _ = rasterization(**scene(), width=WIDTH, height=HEIGHT)
     image, _, _ = rasterization(**scene(), width=WIDTH, height=HEIGHT, renderer_config=object(), tile_size=None)
     assert torch.equal(image, plain)
 
 
 @pytest.mark.parametrize("channels", [33, 128])
-def test_features_of_many_channels(channels: int):
+def test_many_channel_features_match_reference(channels: int):
     results = []
     for function, dtype in ((rasterization, torch.float32), (reference.rasterization, torch.float64)):
         given = scene(dtype, cameras=1)

@@ -24,7 +24,7 @@ def render(scene, function=rasterization, colors=None, sh_degree=2, **options):
 
 @pytest.mark.parametrize("kind", ["shared", "of each camera", "plain"])
 @pytest.mark.parametrize(("batch", "cameras"), [((), 1), ((2,), 2)])
-def test_packed_gives_the_picture_and_gradients_of_dense(make_scene, assert_near, kind, batch, cameras):
+def test_packed_equals_dense_image_and_gradients(make_scene, assert_near, kind, batch, cameras):
     scene = make_scene(50, batch, cameras).to(torch.float32)
     generator = torch.Generator().manual_seed(1)
     shapes = {"shared": (50, 16, 3), "of each camera": (cameras, 50, 16, 3), "plain": (cameras, 50, 5)}
@@ -37,7 +37,7 @@ def test_packed_gives_the_picture_and_gradients_of_dense(make_scene, assert_near
         assert_near(packed[name].grad, dense[name].grad.double(), of_largest=1e-5)
 
 
-def test_packed_is_the_reference(make_scene, assert_near):
+def test_packed_matches_reference(make_scene, assert_near):
     scene = make_scene(30, (), 2)
     wanted, _, exact = render(scene.to(torch.float64), reference.rasterization)
     image, _, ours = render(scene.to(torch.float32))
@@ -47,7 +47,7 @@ def test_packed_is_the_reference(make_scene, assert_near):
 
 
 @pytest.mark.parametrize("cameras", [1, 2])
-def test_sparse_gradients_are_those_of_visible_gaussians(make_scene, assert_near, cameras):
+def test_sparse_gradients_cover_visible_gaussians(make_scene, assert_near, cameras):
     scene = make_scene(200, (), cameras).to(torch.float32)
     _, meta, dense = render(scene)
     for wish, names in ((True, NAMES[:3]), ("all", NAMES[:5])):
@@ -63,7 +63,7 @@ def test_sparse_gradients_are_those_of_visible_gaussians(make_scene, assert_near
 
 
 @pytest.mark.parametrize("share", [1.0, 0.1, 0.0])
-def test_memory_of_sparse_gradients_falls_with_the_visible_share(make_scene, share):
+def test_sparse_gradient_memory_proportional_to_visible_share(make_scene, share):
     scene = make_scene(100).to(torch.float32)
     scene.means[:, :2] *= 0.1
     scene.means[round(100 * share) :, 2] = -5  # behind the camera
@@ -74,7 +74,7 @@ def test_memory_of_sparse_gradients_falls_with_the_visible_share(make_scene, sha
         assert leaves[name].grad.coalesce().values().numel() == share * leaves[name].numel()
 
 
-def test_gaussians_with_colours_that_are_not_finite_are_no_rows(make_scene):
+def test_packed_omits_gaussians_with_non_finite_colours(make_scene):
     scene = make_scene(50).to(torch.float32)
     _, meta, _ = render(scene)
     lost = int(meta["gaussian_ids"][3])
@@ -85,7 +85,7 @@ def test_gaussians_with_colours_that_are_not_finite_are_no_rows(make_scene):
     assert all(leaf.grad.isfinite().all() for leaf in leaves.values())
 
 
-def test_wrong_wishes_for_sparse_gradients_are_refused(make_scene):
+def test_invalid_sparse_grad_options_rejected(make_scene):
     scene = make_scene(5).to(torch.float32)
     with pytest.raises(InvalidInput, match="needs packed=True"):
         render(scene, sparse_grad=True, packed=False)

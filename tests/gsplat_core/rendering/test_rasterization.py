@@ -47,7 +47,9 @@ def run(function, scene, seed=5, **options):
         (0, (), 2, {"render_mode": "RGB+ED"}),
     ],
 )
-def test_image_and_gradients_match_the_reference(make_scene, assert_near, model, count, batch, cameras, options):
+def test_rasterization_image_and_gradients_match_reference(
+    make_scene, assert_near, model, count, batch, cameras, options
+):
     scene = make_scene(count, batch, cameras, model)
     ours = run(rasterization, scene.to(torch.float32), **options)
     exact = run(reference.rasterization, scene.to(torch.float64), **options)
@@ -73,7 +75,7 @@ def test_reference_gradcheck_end_to_end(make_scene):
 
 @pytest.mark.parametrize("instructions", ["baseline", "avx2"])
 @pytest.mark.slow
-def test_other_instruction_sets_give_the_image(tmp_path, make_scene, assert_near, instructions):
+def test_rasterization_equal_for_other_instruction_sets(tmp_path, make_scene, assert_near, instructions):
     scene = make_scene(80, cameras=2)
     image, alpha, gradients, _ = run(reference.rasterization, scene.to(torch.float64), render_mode="RGB+ED")
     torch.save({name: getattr(scene, name) for name in scene.__dataclass_fields__}, tmp_path / "scene.pt")
@@ -100,7 +102,7 @@ def test_other_instruction_sets_give_the_image(tmp_path, make_scene, assert_near
         assert_near(actual, wanted, relative=1e-2, of_largest=1e-3)
 
 
-def test_image_and_gradients_do_not_depend_on_the_number_of_threads(make_scene):
+def test_rasterization_independent_of_thread_count(make_scene):
     threads = torch.get_num_threads()
     try:
         results = []
@@ -131,7 +133,7 @@ def ball(opacity_logit=8.0, z=5.0, dtype=torch.float32):
     return Gaussians(*tensors, red).to(dtype=dtype)
 
 
-def test_render_one_ball():
+def test_render_single_gaussian():
     out = render(ball(), CAMERA)
     assert out.image.shape == (30, 40, 3) and out.alpha.shape == out.depth.shape == (30, 40)
     # The mean is the middle pixel's centre; alpha is clamped to 0.99.
@@ -143,7 +145,7 @@ def test_render_one_ball():
     assert (out.depth[out.alpha == 0] == 0).all() and (out.alpha == 0).any()
 
 
-def test_render_background_and_no_depth():
+def test_render_with_background_and_without_depth():
     background = torch.tensor([0.2, 0.4, 0.6])
     out = render(ball(), CAMERA, background, depth=False)
     torch.testing.assert_close(out.image[0, 0], background)
@@ -153,7 +155,7 @@ def test_render_background_and_no_depth():
         render(ball(), CAMERA, torch.zeros(4))
 
 
-def test_render_follows_the_pose_and_the_model():
+def test_render_follows_pose_and_camera_model():
     moved = np.eye(4)
     moved[:3, 3] = [0.5, 0, 0]  # the world moves right by 0.5: six pixels at z = 5
     left, right = (render(ball(), camera).alpha.sum(0).argmax() for camera in (CAMERA, CAMERA.with_pose(moved)))
@@ -163,7 +165,7 @@ def test_render_follows_the_pose_and_the_model():
     torch.testing.assert_close(near, far)
 
 
-def test_render_is_differentiable_and_float64_is_refused():
+def test_render_is_differentiable_and_rejects_float64():
     gaussians = ball(0.0).requires_grad_()
     out = render(gaussians, CAMERA)
     (out.image.sum() + out.depth.sum()).backward()

@@ -27,7 +27,7 @@ CAMERA = Camera.from_focal(40.0, 40, 30)
         {"rasterize_mode": "antialiased", "eps2d": 0.1}, {"constants": "1.5.3", "near_plane": 5.0, "far_plane": 7.0},
     ],
 )  # fmt: skip
-def test_pictures_and_gradients_are_those_of_rasterization(options):
+def test_rasterizer_equals_rasterization(options):
     scene = gaussians().requires_grad_()
     viewmat, K = CAMERA.matrices("cpu", torch.float32)
     behind = torch.tensor([0.2, 0.4, 0.6])
@@ -43,7 +43,7 @@ def test_pictures_and_gradients_are_those_of_rasterization(options):
     assert all(torch.equal(a, b) for a, b in zip(ours, theirs, strict=True))
 
 
-def test_one_object_takes_other_gaussians_and_cameras():
+def test_rasterizer_accepts_changing_gaussians_and_cameras():
     rasterizer = Rasterizer()
     first = rasterizer(gaussians(), CAMERA).colors
     assert rasterizer(gaussians(1), Camera.from_focal(30.0, 20, 16)).colors.shape == (16, 20, 3)
@@ -51,7 +51,7 @@ def test_one_object_takes_other_gaussians_and_cameras():
     assert rasterizer.capacity is None
 
 
-def test_wrong_options_are_refused_at_once():
+def test_rasterizer_rejects_invalid_options_at_construction():
     for options, message in [
         ({"tile_size": 0}, "tile_size must be from 1"),
         ({"render_mode": "XYZ"}, "unknown render_mode 'XYZ'"),

@@ -22,7 +22,7 @@ def cloud(count: int, seed: int = 0) -> Gaussians:
 
 
 @pytest.mark.parametrize("count", [0, 1, 200])
-def test_the_share_is_the_reference_picture_of_the_chosen_ones_in_white(count):
+def test_share_of_equals_reference_image_of_selection_in_white(count):
     gaussians = cloud(count)
     chosen = torch.arange(count) % 3 == 0
     exact = gaussians.to(dtype=torch.float64)
@@ -39,7 +39,7 @@ def test_the_share_is_the_reference_picture_of_the_chosen_ones_in_white(count):
     assert torch.allclose(found[there].double(), wanted[there], atol=2e-3)
 
 
-def test_shares_of_a_part_and_of_the_rest_add_up_to_one():
+def test_share_of_selection_and_complement_sum_to_one():
     gaussians = cloud(100)
     everyone = torch.ones(100, dtype=torch.bool)
     some = torch.arange(100) < 40
@@ -60,7 +60,7 @@ def wall(depth: float) -> Gaussians:
     return Gaussians(means, quats, torch.full((count, 3), 0.5), torch.full((count,), 8.0), torch.zeros(count, 1, 3))
 
 
-def test_remembered_tissue_counts_where_it_is_shown_and_not_behind_what_is_seen():
+def test_share_of_counts_visible_remembered_tissue_only():
     near, far = wall(40.0), wall(60.0)
     near = near.select(near.means[:, 0] < 0)
     scene = near.append(far)
@@ -70,7 +70,7 @@ def test_remembered_tissue_counts_where_it_is_shown_and_not_behind_what_is_seen(
     assert share[:, :12].max() < 0.1 and share[:, -12:].min() > 0.99
 
 
-def test_a_model_says_how_long_as_many_gaussians_were_not_seen_as_it_has():
+def test_model_unseen_s_requires_value_per_gaussian():
     with pytest.raises(InvalidInput, match="unseen_s"):
         Model(1, wall(40.0), None, CAMERA, (0.0, 1.0), unseen_s=torch.zeros(3))
     model = Model(1, wall(40.0), None, CAMERA, (0.0, 1.0))

@@ -39,14 +39,14 @@ def assert_equal(output, expected):
 
 
 @pytest.mark.parametrize("time_s", [1.0, 2.2, 9.0])
-def test_alpha_is_render_of_the_deformed_model(moving, time_s):
+def test_alpha_renderer_equals_render_of_deformed_model(moving, time_s):
     background = torch.tensor([0.1, 0.5, 0.9])
     renderer = new_renderer("alpha", CAMERA, background=background)
     renderer.prepare(moving)
     assert_equal(renderer.render(CAMERA, time_s).result(), render(moving.at(time_s), CAMERA, background))
 
 
-def test_a_snapshot_and_the_model_that_it_was_made_from_look_the_same(moving):
+def test_renderer_gives_same_image_for_snapshot_and_source_model(moving):
     snapshot = SnapshotSlots("cpu").publish(
         moving.gaussians, moving.field, version=1, camera=CAMERA, time_window_s=WINDOW_S
     )
@@ -58,7 +58,7 @@ def test_a_snapshot_and_the_model_that_it_was_made_from_look_the_same(moving):
     assert_equal(*pictures)
 
 
-def test_the_newest_prepared_model_is_shown(moving, make_gaussians):
+def test_renderer_shows_newest_prepared_model(moving, make_gaussians):
     renderer = new_renderer("alpha", CAMERA)
     other = Model(2, make_gaussians(60, seed=1), None, CAMERA, WINDOW_S)
     for model in (moving, other, moving):
@@ -66,7 +66,7 @@ def test_the_newest_prepared_model_is_shown(moving, make_gaussians):
         assert_equal(renderer.render(CAMERA, 2.0).result(), render(model.at(2.0), CAMERA))
 
 
-def test_the_surface_is_among_the_outputs_where_it_is_asked_for(moving):
+def test_renderer_outputs_surface_on_request(moving):
     renderer = new_renderer("alpha", CAMERA)
     renderer.prepare(moving)
     outputs = renderer.render(CAMERA, 2.0, outputs=["depth", "normals", "median_depth"]).outputs()
@@ -77,7 +77,7 @@ def test_the_surface_is_among_the_outputs_where_it_is_asked_for(moving):
     assert torch.equal(outputs["depth"], moving.render(2.0).depth)
 
 
-def test_outputs_are_asked_for_by_name(moving):
+def test_renderer_outputs_selected_by_name(moving):
     renderer = new_renderer("alpha", CAMERA)
     renderer.prepare(moving)
     frame = renderer.render(CAMERA, 2.0, outputs=["alpha"])
@@ -87,7 +87,7 @@ def test_outputs_are_asked_for_by_name(moving):
         renderer.render(CAMERA, 2.0, outputs=["depth", "heat"])
 
 
-def test_motion_is_that_to_a_later_time(moving):
+def test_renderer_flow_output_is_motion_to_later_time(moving):
     renderer = new_renderer("alpha", CAMERA)
     renderer.prepare(moving)
     outputs = renderer.render(CAMERA, 2.0, FLOW_OUTPUTS).outputs()
@@ -98,7 +98,7 @@ def test_motion_is_that_to_a_later_time(moving):
     assert not bool(outputs["occlusion"][~wanted.observed].any())
 
 
-def test_a_renderer_has_outputs_of_its_own():
+def test_checked_outputs_follow_renderer_capabilities():
     capabilities = Capabilities(("image", "normals"), {"cpu": ("fp32",)}, differentiable=False, deterministic=True)
     assert checked_outputs("mine", ["normals"], capabilities) == ("image", "normals")
     frame = FinishedFrame({"image": torch.ones(2, 3, 3), "normals": torch.ones(2, 3, 3)})
@@ -107,7 +107,7 @@ def test_a_renderer_has_outputs_of_its_own():
         checked_outputs("mine", ["depth"], capabilities)
 
 
-def test_what_a_user_chose_is_refused_with_what_there_is():
+def test_new_renderer_error_lists_available_choices():
     for arguments, sentence in (
         (("beta", CAMERA), "unknown renderer 'beta'; known are alpha"),
         (("alpha", CAMERA, "mps"), "does not run on mps, only on cpu, cuda"),
@@ -120,7 +120,7 @@ def test_what_a_user_chose_is_refused_with_what_there_is():
         new_renderer("alpha", CAMERA, precision="fp8")
 
 
-def test_options_that_a_renderer_lacks_are_refused():
+def test_new_renderer_rejects_unsupported_options():
     new_renderer("alpha", CAMERA, options=RendererOptions())
     with pytest.raises(InvalidSetting, match="renderer 'alpha' has no option samples; choose "):
         new_renderer("alpha", CAMERA, options=RendererOptions(samples=4))
@@ -134,7 +134,7 @@ def test_options_that_a_renderer_lacks_are_refused():
             RendererOptions(**options)
 
 
-def test_misuse_is_refused(moving):
+def test_renderer_rejects_misuse(moving):
     renderer = new_renderer("alpha", CAMERA)
     with pytest.raises(InvalidInput, match="prepare"):
         renderer.render(CAMERA, 0.0)
@@ -148,7 +148,7 @@ def test_misuse_is_refused(moving):
         renderer.render(CAMERA, float("nan"))
 
 
-def test_the_registry_says_what_a_renderer_can_do_without_making_one():
+def test_renderer_registry_lists_capabilities_without_instantiation():
     capabilities = RENDERERS["alpha"].capabilities
     assert capabilities.outputs[:3] == ("image", "alpha", "depth") and "normals" in capabilities.outputs
     assert capabilities.devices == ("cpu", "cuda")

@@ -47,37 +47,37 @@ def capacities_for(monkeypatch):
     return of
 
 
-def test_the_first_call_waits_and_equal_calls_have_one_capacity_with_space_to_spare(capacities_for):
+def test_capacity_zero_at_first_call_then_constant_with_headroom(capacities_for):
     first, *others = capacities_for([100_000] * 4)
     assert first == 0
     assert len(set(others)) == 1 and 110_000 <= others[0] <= 150_000
 
 
-def test_lists_that_outgrow_the_capacity_raise_it_for_the_next_call(capacities_for):
+def test_capacity_raised_after_overflow(capacities_for):
     capacities = capacities_for([10_000, 50_000, 50_000, 55_000])
     assert capacities[1] < 50_000 < 55_000 < capacities[2] == capacities[3]
 
 
-def test_lists_that_stay_short_free_memory(capacities_for):
+def test_capacity_reduced_after_sustained_short_lists(capacities_for):
     capacities = capacities_for([100_000, 100_000, *[1000] * 100, *[0] * 100])
     assert capacities[101] < 4000
     assert capacities[-1] == FEWEST_RESERVED_ENTRIES
 
 
-def test_views_with_long_and_short_lists_may_alternate(capacities_for):
+def test_capacity_suffices_for_alternating_list_lengths(capacities_for):
     lengths = [100_000, 1000] * 20
     capacities = capacities_for(lengths)
     assert all(length <= capacity for length, capacity in zip(lengths[1:], capacities[1:], strict=True))
 
 
-def test_nothing_is_reserved_for_very_long_lists(capacities_for):
+def test_capacity_zero_for_very_long_lists(capacities_for):
     long = MOST_RESERVED_ENTRIES + 1
     assert capacities_for([long, long, 1000, 1000, long, long])[:3] == [0, 0, 0]
     assert capacities_for([1000, long, long])[2] == 0
 
 
 @pytest.mark.parametrize("length", [0, 1, 1000, 10**6, MOST_RESERVED_ENTRIES])
-def test_the_capacity_settles_at_once_and_fits(length):
+def test_next_capacity_is_stable_and_sufficient(length):
     capacity = next_capacity(0, length)
     assert length < capacity <= 2 * length + FEWEST_RESERVED_ENTRIES
     assert next_capacity(capacity, length) == capacity

@@ -35,7 +35,7 @@ def rendered(name, model, options=None, background=None, camera=CAMERA):
 
 
 @pytest.mark.parametrize("name", ["stochastic", "points"])
-def test_the_mean_approaches_alpha_blending(name):
+def test_sampling_renderer_mean_approaches_alpha_blending(name):
     model = model_of(random_scene(80, smallest=0.05, largest=0.2))
     background = torch.tensor([0.2, 0.4, 0.6])
     wanted = rendered("alpha", model, background=background)
@@ -49,7 +49,7 @@ def test_the_mean_approaches_alpha_blending(name):
 
 
 @pytest.mark.parametrize("name", ["stochastic", "points"])
-def test_progressive_frames_add_samples_until_something_changes(name):
+def test_progressive_frames_accumulate_samples_until_change(name):
     model = model_of(random_scene(50))
     renderer = new_renderer(name, CAMERA, options=RendererOptions(samples=4, progressive=True))
     renderer.prepare(model)
@@ -65,7 +65,7 @@ def test_progressive_frames_add_samples_until_something_changes(name):
     assert renderer.samples_drawn == 4
 
 
-def test_frames_are_independent_of_earlier_ones_unless_progressive():
+def test_non_progressive_frames_independent_of_earlier_frames():
     model = model_of(random_scene(50))
     renderer = new_renderer("stochastic", CAMERA, options=RendererOptions(samples=2))
     renderer.prepare(model)
@@ -74,7 +74,7 @@ def test_frames_are_independent_of_earlier_ones_unless_progressive():
     assert not torch.equal(first, rendered("stochastic", model, RendererOptions(samples=2, seed=1)).image)
 
 
-def test_order_by_pixel_is_an_option_of_one_renderer():
+def test_pixel_order_supported_by_stochastic_renderer_only():
     model = model_of(random_scene(50))
     by_splat, by_pixel = (
         rendered("stochastic", model, RendererOptions(samples=8, order=order)).image for order in ("splat", "pixel")
@@ -87,7 +87,7 @@ def test_order_by_pixel_is_an_option_of_one_renderer():
         new_renderer("stochastic", fisheye, options=RendererOptions(order="pixel"))
 
 
-def test_misuse_is_refused():
+def test_stochastic_renderer_rejects_misuse():
     renderer = new_renderer("stochastic", CAMERA)
     with pytest.raises(InvalidInput, match="prepare"):
         renderer.render(CAMERA, 0.0)
@@ -103,7 +103,7 @@ def picture(scene, samples=512):
     return picture_of(sums, samples).image
 
 
-def test_prepared_splats_are_the_same_without_invisible_ones():
+def test_prepared_splats_omit_invisible_splats_without_image_change():
     gaussians = random_scene(100)
     gaussians.logit_opacities[::3] = -9.0
     scene = prepared_splats(gaussians)
@@ -115,7 +115,7 @@ def test_prepared_splats_are_the_same_without_invisible_ones():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("degree", [0, 1, 3, 4])
-def test_quantised_splats_give_nearly_the_same_picture(degree):
+def test_quantised_splats_image_psnr(degree):
     gaussians = random_scene(5000, smallest=0.02, largest=0.1, degree=degree)
     scene = quantised_splats(gaussians)
     assert scene.packed.element_size() * scene.packed.shape[1] == 16
@@ -124,13 +124,13 @@ def test_quantised_splats_give_nearly_the_same_picture(degree):
 
 
 @pytest.mark.parametrize("degree", [0, 3, 4])
-def test_the_kernels_decode_what_python_decodes(degree):
+def test_quantised_kernel_decoding_equals_python(degree):
     scene = quantised_splats(random_scene(6000, smallest=0.02, largest=0.1, degree=degree))
     decoded = raw_splats(dequantised(scene))._replace(file_index=scene.file_index)
     assert psnr(picture(scene, 4), picture(decoded, 4)) > 45
 
 
-def test_quantised_values_are_near_the_original():
+def test_quantised_values_close_to_original():
     gaussians = random_scene(1)
     for w in range(4):
         quat = torch.full((1, 4), 0.2)
@@ -140,14 +140,14 @@ def test_quantised_values_are_near_the_original():
     assert quantised_splats(random_scene(0)).splat_count == 0
 
 
-def test_morton_codes_interleave_the_axes():
+def test_morton_codes_interleave_axes():
     corners = torch.tensor([[x, y, z] for z in (0.0, 1) for y in (0.0, 1) for x in (0.0, 1)])
     assert morton_codes(corners).argsort().tolist() == list(range(8))
     assert morton_codes(corners)[-1] == (1 << 63) - 1
 
 
 @pytest.mark.parametrize("name", ["stochastic", "points"])
-def test_storages_show_the_same_scene_with_the_same_random_numbers(name):
+def test_storages_give_same_image_with_same_random_numbers(name):
     model = model_of(random_scene(80, smallest=0.05, largest=0.2))
     raw, prepared, quantised = (
         rendered(name, model, RendererOptions(samples=8, storage=storage)).image
@@ -159,14 +159,14 @@ def test_storages_show_the_same_scene_with_the_same_random_numbers(name):
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float16])
-def test_gaussians_of_another_precision_are_refused(dtype):
+def test_stochastic_renderer_rejects_other_precisions(dtype):
     renderer = new_renderer("stochastic", CAMERA)
     renderer.prepare(model_of(random_scene(20).to(dtype=dtype)))
     with pytest.raises(InvalidInput, match=f"means of the splats must be float32, got {dtype}; convert the Gaussians"):
         renderer.render(CAMERA, 0.0)
 
 
-def test_only_raw_storage_shows_moving_models():
+def test_moving_model_requires_raw_storage():
     gaussians = random_scene(20)
     moving = dataclasses.replace(model_of(gaussians), field=new_field("basis", gaussians, (0.0, 1.0)).detached_copy())
     renderer = new_renderer("stochastic", CAMERA, options=RendererOptions(storage="quantised"))

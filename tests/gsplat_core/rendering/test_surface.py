@@ -98,7 +98,7 @@ def along_one_ray(gaussians: Gaussians, camera: Camera, column: int, row: int) -
 
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 20, 120])
-def test_every_ray_is_that_of_a_loop_over_the_splats(count, device):
+def test_surface_matches_loop_over_splats(count, device):
     gaussians = cloud(count)
     surface = render_surface(gaussians.to(device), CAMERA)
     planes = [surface.ray_depth.cpu(), surface.median_depth.cpu(), surface.spread.cpu()]
@@ -112,7 +112,7 @@ def test_every_ray_is_that_of_a_loop_over_the_splats(count, device):
     assert wrong <= len(pixels) // 50
 
 
-def test_opacity_is_that_of_the_picture(device):
+def test_surface_alpha_equals_rendered_alpha(device):
     gaussians = cloud(150).to(device)
     surface = render_surface(gaussians, CAMERA)
     torch.testing.assert_close(surface.alpha, render(gaussians, CAMERA).alpha, atol=1e-5, rtol=1e-5)
@@ -120,7 +120,7 @@ def test_opacity_is_that_of_the_picture(device):
 
 
 @pytest.mark.parametrize(("tilt_deg", "most"), [(0.0, 1e-4), (20.0, 1e-4), (-35.0, 5e-4)])
-def test_a_tilted_wall_is_where_it_is_and_faces_as_it_does(tilt_deg, most, device):
+def test_surface_depth_and_normals_of_tilted_wall(tilt_deg, most, device):
     gaussians = wall(tilt_deg).to(device)
     surface = render_surface(gaussians, CAMERA)
     exact = plane_depth(CAMERA, tilt_deg).to(device)
@@ -136,7 +136,7 @@ def test_a_tilted_wall_is_where_it_is_and_faces_as_it_does(tilt_deg, most, devic
     assert bool((surface.normals.norm(dim=-1) - 1).abs().max() < 1e-5)
 
 
-def test_normals_face_the_camera_whichever_way_the_axes_point():
+def test_surface_normals_face_camera_for_any_axis_direction():
     gaussians = wall(20.0)
     turned = gaussians.quats.clone()
     # Half a turn round the Gaussian's own x: the same ellipsoid, its shortest axis the other way round.
@@ -149,7 +149,7 @@ def test_normals_face_the_camera_whichever_way_the_axes_point():
     assert bool((render_surface(flipped, CAMERA).normals[..., 2] < 0).all())
 
 
-def test_spread_is_the_thickness_of_a_wall_and_the_gap_between_two():
+def test_surface_spread_of_thick_wall_and_two_walls():
     thick = render_surface(wall(0.0, thickness=0.8), CAMERA).spread
     assert float((thick - 0.8).abs().max()) < 0.08
     near, far = wall(0.0, 40.0), wall(0.0, 44.0)
@@ -162,7 +162,7 @@ def test_spread_is_the_thickness_of_a_wall_and_the_gap_between_two():
     assert float((both.spread[18, 22] - 4 * (alone * (1 - alone)).sqrt()).abs()) < 0.05
 
 
-def test_nothing_is_known_where_nothing_is():
+def test_surface_unobserved_pixels_are_zero():
     some = wall(0.0)
     right = some.select(some.means[:, 0] > 8)
     surface = render_surface(right, CAMERA)
@@ -174,7 +174,7 @@ def test_nothing_is_known_where_nothing_is():
     assert not nobody.observed.any() and not nobody.median_depth.any()
 
 
-def test_values_that_are_not_finite_are_left_out():
+def test_surface_ignores_non_finite_gaussians():
     gaussians = wall(0.0)
     broken = gaussians.clone()
     broken.means[0] = math.nan
@@ -185,7 +185,7 @@ def test_values_that_are_not_finite_are_left_out():
 
 
 @pytest.mark.parametrize("projection", ["ortho", "fisheye"])
-def test_other_projections(projection):
+def test_surface_with_ortho_and_fisheye_projection(projection):
     gaussians = wall(0.0)
     camera = Camera(CAMERA.K if projection == "fisheye" else np.diag([1.0, 1.0, 1]), 45, 37, model=projection)
     if projection == "ortho":
@@ -196,7 +196,7 @@ def test_other_projections(projection):
     assert float((surface.normals[18, 22] - torch.tensor([0, 0, -1.0])).abs().max()) < 1e-4
 
 
-def test_confidence_falls_with_the_time_for_which_nobody_looked():
+def test_surface_confidence_decreases_with_unseen_time():
     gaussians = wall(0.0)
     unseen_s = torch.where(gaussians.means[:, 0] > 0, 5.0, 0.0).double()
     model = Model(1, gaussians, None, CAMERA, (0.0, 1.0), unseen_s=unseen_s)
@@ -207,7 +207,7 @@ def test_confidence_falls_with_the_time_for_which_nobody_looked():
         render_surface(gaussians, CAMERA, certainty(unseen_s)[:4])
 
 
-def test_classes_are_blended_as_colours_are():
+def test_surface_semantics_blended_like_colours():
     gaussians = cloud(60)
     logits = torch.randn(60, 20, generator=torch.Generator().manual_seed(1))
     surface = render_surface(replace(gaussians, extra={"semantics": logits}), CAMERA)
@@ -220,7 +220,7 @@ def test_classes_are_blended_as_colours_are():
 
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 25.0, -50.0])
-def test_normals_of_a_depth_map(tilt_deg, device):
+def test_depth_normals_of_tilted_plane_with_jump(tilt_deg, device):
     camera = Camera.from_focal(500.0, 45, 37)
     depth = plane_depth(camera, tilt_deg).to(device).clone()
     depth[:, 30:] *= 1.1  # a parallel plane behind a jump of more than 2 %
@@ -234,13 +234,13 @@ def test_normals_of_a_depth_map(tilt_deg, device):
     assert bool(known[10, 1:29].all()) and bool(known[10, 31:-1].all())
 
 
-def test_gradient_of_depth_normals_is_the_derivative():
+def test_depth_normals_pass_gradcheck():
     camera = Camera.from_focal(500.0, 8, 7)
     depth = plane_depth(camera, 20.0).double() + 0.01 * torch.rand(7, 8, generator=torch.Generator().manual_seed(0))
     assert torch.autograd.gradcheck(lambda plane: depth_normals(plane, camera), depth.requires_grad_())
 
 
-def test_every_output_of_the_surface_is_registered_and_offered():
+def test_surface_outputs_registered_and_rendered():
     assert {*SURFACE_OUTPUTS} <= {*OUTPUTS}
     assert {*SURFACE_OUTPUTS} == {*Surface._fields} - {"alpha"}
     frame = AlphaRenderer(CAMERA, torch.device("cpu"))
@@ -252,7 +252,7 @@ def test_every_output_of_the_surface_is_registered_and_offered():
         assert shape[:2] == (37, 45) and (channels is None or tuple(shape[2:]) == ((channels,) if channels > 1 else ()))
 
 
-def test_gaussians_that_change_no_pixel_are_pruned(device):
+def test_pruned_removes_gaussians_without_contribution(device):
     front = wall(0.0)
     hidden = replace(wall(0.0), means=front.means + torch.tensor([0.0, 0.0, 20.0]))
     scene = front.append(hidden).to(device)

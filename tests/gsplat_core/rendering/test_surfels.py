@@ -37,7 +37,7 @@ def wall(tilt_deg: float, distance: float = 40.0, spacing: float = 1.0) -> dict[
 
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 35.0, -40.0])
-def test_a_plane_has_its_depth_and_its_normal(tilt_deg: float) -> None:
+def test_surfel_plane_depth_and_normal(tilt_deg: float) -> None:
     # A camera that is turned round z and shifted, so that the normals' axes are those of the world.
     turn = math.radians(25)
     pose = torch.eye(4)
@@ -65,7 +65,7 @@ def test_a_plane_has_its_depth_and_its_normal(tilt_deg: float) -> None:
     assert cosines.mean() > math.cos(math.radians(3))
 
 
-def test_the_depth_of_a_tilted_plane_converges_with_the_size_of_its_surfels() -> None:
+def test_surfel_plane_depth_error_proportional_to_surfel_size() -> None:
     exact = 40.0 / (1 - math.tan(math.radians(35)) * ((torch.arange(9) + 0.5 - 4.5) / 300))
     K = torch.tensor([[[300.0, 0, 4.5], [0, 300, 2.5], [0, 0, 1]]])
     errors = []
@@ -88,7 +88,7 @@ def scene(**options: Any) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("mode", ["RGB", "D", "ED", "RGB+D", "RGB+ED"])
-def test_modes_have_the_same_values(mode: str) -> None:
+def test_surfel_render_modes_agree(mode: str) -> None:
     s = scene(cameras=2)
     whole, alphas, normals, surface, *_ = rasterization_2dgs(**s, render_mode="RGB+D")
     image, seen_alphas, seen_normals, seen_surface, _, _, meta = rasterization_2dgs(**s, render_mode=mode)
@@ -106,7 +106,7 @@ def test_modes_have_the_same_values(mode: str) -> None:
 
 
 @pytest.mark.parametrize("packed", [False, True])
-def test_colors_without_channels_leave_the_depth(packed: bool) -> None:
+def test_surfel_colors_without_channels_give_depth_only(packed: bool) -> None:
     s = scene(cameras=2)
     options: dict[str, Any] = {"render_mode": "RGB+ED", "packed": packed}
     expected = rasterization_2dgs(**s, **options)
@@ -118,7 +118,7 @@ def test_colors_without_channels_leave_the_depth(packed: bool) -> None:
         rasterization_2dgs(**{**s, **empty}, packed=packed)
 
 
-def test_packed_rows_and_sparse_gradients_are_those_of_the_dense_call() -> None:
+def test_surfel_packed_and_sparse_gradients_equal_dense() -> None:
     s = scene(cameras=2)
     s["means"][:20, 2] -= 4
     results = []
@@ -143,7 +143,7 @@ def test_packed_rows_and_sparse_gradients_are_those_of_the_dense_call() -> None:
     assert sparse[3]["means"]._nnz() == 40
 
 
-def test_harmonics_batches_and_the_version_of_constants() -> None:
+def test_surfel_harmonics_batches_and_constants() -> None:
     s = scene(batch=(2,), cameras=2)
     s["opacities"][:] = 1.0
     s["colors"] = torch.rand(2, 60, 4, 3) - 0.5
@@ -154,7 +154,7 @@ def test_harmonics_batches_and_the_version_of_constants() -> None:
     torch.testing.assert_close(rasterization_2dgs(**one, sh_degree=1, backgrounds=torch.ones(1, 2, 3))[0], image[:1])
 
 
-def test_surfels_that_cannot_be_rendered_change_nothing() -> None:
+def test_surfels_with_invalid_values_are_ignored() -> None:
     s = scene()
     expected = rasterization_2dgs(**s, render_mode="RGB+ED")
     more = dict(s)
@@ -173,7 +173,7 @@ def test_surfels_that_cannot_be_rendered_change_nothing() -> None:
     assert more["means"].grad.isfinite().all() and not more["means"].grad[-3:].any()
 
 
-def test_no_surfels() -> None:
+def test_surfel_rendering_without_surfels() -> None:
     s = scene()
     empty = {name: s[name][:0] for name in ("means", "quats", "scales", "opacities")}
     image, alphas, *_ = rasterization_2dgs(
@@ -182,7 +182,7 @@ def test_no_surfels() -> None:
     assert (image == 0.25).all() and not alphas.any()
 
 
-def test_pairs_blend_to_the_same_pictures() -> None:
+def test_surfel_pairs_blend_to_same_image() -> None:
     s = blend_scene(surfel_scene(50, 40, 33, cameras=2))
     inputs = {name: value.detach() for name, value in s.to(torch.float32).items()}
     offsets, ids = s.lists()
@@ -197,7 +197,7 @@ def test_pairs_blend_to_the_same_pictures() -> None:
         torch.testing.assert_close(value, wanted, rtol=1e-4, atol=1e-4)
 
 
-def test_the_stand_in_for_the_authors_renderer() -> None:
+def test_inria_wrapper_equals_rasterization_2dgs() -> None:
     s = scene()
     s["colors"] = s["colors"][0]
     (colors, alphas), meta = rasterization_2dgs_inria_wrapper(**s, depth_ratio=1)
@@ -218,6 +218,6 @@ def test_the_stand_in_for_the_authors_renderer() -> None:
         ({"backgrounds": torch.zeros(2, 3)}, "backgrounds"),
     ],
 )
-def test_wrong_options_are_refused(options: dict[str, Any], message: str) -> None:
+def test_surfel_rendering_rejects_invalid_options(options: dict[str, Any], message: str) -> None:
     with pytest.raises(InvalidInput, match=message):
         rasterization_2dgs(**scene(), **options)

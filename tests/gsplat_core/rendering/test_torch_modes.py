@@ -31,7 +31,7 @@ def arguments():
 
 
 @pytest.mark.parametrize("render", RENDER.values(), ids=RENDER.keys())
-def test_autocasting_does_not_change_the_picture(render):
+def test_rendering_unchanged_under_autocast(render):
     expected = render(*arguments())
     with torch.autocast("cpu", dtype=torch.bfloat16):
         assert torch.is_autocast_enabled("cpu")
@@ -42,7 +42,7 @@ def test_autocasting_does_not_change_the_picture(render):
 
 @pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated")  # by torch itself when jvp is first used
 @pytest.mark.parametrize("render", [RENDER["dense"], RENDER["packed"], RENDER["surfels"]])
-def test_transforms_that_would_give_wrong_results_are_refused(render):
+def test_rendering_rejects_vmap_and_forward_mode(render):
     means, *others = arguments()
     of_means = lambda each: render(each, *others)
     with pytest.raises(
@@ -57,7 +57,7 @@ def test_transforms_that_would_give_wrong_results_are_refused(render):
 
 
 @pytest.mark.parametrize("render", RENDER.values(), ids=RENDER.keys())
-def test_second_derivatives_are_refused_and_first_ones_stay(render):
+def test_rendering_rejects_second_derivatives(render):
     means, *others = arguments()
     means.requires_grad_()
     image = render(means, *others)

@@ -44,7 +44,7 @@ def psnr(first: Tensor, second: Tensor) -> float:
 
 @pytest.mark.parametrize("eval3d", [False, True])
 @pytest.mark.parametrize("mode", ["RGB+ED", "D"])
-def test_without_distortion_it_is_the_ordinary_picture(eval3d, mode):
+def test_unscented_without_distortion_equals_ordinary_image(eval3d, mode):
     size = {"width": W, "height": H, "render_mode": mode}
     expected, _, _ = rasterization(**scene(), **size, eps2d=0.01)
     found, _, meta = rasterization(**scene(), **size, eps2d=0.01, with_ut=True, with_eval3d=eval3d)
@@ -52,7 +52,7 @@ def test_without_distortion_it_is_the_ordinary_picture(eval3d, mode):
     assert meta["gaussian_ids"] is None and meta["radii"].shape == (1, 60, 2)
 
 
-def test_fisheye_and_ftheta_of_the_same_lens_agree():
+def test_fisheye_and_ftheta_of_same_lens_agree():
     size = {"width": W, "height": H, "with_ut": True, "with_eval3d": True}
     fisheye, _, _ = rasterization(**scene(), **size, camera_model="fisheye")
     given = scene()
@@ -62,7 +62,7 @@ def test_fisheye_and_ftheta_of_the_same_lens_agree():
 
 
 @pytest.mark.parametrize("eval3d", [False, True])
-def test_a_rolling_shutter_shows_the_rows_of_pictures_at_their_times(eval3d):
+def test_rolling_shutter_rows_equal_images_at_row_times(eval3d):
     given = scene()
     end = exp(torch.tensor([[0.05, -0.03, 0.02, 0.01, 0.02, 0.05]])) @ given["viewmats"]
     kind = RollingShutterType.ROLLING_TOP_TO_BOTTOM
@@ -78,7 +78,7 @@ def test_a_rolling_shutter_shows_the_rows_of_pictures_at_their_times(eval3d):
 
 
 @pytest.mark.parametrize("kind", ["plain", "packed", "unscented", "eval3d"])
-def test_values_and_gradients_are_the_references_with_cameras_and_coefficients(kind):
+def test_unscented_values_and_gradients_match_reference(kind):
     results = []
     for function, dtype in ((rasterization, torch.float32), (reference.rasterization, torch.float64)):
         given = scene(dtype)
@@ -100,7 +100,7 @@ def test_values_and_gradients_are_the_references_with_cameras_and_coefficients(k
         )
 
 
-def test_harmonics_are_seen_from_the_middle_of_the_read_out():
+def test_rolling_shutter_harmonics_use_pose_at_middle_of_readout():
     given = scene()
     end = given["viewmats"].clone()
     end[:, 0, 3] = 0.4
@@ -130,6 +130,6 @@ def test_harmonics_are_seen_from_the_middle_of_the_read_out():
         ({"with_ut": True, "radial_coeffs": torch.zeros(1, 6), "render_mode": "Ed"}, NotImplementedError, "D and ED"),
     ],
 )
-def test_combinations_that_do_not_work_name_one_that_does(options, error, words):
+def test_unsupported_combination_error_names_alternative(options, error, words):
     with pytest.raises(error, match=words):
         rasterization(**scene(), width=W, height=H, **options)

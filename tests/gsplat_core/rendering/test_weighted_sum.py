@@ -39,7 +39,7 @@ def values_of(kind, distance=50.0):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_picture_is_the_weighted_mean(kind):
+def test_weighted_sum_image_is_weighted_mean(kind):
     scene, values = kind.extended(two_splats()), values_of(kind)
     output = kind.picture(scene, CAMERA, torch.tensor([0.0, 0.0, 1.0]), values)
     depths = torch.tensor([40.0, 80.0])
@@ -58,7 +58,7 @@ def test_the_picture_is_the_weighted_mean(kind):
     torch.testing.assert_close(output.depth[11, 15], (terms * depths).sum() / terms.sum(), rtol=2e-4, atol=1e-3)
 
 
-def test_opacities_depend_on_the_direction_and_may_be_negative():
+def test_weighted_sum_opacity_depends_on_direction_and_may_be_negative():
     scene = WeightedSumRenderer.extended(two_splats())
     opacity = scene.extra[OPACITY].clone()
     opacity[0, 0], opacity[0, 2] = 0.0, -1.0  # Y_1,0 = 0.4886 z, and the direction is +z
@@ -71,7 +71,7 @@ def test_opacities_depend_on_the_direction_and_may_be_negative():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_gradients_equal_differences(kind):
+def test_weighted_sum_gradients_equal_finite_differences(kind):
     # The splats cover the whole picture, so no pixel crosses the cutoff.
     scene, values = kind.extended(two_splats()), values_of(kind)
     scene.means[:, :2] += torch.tensor([[3.0, -2.0], [-4.0, 5.0]])
@@ -105,7 +105,7 @@ def test_gradients_equal_differences(kind):
         assert float(scalars[name].grad) == pytest.approx(expected, rel=0.05, abs=0.05)
 
 
-def test_any_order_gives_the_same_bytes(make_gaussians):
+def test_weighted_sum_is_independent_of_order(make_gaussians):
     scene, values = WeightedSumRenderer.extended(make_gaussians(300)), values_of(WeightedSumRenderer, 1000.0)
     order = torch.randperm(300, generator=torch.Generator().manual_seed(2))
     wanted = WeightedSumRenderer.picture(scene, CAMERA, None, values)
@@ -115,7 +115,7 @@ def test_any_order_gives_the_same_bytes(make_gaussians):
 
 
 @pytest.mark.parametrize("with_background", [True, False])
-def test_the_picture_equals_the_reference(make_gaussians, assert_near, with_background):
+def test_weighted_sum_image_equals_reference(make_gaussians, assert_near, with_background):
     scene, values = WeightedSumRenderer.extended(make_gaussians(200)), values_of(WeightedSumRenderer)
     g = torch.Generator().manual_seed(5)
     opacity = scene.extra[OPACITY] + 0.3 * torch.randn(200, 16, generator=g)
