@@ -11,7 +11,7 @@ from gsplat_core.training.steps.optimiser import FusedAdam
 
 @pytest.mark.parametrize("row_size", [1, 3, 48, 5000])
 @pytest.mark.parametrize("rows", [0, 1, 2003])
-def test_equals_the_reference_where_gradients_are_not_finite(gpu, rows, row_size):
+def test_adam_step_equals_reference_with_non_finite_gradients(gpu, rows, row_size):
     generator = torch.Generator().manual_seed(0)
     draw = lambda: torch.randn(rows, row_size, generator=generator)
     parameter, first, second = draw().to(gpu), torch.zeros(rows, row_size).to(gpu), torch.zeros(rows, row_size).to(gpu)
@@ -30,7 +30,7 @@ def test_equals_the_reference_where_gradients_are_not_finite(gpu, rows, row_size
 
 @pytest.mark.parametrize("row_size", [1, 3, 48, 5000])
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
-def test_rows_that_are_not_shown_keep_their_bits_and_are_not_counted(gpu, row_size, share):
+def test_adam_step_leaves_hidden_rows_unchanged_and_uncounted(gpu, row_size, share):
     generator = torch.Generator().manual_seed(4)
     rows = 2003
     shown = torch.rand(rows, generator=generator) < share
@@ -53,7 +53,7 @@ def test_rows_that_are_not_shown_keep_their_bits_and_are_not_counted(gpu, row_si
         torch.testing.assert_close(now.cpu().double(), wanted, rtol=1e-5, atol=2e-6)
 
 
-def test_devices_must_agree(gpu):
+def test_adam_step_rejects_mixed_devices(gpu):
     on_gpu, here = torch.zeros(4, device=gpu), torch.zeros(4)
     with pytest.raises(InvalidInput, match="one device"):
         adam_step(on_gpu, here, on_gpu.clone(), on_gpu.clone(), 1, 0.1)
@@ -62,7 +62,7 @@ def test_devices_must_agree(gpu):
 
 
 @pytest.mark.parametrize("row_size", [1, 3, 5000])
-def test_a_captured_step_reads_rate_and_step_anew(gpu, row_size):
+def test_captured_adam_step_reads_current_rate_and_step(gpu, row_size):
     generator = torch.Generator().manual_seed(0)
     parameter = torch.randn(41, row_size, generator=generator).to(gpu)
     first, second = torch.zeros_like(parameter), torch.zeros_like(parameter)
@@ -89,7 +89,7 @@ def test_a_captured_step_reads_rate_and_step_anew(gpu, row_size):
         torch.testing.assert_close(actual.cpu().double(), wanted, rtol=1e-5, atol=2e-6)
 
 
-def test_opcheck(gpu):
+def test_adam_ops_pass_opcheck(gpu):
     parameter, gradient, first, second = (torch.ones(10, 3, device=gpu) for _ in range(4))
     rate, step, skipped = torch.ones(1, device=gpu), *torch.ones(2, 1, dtype=torch.int64, device=gpu).unbind()
     shown = torch.arange(10, device=gpu) % 2 == 0
@@ -103,7 +103,7 @@ def test_opcheck(gpu):
 
 
 @pytest.mark.filterwarnings("ignore:Synchronization debug mode:UserWarning")
-def test_the_optimiser_does_not_wait(gpu):
+def test_fused_adam_does_not_synchronise(gpu):
     values = {"means": torch.zeros(5, 3, device=gpu), "sh": torch.zeros(5, 4, 3, device=gpu)}
     optimiser = FusedAdam(values, {"means": 0.1, "sh": 0.1})
     gradients = {name: torch.ones_like(t) for name, t in values.items()}

@@ -64,7 +64,7 @@ def assert_near(output, expected):
 
 
 @pytest.mark.parametrize("kind", ["basis", "hexplane", None])
-def test_a_snapshot_looks_as_its_model_deformed_and_rendered_by_single_launches(scene, camera, kind):
+def test_alpha_renderer_snapshot_equals_single_launches(scene, camera, kind):
     field = None if kind is None else moving(scene, kind)
     snapshot = publish(SnapshotSlots("cuda"), scene, field, camera)
     renderer = new_renderer("alpha", camera, "cuda")
@@ -75,7 +75,7 @@ def test_a_snapshot_looks_as_its_model_deformed_and_rendered_by_single_launches(
         check(renderer.render(camera, time_s).result(), expected)
 
 
-def test_new_states_of_a_growing_scene_capture_nothing_anew(make_gaussians, scene, camera, captures):
+def test_alpha_renderer_recaptures_nothing_for_growing_scene(make_gaussians, scene, camera, captures):
     field = BasisField(scene.count, WINDOW_S, bumps=6).to("cuda")
     slots, renderer = SnapshotSlots("cuda"), new_renderer("alpha", camera, "cuda")
     held = None
@@ -95,7 +95,7 @@ def test_new_states_of_a_growing_scene_capture_nothing_anew(make_gaussians, scen
     assert len(captures) == captured, "a graph was captured although the scene stayed within its capacity"
 
 
-def test_what_is_published_next_does_not_reach_a_frame_in_flight(scene, camera):
+def test_alpha_renderer_frame_unaffected_by_later_snapshots(scene, camera):
     slots, renderer = SnapshotSlots("cuda"), new_renderer("alpha", camera, "cuda")
     expected = render(scene, camera)
     training, showing = torch.cuda.Stream(), torch.cuda.Stream()
@@ -120,7 +120,7 @@ def test_what_is_published_next_does_not_reach_a_frame_in_flight(scene, camera):
     assert not torch.equal(pictures[0][1], pictures[1][1])
 
 
-def test_overflowing_tile_lists_are_rendered_again_in_every_slot(make_gaussians, camera):
+def test_alpha_renderer_repeats_overflowing_frame_in_every_slot(make_gaussians, camera):
     scene = make_gaussians(3000).to("cuda")
     large = scene.map(torch.clone)
     large.log_scales.fill_(2.3)  # each covers most of the picture: no initial capacity holds them
@@ -132,7 +132,7 @@ def test_overflowing_tile_lists_are_rendered_again_in_every_slot(make_gaussians,
         assert_same_bits(renderer.render(camera, 0.0).result(), render(gaussians, camera))
 
 
-def test_a_model_is_rendered_too_and_half_precision_is_near(scene, camera):
+def test_alpha_renderer_accepts_model_and_half_precision(scene, camera):
     field = moving(scene).requires_grad_(False)
     model = Model(1, scene, field, camera, WINDOW_S)
     expected = render(model.at(0.4), camera)
@@ -145,7 +145,7 @@ def test_a_model_is_rendered_too_and_half_precision_is_near(scene, camera):
         assert 0 < float(error) < 10 ** -(50 / 10)
 
 
-def test_spare_rows_are_in_no_tile_list(scene, camera):
+def test_snapshot_spare_rows_do_not_change_image(scene, camera):
     snapshot = publish(SnapshotSlots("cuda"), scene, None, camera)
     everything = snapshot.slot.gaussians
     assert everything.count > scene.count and (everything.logit_opacities[scene.count :] == -math.inf).all()

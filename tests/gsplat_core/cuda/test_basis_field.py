@@ -36,7 +36,7 @@ def training_state(n, b, convert):
 
 @pytest.mark.parametrize("n", [0, 1, 2503])
 @pytest.mark.parametrize("b", [1, 4, 26, 33, 100])
-def test_forward_and_backward_equal_the_reference(gpu, n, b):
+def test_basis_field_forward_and_backward_equal_reference(gpu, n, b):
     field = bumps(n, b)
     ours, exact = [t.to(gpu) for t in field], [t.double() for t in field]
     for tau in (-3.0, 0.0, b / 2, b + 30.0):  # at the last none is active
@@ -53,7 +53,7 @@ def test_forward_and_backward_equal_the_reference(gpu, n, b):
 
 @pytest.mark.parametrize("n", [0, 1, 2503])
 @pytest.mark.parametrize("b", [1, 4, 33, 100])
-def test_added_colours_equal_the_reference(gpu, n, b):
+def test_basis_field_add_colours_equals_reference(gpu, n, b):
     centers, log_widths, weights = bumps(n, b)
     change = gradient_of(n, columns=3)
     change[::7] = torch.nan
@@ -70,7 +70,7 @@ def test_added_colours_equal_the_reference(gpu, n, b):
 
 @pytest.mark.parametrize("n", [0, 1, 2503])
 @pytest.mark.parametrize("b", [1, 4, 33, 100])
-def test_moving_to_deltas_equals_the_reference(gpu, n, b):
+def test_basis_field_move_to_equals_reference(gpu, n, b):
     centers, log_widths, weights = bumps(n, b)
     target = gradient_of(n)
     target[::7, 5] = torch.nan
@@ -87,7 +87,7 @@ def test_moving_to_deltas_equals_the_reference(gpu, n, b):
         assert float(near.flatten(1).all(1).double().mean() if n else 1.0) >= 0.998
 
 
-def test_autograd_goes_through_the_compiled_backward(gpu):
+def test_basis_field_autograd_uses_compiled_backward(gpu):
     field = [t.to(gpu).requires_grad_() for t in bumps(20, 10)]
     gradient = gradient_of(20).to(gpu)
     basis_field(*field, 4.4).backward(gradient)
@@ -96,7 +96,7 @@ def test_autograd_goes_through_the_compiled_backward(gpu):
 
 
 @pytest.mark.parametrize(("n", "b"), [(0, 5), (1, 4), (300, 26), (50, 70)])
-def test_fused_adam_equals_the_reference_over_many_steps_and_itself_to_the_bit(gpu, n, b):
+def test_basis_field_fused_adam_equals_reference_and_is_deterministic(gpu, n, b):
     exact = training_state(n, b, lambda t: t.double())
     twins = [training_state(n, b, lambda t: t.to(gpu)) for _ in range(2)]
     for step in range(12):
@@ -121,7 +121,7 @@ def test_fused_adam_equals_the_reference_over_many_steps_and_itself_to_the_bit(g
             torch.testing.assert_close(s.cpu().double(), w, rtol=2e-3, atol=2e-4)
 
 
-def test_bias_corrections_hold_for_a_bump_that_was_updated_often(gpu):
+def test_basis_field_adam_bias_correction_at_high_step_counts(gpu):
     exact, ours = training_state(4, 5, lambda t: t.double()), training_state(4, 5, lambda t: t.to(gpu))
     for state in (exact, ours):
         state[3].copy_(torch.tensor([0, 1, 50, 1_000_000])[:, None].expand(4, 5))
@@ -133,7 +133,7 @@ def test_bias_corrections_hold_for_a_bump_that_was_updated_often(gpu):
     assert ((ours[0][2].cpu().double() - exact[0][2]).abs() < 1e-4 * step + 1e-6).all()
 
 
-def test_a_captured_step_reads_time_and_rates_anew(gpu):
+def test_basis_field_captured_step_reads_current_time_and_rates(gpu):
     state, fused = (training_state(200, 26, lambda t: t.to(gpu)) for _ in range(2))
     tau, rates = torch.zeros(1, device=gpu), torch.zeros(6, device=gpu)
     gradient = gradient_of(200, columns=16).to(gpu)
@@ -163,7 +163,7 @@ def test_a_captured_step_reads_time_and_rates_anew(gpu):
         assert torch.equal(a, b)
 
 
-def test_nan_shows_in_its_own_gaussian_only_and_only_while_active(gpu):
+def test_basis_field_nan_affects_only_own_gaussian_while_active(gpu):
     for which in (0, 1, 2):
         field = [t.to(gpu) for t in bumps(9, 20)]
         field[which][4, 2] = torch.nan
@@ -172,7 +172,7 @@ def test_nan_shows_in_its_own_gaussian_only_and_only_while_active(gpu):
     assert basis_field(*field, 18.0).isfinite().all(), "the NaN weight is of a bump far from this time"
 
 
-def test_extreme_widths_do_not_overflow(gpu):
+def test_basis_field_extreme_widths_do_not_overflow(gpu):
     field = bumps(3, 4)
     field[1][0, :], field[1][1, :] = 500.0, -500.0
     for tau in (0.5, 7.7):
@@ -180,7 +180,7 @@ def test_extreme_widths_do_not_overflow(gpu):
         torch.testing.assert_close(actual, reference.basis_field(*field, tau), rtol=2e-5, atol=2e-6)
 
 
-def test_inputs_that_are_not_contiguous(gpu):
+def test_basis_field_accepts_non_contiguous_inputs(gpu):
     centers, log_widths, weights = (t.to(gpu) for t in bumps(33, 26))
     expected = basis_field(centers, log_widths, weights, 5.0)
     strided = weights.permute(2, 0, 1).contiguous().permute(1, 2, 0)
@@ -188,7 +188,7 @@ def test_inputs_that_are_not_contiguous(gpu):
 
 
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor:UserWarning")  # raised by opcheck itself
-def test_ops_pass_opcheck(gpu):
+def test_basis_field_ops_pass_opcheck(gpu):
     field, m, v, steps = training_state(5, 7, lambda t: t.to(gpu))
     ops, tau, gradient = torch.ops.gsplat_core, torch.full((1,), 3.0, device=gpu), gradient_of(5).to(gpu)
     leaves = [t.clone().requires_grad_() for t in field]
@@ -201,7 +201,7 @@ def test_ops_pass_opcheck(gpu):
     )
 
 
-def test_what_it_cannot_take_is_refused(gpu):
+def test_basis_field_rejects_invalid_inputs(gpu):
     field = [t.to(gpu) for t in bumps(3, 4)]
     with pytest.raises(InvalidInput, match=r"tau must be 1 float32 on cuda:0, got .* on cpu"):
         basis_field(*field, torch.zeros(1))
@@ -211,7 +211,7 @@ def test_what_it_cannot_take_is_refused(gpu):
         basis_field(field[0].double(), *field[1:], 0.0)
 
 
-def test_the_field_trains_grows_and_moves_on_as_on_the_cpu(gpu):
+def test_basis_field_training_and_growth_equal_cpu(gpu):
     here, there = BasisField(40, (0.0, 1.0)), BasisField(40, (0.0, 1.0)).to(gpu)
     for step, time_s in enumerate((0.1, 0.9, 1.4, 1.6)):
         if step == 2:
@@ -237,7 +237,7 @@ def test_the_field_trains_grows_and_moves_on_as_on_the_cpu(gpu):
 
 
 @pytest.mark.filterwarnings("ignore:Synchronization debug mode:UserWarning")
-def test_adam_step_of_the_field_does_not_wait(gpu):
+def test_basis_field_adam_step_does_not_synchronise(gpu):
     field = BasisField(40, (0.0, 1.0)).to(gpu)
     gradient = gradient_of(40).to(gpu)
     field.adam_step(0.5, gradient, BasisRates())

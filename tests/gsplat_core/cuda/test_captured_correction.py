@@ -38,7 +38,7 @@ def sloping(gpu, hole=False):
 
 @pytest.mark.parametrize("hole", [False, True])
 @pytest.mark.parametrize("later_s", [0.0, 0.1])
-def test_one_launch_corrects_as_many_do(gpu, step, hole, later_s):
+def test_captured_correction_equals_separate_launches(gpu, step, hole, later_s):
     observation = Observation.of(found(FRAME, origin=DEPTH_ORIGINS["stereo"]), CAMERA, gpu)
     weights, depth = step.field.weights.data, sloping(gpu, hole)
     before = weights.clone()
@@ -56,7 +56,7 @@ def test_one_launch_corrects_as_many_do(gpu, step, hole, later_s):
     assert torch.equal(weights[count:], before[count:]), "rows that are not in use stay as they are"
 
 
-def test_a_frame_that_does_not_fit_changes_nothing_and_the_next_one_does(gpu, step):
+def test_captured_correction_skips_overflowing_frame_then_recovers(gpu, step):
     observation = Observation.of(found(FRAME, origin=DEPTH_ORIGINS["stereo"]), CAMERA, gpu)
     weights, depth = step.field.weights.data, sloping(gpu)
     captured = CapturedCorrection(step.fixed_rows, step.capabilities.captured_motion, CAMERA)

@@ -121,18 +121,18 @@ def check(s: Scene, absgrad: bool = False) -> Results:
 
 @pytest.mark.parametrize("absgrad", [True, False])
 @pytest.mark.parametrize("channels", [1, 2, 3, 4, 5, 7, 8, 9, 32])
-def test_random_scene_for_any_number_of_channels(channels: int, absgrad: bool) -> None:
+def test_compositing_with_any_number_of_channels(channels: int, absgrad: bool) -> None:
     check(scene(300, channels=channels, backgrounds=torch.rand(1, channels)), absgrad)
 
 
 @pytest.mark.parametrize("tile_size", [4, 5, 8, 16, 20, 33, 64])
 @pytest.mark.parametrize("size", [(1, 1), (33, 50)])
-def test_any_tile_and_image_size(tile_size: int, size: tuple[int, int]) -> None:
+def test_compositing_with_any_tile_and_image_size(tile_size: int, size: tuple[int, int]) -> None:
     check(scene(120, *size, tile_size=tile_size, backgrounds=torch.rand(1, 3)), absgrad=True)
 
 
 @pytest.mark.parametrize("image_dims", [(), (3,), (2, 2), (0,)])
-def test_leading_dimensions(image_dims: tuple[int, ...]) -> None:
+def test_compositing_with_leading_dimensions(image_dims: tuple[int, ...]) -> None:
     s = scene(60, 40, 20, image_dims=image_dims, backgrounds=torch.rand(*image_dims, 3))
     seen = s.run()
     assert seen["image"].shape == (*image_dims, 20, 40, 3)
@@ -140,7 +140,7 @@ def test_leading_dimensions(image_dims: tuple[int, ...]) -> None:
         check(s)
 
 
-def test_faint_opaque_and_indefinite_splats() -> None:
+def test_compositing_of_faint_opaque_and_indefinite_splats() -> None:
     s = scene(300, median_px=5.0)
     s.opacities[:, ::4] = 1.0
     s.opacities[:, 1::4] = 1.5 / 255
@@ -150,7 +150,7 @@ def test_faint_opaque_and_indefinite_splats() -> None:
     check(s)
 
 
-def test_thin_huge_and_tiny_splats() -> None:
+def test_compositing_of_thin_huge_and_tiny_splats() -> None:
     s = scene(200, 90, 60, median_px=4.0)
     direction = torch.tensor([[1.0, 1.0], [-1.0, 1.0]]) / math.sqrt(2)
     thin = direction.T @ torch.diag(torch.tensor([1 / 80.0**2, 1 / 0.6**2])) @ direction
@@ -161,7 +161,7 @@ def test_thin_huge_and_tiny_splats() -> None:
     check(s, absgrad=True)
 
 
-def test_gradients_of_single_tiny_splats_keep_single_precision() -> None:
+def test_compositing_gradients_of_tiny_splats_keep_single_precision() -> None:
     """Moments are summed about the middle of 8x8 pixels: what is left after moving them to a tiny splat's mean must be good."""
     s, random = scene(400, 160, 160, channels=4), torch.Generator().manual_seed(5)
     s.means2d[0] = torch.cartesian_prod(torch.arange(20.0), torch.arange(20.0)) * 8 + 8 * torch.rand(
@@ -177,7 +177,7 @@ def test_gradients_of_single_tiny_splats_keep_single_precision() -> None:
 
 
 @pytest.mark.parametrize("channels", [3, 6])
-def test_values_that_are_not_finite_are_skipped_and_get_no_gradient(channels: int) -> None:
+def test_compositing_skips_non_finite_splats_without_gradient(channels: int) -> None:
     s = scene(200, channels=channels)
     columns = (
         (s.means2d, 0),
@@ -202,7 +202,7 @@ def test_values_that_are_not_finite_are_skipped_and_get_no_gradient(channels: in
         torch.testing.assert_close(seen[name][:, ~bad], wanted[name])
 
 
-def test_masked_tiles_show_the_background_only() -> None:
+def test_compositing_masked_tiles_show_background_only() -> None:
     masks = torch.rand(2, 3, 5, generator=torch.Generator().manual_seed(2)) > 0.4
     seen = check(scene(150, image_dims=(2,), masks=masks, backgrounds=torch.rand(2, 3)))
     hidden = ~masks.repeat_interleave(16, 1).repeat_interleave(16, 2)[:, :45, :70]
@@ -210,28 +210,28 @@ def test_masked_tiles_show_the_background_only() -> None:
 
 
 @pytest.mark.parametrize("channels", [3, 2])
-def test_no_splats_show_the_background(channels: int) -> None:
+def test_compositing_without_splats_shows_background(channels: int) -> None:
     background = torch.rand(1, channels)
     seen = scene(0, 33, 17, channels, backgrounds=background).run()
     assert torch.equal(seen["image"], background.expand(1, 17, 33, channels))
     assert not seen["alphas"].any()
 
 
-def test_very_many_splats_in_one_tile() -> None:
+def test_compositing_of_very_many_splats_in_one_tile() -> None:
     s = scene(20_000, 16, 16)
     s.opacities[:] = 0.0045  # just visible, so that about 2,000 are blended before a pixel ends
     s.conics[:] = torch.tensor([1e-6, 0.0, 1e-6])  # and over the whole tile: no pixel is near the cut-off of 1/255
     check(s)
 
 
-def test_a_splat_in_very_many_tiles() -> None:
+def test_compositing_of_splat_in_very_many_tiles() -> None:
     s = scene(40, 300, 200, median_px=2.0, backgrounds=torch.rand(1, 3))
     s.conics[:, 3] = torch.tensor([1e-6, 0.0, 1e-6])
     s.opacities[:, 3] = 0.3
     check(s, absgrad=True)
 
 
-def test_packed_splats_equal_the_dense_ones() -> None:
+def test_compositing_packed_equals_dense() -> None:
     s = scene(80, image_dims=(2,))
     offsets, flatten_ids = (t.cuda() for t in s.lists())
     splats = [t.cuda() for t in (s.means2d, s.conics, s.colors, s.opacities)]
@@ -242,14 +242,14 @@ def test_packed_splats_equal_the_dense_ones() -> None:
 
 
 @pytest.mark.parametrize("channels", [4, 6])
-def test_the_same_bits_every_time(channels: int) -> None:
+def test_compositing_is_deterministic(channels: int) -> None:
     s = scene(3000, 300, 200, channels=channels, backgrounds=torch.rand(1, channels))
     runs = [s.run(absgrad=True) for _ in range(3)]
     for other in runs[1:]:
         assert all(torch.equal(other[name], value) for name, value in runs[0].items())
 
 
-def test_indices_that_are_no_splats_are_skipped() -> None:
+def test_compositing_skips_indices_out_of_range() -> None:
     s = scene(50)
     offsets, flatten_ids = (t.cuda() for t in s.lists())
     splats = [t.cuda().requires_grad_() for t in (s.means2d, s.conics, s.colors, s.opacities)]
@@ -262,7 +262,7 @@ def test_indices_that_are_no_splats_are_skipped() -> None:
     assert not beyond[1].any()
 
 
-def test_strided_inputs_and_a_side_stream() -> None:
+def test_compositing_with_strided_inputs_on_side_stream() -> None:
     s = scene(300)
     lists = [t.cuda() for t in s.lists()]
     splats = [t.cuda() for t in (s.means2d, s.conics, s.colors, s.opacities)]
@@ -279,7 +279,7 @@ def test_strided_inputs_and_a_side_stream() -> None:
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor:UserWarning")  # raised by opcheck itself
 @pytest.mark.parametrize("background", [True, False])
 @pytest.mark.parametrize("limit", [(), (0.999,)], ids=["default", "0.999"])
-def test_ops_pass_opcheck(background: bool, limit: tuple[float, ...]) -> None:
+def test_compositing_ops_pass_opcheck(background: bool, limit: tuple[float, ...]) -> None:
     s = scene(30, 20, 18)
     lists = [t.cuda() for t in s.lists()]
     splats = [t[0].cuda().requires_grad_() for t in (s.means2d, s.conics, s.colors, s.opacities)]

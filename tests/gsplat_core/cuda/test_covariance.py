@@ -8,7 +8,7 @@ from gsplat_core import InvalidInput, quat_scale_to_covar_preci, reference
 
 @pytest.mark.parametrize("triu", [True, False])
 @pytest.mark.parametrize("count", [0, 1, 1003])
-def test_values_and_gradients_equal_the_reference(gpu, assert_near, count, triu):
+def test_covariance_values_and_gradients_equal_reference(gpu, assert_near, count, triu):
     generator = torch.Generator().manual_seed(0)
     quats = torch.randn(count, 4, generator=generator)
     scales = (torch.randn(count, 3, generator=generator) * 0.5).exp()
@@ -27,7 +27,7 @@ def test_values_and_gradients_equal_the_reference(gpu, assert_near, count, triu)
 
 
 @pytest.mark.parametrize("triu", [True, False])
-def test_opcheck(gpu, triu):
+def test_covariance_ops_pass_opcheck(gpu, triu):
     quats, scales = (torch.rand(9, n, device=gpu, requires_grad=True) for n in (4, 3))
     ops = torch.ops.gsplat_core
     torch.library.opcheck(ops.quat_scale_to_covar_preci.default, (quats, scales, True, True, triu))
@@ -37,7 +37,7 @@ def test_opcheck(gpu, triu):
         torch.library.opcheck(ops.quat_scale_to_covar_preci_backward.default, (*plain, *given, triu))
 
 
-def test_values_of_any_layout_give_the_same_bits(gpu):
+def test_covariance_independent_of_memory_layout(gpu):
     quats, scales = (torch.rand(1000, n, device=gpu) for n in (4, 3))
     wanted = quat_scale_to_covar_preci(quats, scales)
     shifted = [torch.empty(t.numel() + 1, device=gpu)[1:].view(t.shape).copy_(t) for t in (quats, scales)]
@@ -47,6 +47,6 @@ def test_values_of_any_layout_give_the_same_bits(gpu):
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float16])
-def test_other_types_are_refused(gpu, dtype):
+def test_covariance_rejects_other_dtypes(gpu, dtype):
     with pytest.raises(InvalidInput, match="must be float32"):
         quat_scale_to_covar_preci(*(torch.rand(5, n, device=gpu, dtype=dtype) for n in (4, 3)))

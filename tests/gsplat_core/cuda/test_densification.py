@@ -26,7 +26,7 @@ def gaussians(count):
 
 @pytest.mark.parametrize("with_radii", [True, False])
 @pytest.mark.parametrize(("images", "count"), [(0, 3), (1, 0), (1, 1), (3, 100_003)])
-def test_statistics_equal_the_reference_and_repeat_bit_by_bit(gpu, assert_near, images, count, with_radii):
+def test_gradient_norms_equal_reference_and_are_deterministic(gpu, assert_near, images, count, with_radii):
     gradients, radii, start = screen(images, count)
 
     def run(function, convert):
@@ -41,7 +41,7 @@ def test_statistics_equal_the_reference_and_repeat_bit_by_bit(gpu, assert_near, 
 
 
 @pytest.mark.parametrize("count", [0, 1, 7, 100_003])
-def test_noise_equals_the_reference_and_repeats_bit_by_bit(gpu, assert_near, count):
+def test_diffuse_positions_equals_reference_and_is_deterministic(gpu, assert_near, count):
     given = gaussians(count)
 
     def run(function, convert):
@@ -55,7 +55,7 @@ def test_noise_equals_the_reference_and_repeats_bit_by_bit(gpu, assert_near, cou
     assert_near(ours - given[0], exact - given[0].double(), of_largest=1e-5)
 
 
-def test_a_graph_captures_both(gpu):
+def test_densification_ops_captured_in_graph(gpu):
     gradients, radii, start = (each.to(gpu) for each in screen(2, 1000))
     means, *rest = (each.to(gpu) for each in gaussians(1000))
     state, moved = start.clone(), means.clone()
@@ -76,7 +76,7 @@ def test_a_graph_captures_both(gpu):
     assert torch.equal(moved, wanted[1])
 
 
-def test_opcheck(gpu):
+def test_densification_ops_pass_opcheck(gpu):
     gradients, radii, state = (each.to(gpu) for each in screen(2, 9))
     ops = torch.ops.gsplat_core
     torch.library.opcheck(ops.accumulate_gradient_norms_.default, (gradients, radii, 1.0, 2.0, 0.5, *state.clone()))

@@ -11,13 +11,13 @@ from tests.gsplat_core.ops.test_disparity_fit import check_against_reference
 
 
 @every_case
-def test_values_are_those_of_the_reference(gpu, case):
+def test_disparity_fit_equals_reference(gpu, case):
     kind, height, width, lowest, count = case
     left, right = pair(kind, height, width)
     check_against_reference(left, right, match_disparities(left, right, lowest, count).sixteenths, gpu)
 
 
-def test_pictures_of_usual_size_are_as_on_the_cpu(gpu):
+def test_disparity_fit_of_usual_image_size_equals_cpu(gpu):
     left, right = pair("steps", 512, 640)
     start = match_disparities(left, right, 0, 32).sixteenths
     assert (start == UNKNOWN).any()
@@ -26,19 +26,19 @@ def test_pictures_of_usual_size_are_as_on_the_cpu(gpu):
     torch.testing.assert_close(there.error_px.cpu(), here.error_px, rtol=5e-3, atol=1e-4)
 
 
-def test_the_same_bits_again(gpu):
+def test_disparity_fit_is_deterministic(gpu):
     left, right = (each.to(gpu) for each in pair("noise", 200, 300))
     start = torch.zeros(200, 300, dtype=torch.int32, device=gpu)
     first, second = (fit_disparities(left, right, start) for _ in range(2))
     assert torch.equal(first.px, second.px) and torch.equal(first.error_px, second.error_px)
 
 
-def test_no_pixels(gpu):
+def test_disparity_fit_without_pixels(gpu):
     nothing = torch.zeros(5, 0, dtype=torch.uint8, device=gpu)
     assert fit_disparities(nothing, nothing, nothing.int()).px.shape == (5, 0)
 
 
-def test_opcheck(gpu):
+def test_disparity_fit_passes_opcheck(gpu):
     left, right = (each.to(gpu) for each in pair("texture", 12, 20))
     start = torch.zeros(12, 20, dtype=torch.int32, device=gpu)
     torch.library.opcheck(torch.ops.gsplat_core.fit_disparities, (left, right, start))

@@ -13,7 +13,7 @@ pytestmark = [
 ]
 
 
-def test_each_gpu_renders_its_cameras_with_the_gaussians_of_all():
+def test_distributed_rendering_over_gpus_equals_single_gpu():
     size = torch.cuda.device_count()
     found = differences(300, 2 * size, size, "cuda")
     assert len(found) == 14

@@ -22,7 +22,7 @@ def evaluated(function, scene, dtype, device, before=BEFORE):
 
 @pytest.mark.parametrize("size", [(70, 45), (1, 1), (33, 18), (200, 130)])
 @pytest.mark.parametrize("count", [0, 1, 5, 1200])
-def test_values_and_gradients_equal_the_reference(gpu, assert_near, count, size):
+def test_blend_flow_values_and_gradients_equal_reference(gpu, assert_near, count, size):
     camera = Camera.from_focal(60.0, *size)
     scene = flow_scene(count, camera)
     blended, gradient = evaluated(blend_flow, scene, torch.float32, gpu, camera)
@@ -32,7 +32,7 @@ def test_values_and_gradients_equal_the_reference(gpu, assert_near, count, size)
     assert_near(gradient, wanted_gradient, of_largest=5e-5)
 
 
-def test_opaque_splats_and_points_behind_the_camera(gpu, assert_near):
+def test_blend_flow_of_opaque_splats_and_points_behind_camera(gpu, assert_near):
     scene = flow_scene(400, median_px=8.0)
     scene.opacities[::2] = 1.0
     scene.planes[::3, 2] = -40.0
@@ -42,7 +42,7 @@ def test_opaque_splats_and_points_behind_the_camera(gpu, assert_near):
     assert_near(gradient, wanted_gradient, of_largest=5e-5)
 
 
-def test_splats_with_values_that_are_not_finite_are_skipped(gpu):
+def test_blend_flow_skips_non_finite_splats(gpu):
     scene = flow_scene(120)
     bad = torch.zeros(120, dtype=torch.bool)
     for number, tensor in enumerate((scene.means2d, scene.conics, scene.rays, scene.planes)):
@@ -55,7 +55,7 @@ def test_splats_with_values_that_are_not_finite_are_skipped(gpu):
     assert not gradient[bad].any()
 
 
-def test_the_same_bits_twice(gpu):
+def test_blend_flow_is_deterministic(gpu):
     scene = flow_scene(2000, median_px=8.0)
     first, second = (evaluated(blend_flow, scene, torch.float32, gpu) for _ in range(2))
     assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
@@ -63,7 +63,7 @@ def test_the_same_bits_twice(gpu):
 
 # opcheck itself reads .grad of tensors that are not leaves.
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
-def test_opcheck(gpu):
+def test_blend_flow_ops_pass_opcheck(gpu):
     scene = flow_scene(30).converted(torch.float32, gpu)
     offsets, ids = scene.lists(BEFORE)
     rest = (offsets, ids, intrinsics_of(BEFORE, AFTER), BEFORE.width_px, BEFORE.height_px)
@@ -73,7 +73,7 @@ def test_opcheck(gpu):
     torch.library.opcheck(torch.ops.gsplat_core.blend_flow_backward.default, (*scene[:4], planes, *rest, v))
 
 
-def test_captured_in_a_cuda_graph(gpu):
+def test_blend_flow_captured_in_graph(gpu):
     scene = FlowScene(*(tensor.detach() for tensor in flow_scene(300).converted(torch.float32, gpu)))
     offsets, ids = scene.lists(BEFORE)
     arguments = (*scene, offsets, ids, intrinsics_of(BEFORE, AFTER), BEFORE.width_px, BEFORE.height_px)

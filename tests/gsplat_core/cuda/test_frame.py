@@ -14,27 +14,27 @@ from tests.gsplat_core.cuda.frame_checks import assert_near, check, plain, scene
 
 @pytest.mark.parametrize("model", ["pinhole", "ortho", "fisheye"])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
-def test_pictures_of_every_degree_and_camera_model_equal_the_reference(degree: int, model: str) -> None:
+def test_frame_of_every_degree_and_camera_model_equals_reference(degree: int, model: str) -> None:
     assert check(scene(400, degree=degree, model=model)).alphas.max() > 0.5
 
 
 @pytest.mark.parametrize("size", [(1, 1), (16, 16), (17, 33), (200, 131)])
-def test_pictures_of_any_size_equal_the_reference(size: tuple[int, int]) -> None:
+def test_frame_of_any_size_equals_reference(size: tuple[int, int]) -> None:
     check(scene(300, *size, seed=1, background=False))
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 127, 128, 129, 1000])
-def test_pictures_of_any_number_of_gaussians_equal_the_reference(count: int) -> None:
+def test_frame_of_any_number_of_gaussians_equals_reference(count: int) -> None:
     check(scene(count, deltas=count % 2 == 0, seed=2))
 
 
 @pytest.mark.parametrize("deltas", [False, True])
-def test_the_picture_is_that_of_rasterization(deltas: bool) -> None:
+def test_frame_equals_rasterization(deltas: bool) -> None:
     s = scene(3000, 320, 240, degree=3, deltas=deltas, seed=3)
     assert_near(s.render(), plain(s))
 
 
-def test_deltas_are_added_to_the_raw_parameters() -> None:
+def test_frame_deltas_added_to_raw_parameters() -> None:
     s = scene(500, seed=4)
     d = s.deltas
     sh = s.sh.clone()
@@ -49,7 +49,7 @@ def test_deltas_are_added_to_the_raw_parameters() -> None:
     assert torch.equal(replace(s, deltas=unused).render().image, s.render().image)
 
 
-def test_gaussians_behind_the_camera_show_nothing() -> None:
+def test_frame_hides_gaussians_behind_camera() -> None:
     s = scene(200, seed=5)
     s.viewmat[2, 3] -= 100
     frame = check(s)
@@ -58,7 +58,7 @@ def test_gaussians_behind_the_camera_show_nothing() -> None:
     assert frame.status.tolist() == [0, 0, 0, 0]
 
 
-def test_gaussians_that_cover_the_screen() -> None:
+def test_frame_of_screen_covering_gaussians_equals_reference() -> None:
     s = scene(300, 700, 600, seed=6)
     s.log_scales[::20] = 1.5
     s.log_scales[1::20] = torch.tensor([1.0, -4.0, -4.0])  # longer ones lose digits in any float32
@@ -67,11 +67,11 @@ def test_gaussians_that_cover_the_screen() -> None:
     assert frame.splat_starts.diff().max() == 44 * 38
 
 
-def test_a_cloud_of_medium_splats_equals_the_reference() -> None:
+def test_frame_of_medium_splats_equals_reference() -> None:
     check(scene(2000, 500, 300, seed=7, size=0.2), capacity=1 << 20)
 
 
-def test_values_that_are_not_finite_leave_their_gaussian_out() -> None:
+def test_frame_omits_gaussians_with_non_finite_values() -> None:
     s = scene(200, degree=2, seed=9)
     row = 0
     for value in (math.nan, math.inf, -math.inf):
@@ -87,7 +87,7 @@ def test_values_that_are_not_finite_leave_their_gaussian_out() -> None:
     assert torch.equal(replace(s, **good).render(mode=FrameMode.TRAINING).image, frame.image)
 
 
-def test_the_same_bits_every_time() -> None:
+def test_frame_is_deterministic() -> None:
     s = scene(20_000, 320, 240, degree=3, seed=10, size=0.1)
     first, *others = (s.render(1 << 20, FrameMode.TRAINING) for _ in range(3))
     needed = int(first.status[STATUS_NEEDED])
@@ -100,7 +100,7 @@ def test_the_same_bits_every_time() -> None:
 
 
 @pytest.mark.parametrize("mode", FrameMode)
-def test_a_captured_frame_follows_camera_and_deltas(mode: FrameMode) -> None:
+def test_captured_frame_follows_camera_and_deltas(mode: FrameMode) -> None:
     s = scene(2000, 160, 120, degree=3, seed=12)
     tensors = s.tensors("cuda", torch.float32)
     controls = torch.empty(1 + 16 + 9 + 3, device="cuda")  # views that begin anywhere
@@ -132,7 +132,7 @@ def test_a_captured_frame_follows_camera_and_deltas(mode: FrameMode) -> None:
             assert torch.equal(getattr(captured, name), getattr(now, name)), name
 
 
-def test_strided_and_misaligned_inputs_and_a_side_stream() -> None:
+def test_frame_with_strided_and_misaligned_inputs_on_side_stream() -> None:
     s = scene(700, 160, 120, degree=3, seed=13)
     tensors = s.tensors("cuda", torch.float32)
     wanted = s.render(mode=FrameMode.TRAINING)
@@ -153,7 +153,7 @@ def test_strided_and_misaligned_inputs_and_a_side_stream() -> None:
     [(FrameMode.SHARED, False), (FrameMode.TRAINING, False), (FrameMode.SHARED, True), (FrameMode.SEGMENTS, False)],
 )
 @pytest.mark.parametrize("optional", [False, True])
-def test_op_passes_opcheck(mode: FrameMode, half: bool, optional: bool) -> None:
+def test_render_frame_op_passes_opcheck(mode: FrameMode, half: bool, optional: bool) -> None:
     s = scene(30, 20, 18, deltas=optional, background=optional)
     tensors = s.tensors("cuda", torch.float32)
     if half:

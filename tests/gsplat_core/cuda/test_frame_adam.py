@@ -66,7 +66,7 @@ class AdamState:
 
 @pytest.mark.parametrize("dtype", [torch.int32, torch.int64])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
-def test_fused_adam_is_the_gradient_and_then_adam(degree: int, dtype: torch.dtype) -> None:
+def test_frame_adam_equals_gradient_followed_by_adam(degree: int, dtype: torch.dtype) -> None:
     scene = on_gpu(frame_scene(333, degree=degree, deltas=True))
     scene.logit_opacities[5] = math.nan
     state = AdamState(scene)
@@ -86,7 +86,7 @@ def test_fused_adam_is_the_gradient_and_then_adam(degree: int, dtype: torch.dtyp
     assert not state.skipped.any()
 
 
-def test_fused_adam_leaves_rows_alone_whose_gradient_is_not_finite() -> None:
+def test_frame_adam_skips_rows_with_non_finite_gradient() -> None:
     scene = on_gpu(frame_scene(100, degree=1))
     state = AdamState(scene)
     raw = state.step(rendered(scene), 1, scale=1e30)
@@ -103,7 +103,7 @@ def test_fused_adam_leaves_rows_alone_whose_gradient_is_not_finite() -> None:
 
 
 @pytest.mark.parametrize("degree", [0, 2])
-def test_fused_adam_adds_the_gradient_of_further_losses_except_for_colours(degree: int) -> None:
+def test_frame_adam_adds_further_gradients_except_colours(degree: int) -> None:
     scene = on_gpu(frame_scene(333, degree=degree, deltas=True))
     added = torch.randn(333, 16, generator=torch.Generator().manual_seed(1)).cuda()
     added[7] = math.nan
@@ -127,7 +127,7 @@ def test_fused_adam_adds_the_gradient_of_further_losses_except_for_colours(degre
             torch.testing.assert_close(actual.cpu().double(), exact, rtol=1e-5, atol=2e-6)
 
 
-def test_fused_adam_without_raw_gradients_and_twice_the_same() -> None:
+def test_frame_adam_same_result_without_raw_gradients() -> None:
     scene = on_gpu(frame_scene(1000, 200, 100, degree=3))
     forward = rendered(scene)
     states = [AdamState(scene) for _ in range(2)]
@@ -137,7 +137,7 @@ def test_fused_adam_without_raw_gradients_and_twice_the_same() -> None:
         assert torch.equal(a, b)
 
 
-def test_fused_adam_reads_rates_and_step_from_the_device_in_a_graph() -> None:
+def test_frame_adam_in_graph_reads_rates_and_step_from_device() -> None:
     scene = on_gpu(frame_scene(500, 100, 80, degree=3))
     forward = rendered(scene)
     v_image, v_alphas = (t.cuda() for t in scene.picture_gradients())
@@ -161,7 +161,7 @@ def test_fused_adam_reads_rates_and_step_from_the_device_in_a_graph() -> None:
     assert all(torch.equal(a, b) for a, b in zip(graphed.scene.gaussians, plain.scene.gaussians, strict=True))
 
 
-def test_a_frame_that_overflowed_changes_nothing() -> None:
+def test_frame_adam_overflowed_frame_changes_nothing() -> None:
     scene = on_gpu(frame_scene(300, degree=1))
     forward = rendered(scene)
     forward.status[STATUS_OVERFLOW] = 1
@@ -174,7 +174,7 @@ def test_a_frame_that_overflowed_changes_nothing() -> None:
 
 
 @pytest.mark.parametrize("degree", [0, 1])
-def test_op_passes_opcheck(degree: int) -> None:
+def test_frame_adam_op_passes_opcheck(degree: int) -> None:
     scene = on_gpu(frame_scene(30, 20, 18, degree=degree, deltas=degree > 0))
     v_image, v_alphas = (t.cuda() for t in scene.picture_gradients())
     state = AdamState(scene)

@@ -13,7 +13,7 @@ from tests.gsplat_core.cuda.frame_scenes import NAMES, backward, by_name, frame_
 
 
 @pytest.mark.parametrize("degree", [0, 2])
-def test_autograd_takes_the_same_way(degree: int) -> None:
+def test_frame_autograd_equals_direct_backward(degree: int) -> None:
     scene = on_gpu(frame_scene(300, degree=degree, deltas=True))
     wanted = by_name(backward(scene), scene.sh.shape[1])
     leaves = {name: getattr(scene, name).clone().requires_grad_() for name in (*NAMES, "deltas")}
@@ -25,7 +25,7 @@ def test_autograd_takes_the_same_way(degree: int) -> None:
     assert torch.equal(leaves["deltas"].grad, backward(scene).raw)
 
 
-def test_autograd_is_registered_as_it_should_be() -> None:
+def test_frame_autograd_registration_passes_opcheck() -> None:
     scene = on_gpu(frame_scene(30, 20, 18, deltas=True))
     leaves = [t.clone().requires_grad_() for t in (*scene.gaussians, scene.deltas)]
     arguments = (leaves[:5], leaves[5], *scene.view.tensors, 20, 18, 0.3, 0.01, 1e10, 0, 1000, int(FrameMode.TRAINING))
@@ -33,7 +33,7 @@ def test_autograd_is_registered_as_it_should_be() -> None:
     torch.library.opcheck(torch.ops.gsplat_core.render_frame.default, arguments, test_utils=checks)
 
 
-def test_autograd_refuses_what_has_no_gradient() -> None:
+def test_frame_autograd_rejects_unsupported_gradients() -> None:
     scene = on_gpu(frame_scene(30, 20, 18))
     means = scene.means.clone().requires_grad_()
     gaussians = [means, *scene.gaussians[1:]]

@@ -57,40 +57,40 @@ def check(scene: FrameScene, with_alphas: bool = True) -> RawGradients:
 
 @pytest.mark.parametrize("deltas", [True, False])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
-def test_gradients_of_every_degree_equal_the_reference(degree: int, deltas: bool) -> None:
+def test_frame_gradients_of_every_degree_equal_reference(degree: int, deltas: bool) -> None:
     check(frame_scene(300, degree=degree, deltas=deltas))
 
 
 @pytest.mark.parametrize("camera_model", MODELS)
 @pytest.mark.parametrize("with_alphas", [True, False])
-def test_gradients_of_every_camera_model_equal_the_reference(camera_model: str, with_alphas: bool) -> None:
+def test_frame_gradients_of_every_camera_model_equal_reference(camera_model: str, with_alphas: bool) -> None:
     check(frame_scene(400, degree=2, camera_model=camera_model, background=with_alphas), with_alphas)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (16, 16), (33, 50), (130, 17)])
-def test_gradients_of_any_picture_size_equal_the_reference(size: tuple[int, int]) -> None:
+def test_frame_gradients_of_any_image_size_equal_reference(size: tuple[int, int]) -> None:
     check(frame_scene(200, *size))
 
 
 @pytest.mark.parametrize("count", [1, 31, 33, 129])
-def test_gradients_of_any_number_of_gaussians_equal_the_reference(count: int) -> None:
+def test_frame_gradients_of_any_number_of_gaussians_equal_reference(count: int) -> None:
     check(frame_scene(count, degree=3, median_px=6.0, deltas=True))
 
 
-def test_lists_of_the_plain_ops_serve_as_well() -> None:
+def test_frame_gradients_accept_tile_lists_of_plain_ops() -> None:
     scene = on_gpu(frame_scene(400, degree=2, deltas=True))
     seen, wanted = backward(scene, forward_of_plain_ops(scene)), backward(scene)
     for s, w in zip(seen, wanted, strict=True):  # the two forward passes round differently, next to cut-offs too
         assert (s - w).norm() <= 1e-3 * w.norm()
 
 
-def test_no_gaussians_at_all() -> None:
+def test_frame_gradients_without_gaussians() -> None:
     gradients = backward(on_gpu(frame_scene(0, degree=1)))
     assert gradients.raw.shape == (0, 16)
     assert gradients.sh.shape == (0, 4, 3)
 
 
-def test_gaussians_behind_the_camera_get_none() -> None:
+def test_frame_gradients_zero_for_gaussians_behind_camera() -> None:
     scene = frame_scene(100)
     behind = scene.viewmat.clone()
     behind[2, 3] -= 20
@@ -99,7 +99,7 @@ def test_gaussians_behind_the_camera_get_none() -> None:
     assert not gradients.sh.any()
 
 
-def test_gradients_of_faint_opaque_and_dark_gaussians_equal_the_reference() -> None:
+def test_frame_gradients_of_faint_opaque_and_dark_gaussians_equal_reference() -> None:
     scene = frame_scene(400, degree=1)
     scene.logit_opacities[::4] = 12.0
     scene.logit_opacities[1::4] = math.log(1.5 / 253.5)
@@ -111,7 +111,7 @@ def test_gradients_of_faint_opaque_and_dark_gaussians_equal_the_reference() -> N
     assert not gradients.raw[1::3, 11].any()
 
 
-def test_one_splat_over_the_whole_picture_among_thin_and_tiny_ones_equals_the_reference() -> None:
+def test_frame_gradients_of_huge_thin_and_tiny_splats_equal_reference() -> None:
     scene = frame_scene(300, 200, 150, degree=1, median_px=2.0)
     scene.log_scales[7] = 4.0
     scene.logit_opacities[7] = -1.0
@@ -120,7 +120,7 @@ def test_one_splat_over_the_whole_picture_among_thin_and_tiny_ones_equals_the_re
     check(scene)
 
 
-def test_gradients_of_very_many_splats_in_one_tile_equal_the_reference() -> None:
+def test_frame_gradients_of_very_many_splats_in_one_tile_equal_reference() -> None:
     scene = frame_scene(100_000, 16, 16, degree=0)
     scene.logit_opacities[:] = math.log(0.0045 / 0.9955)  # about 2,000 are blended before a pixel ends
     scene.log_scales[:] = 6.0  # over the whole tile: no pixel is near the cut-off of 1/255
@@ -131,7 +131,7 @@ def test_gradients_of_very_many_splats_in_one_tile_equal_the_reference() -> None
 
 
 @pytest.mark.parametrize("deltas", [True, False])
-def test_what_is_not_finite_gets_no_gradient_and_spoils_no_other(deltas: bool) -> None:
+def test_frame_gradients_zero_for_non_finite_gaussians_only(deltas: bool) -> None:
     scene = frame_scene(200, degree=1, deltas=deltas)
     tensors = [scene.means, scene.quats, scene.log_scales, scene.logit_opacities, scene.sh.view(200, -1)]
     tensors += [] if scene.deltas is None else [scene.deltas[:, :14]]
@@ -150,7 +150,7 @@ def test_what_is_not_finite_gets_no_gradient_and_spoils_no_other(deltas: bool) -
     assert gradients.raw[bad:].any()
 
 
-def test_strided_and_misaligned_inputs_give_the_same_bits() -> None:
+def test_frame_gradients_independent_of_memory_layout() -> None:
     scene = on_gpu(frame_scene(300, degree=3, deltas=True))
     wanted = backward(scene)
 
@@ -168,7 +168,7 @@ def test_strided_and_misaligned_inputs_give_the_same_bits() -> None:
         assert torch.equal(seen.sh, wanted.sh)
 
 
-def test_the_same_bits_every_time_and_in_a_graph() -> None:
+def test_frame_gradients_are_deterministic_and_captured_in_graph() -> None:
     scene = on_gpu(frame_scene(5000, 300, 200, degree=3, deltas=True))
     forward = rendered(scene)
     wanted = backward(scene, forward)
@@ -193,14 +193,14 @@ def test_the_same_bits_every_time_and_in_a_graph() -> None:
     assert torch.equal(seen.sh, first[1])
 
 
-def test_atomic_sums_are_the_same_but_for_rounding() -> None:
+def test_frame_gradients_with_atomic_sums_differ_by_rounding_only() -> None:
     scene = on_gpu(frame_scene(2000, 200, 150, degree=2))
     wanted, seen = backward(scene), backward(scene, deterministic=False)
     for s, w in zip(seen, wanted, strict=True):
         assert (s - w).norm() <= 1e-5 * w.norm()
 
 
-def test_a_frame_that_overflowed_has_no_gradient() -> None:
+def test_frame_gradients_zero_for_overflowed_frame() -> None:
     scene = on_gpu(frame_scene(300, degree=1))
     forward = rendered(scene)
     forward.status[STATUS_OVERFLOW] = 1
@@ -209,7 +209,7 @@ def test_a_frame_that_overflowed_has_no_gradient() -> None:
     assert not gradients.sh.any()
 
 
-def test_wrong_arguments_are_refused() -> None:
+def test_frame_backward_rejects_invalid_arguments() -> None:
     scene = on_gpu(frame_scene(20, 20, 18))
     forward = rendered(scene)
     v_image = scene.picture_gradients()[0].cuda()
@@ -229,7 +229,7 @@ def test_wrong_arguments_are_refused() -> None:
 
 
 @pytest.mark.parametrize("degree", [0, 1])
-def test_op_passes_opcheck(degree: int) -> None:
+def test_frame_backward_op_passes_opcheck(degree: int) -> None:
     scene = on_gpu(frame_scene(30, 20, 18, degree=degree, deltas=degree > 0))
     v_image, v_alphas = (t.cuda() for t in scene.picture_gradients())
     inputs = (scene.gaussians, scene.deltas, *scene.view.tensors, list(rendered(scene)[1:]), v_image, v_alphas)

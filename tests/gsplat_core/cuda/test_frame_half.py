@@ -62,18 +62,18 @@ def check(scene: FrameScene, capacity: int = 1 << 20, psnr_db: float = 58.0) -> 
 
 @pytest.mark.parametrize("median_px", [1.0, 3.0, 15.0])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
-def test_picture_for_every_degree(degree: int, median_px: float) -> None:
+def test_half_frame_of_every_degree(degree: int, median_px: float) -> None:
     assert check(frame_scene(700, degree=degree, median_px=median_px, deltas=degree % 2 == 0)).alphas.max() > 0.5
 
 
 @pytest.mark.parametrize("size", [(1, 1), (8, 4), (16, 16), (17, 33), (70, 3), (200, 131)])
 @pytest.mark.parametrize("background", [False, True])
-def test_any_image_size(size: tuple[int, int], background: bool) -> None:
+def test_half_frame_of_any_image_size(size: tuple[int, int], background: bool) -> None:
     check(frame_scene(400, *size, background=background, seed=1))
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 15, 16, 17, 31, 32, 33, 127, 128, 129, 300])
-def test_any_number_of_splats_on_every_pixel(count: int) -> None:
+def test_half_frame_of_any_number_of_splats_per_pixel(count: int) -> None:
     """Around what a warp blends at once, stages at once, and keeps for later."""
     scene = frame_scene(count, 16, 16, median_px=40.0, seed=2)
     scene.logit_opacities[:] -= 3.0
@@ -81,7 +81,7 @@ def test_any_number_of_splats_on_every_pixel(count: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_lists_of_different_lengths_side_by_side(seed: int) -> None:
+def test_half_frame_with_adjacent_lists_of_different_lengths(seed: int) -> None:
     """Most splats are in one corner of the tile, so that some of the parts' lists stay short for many batches."""
     scene = frame_scene(1500, 16, 16, median_px=0.5, seed=seed)
     crowd = torch.arange(len(scene.means)) % 7 != 0
@@ -97,27 +97,27 @@ def test_lists_of_different_lengths_side_by_side(seed: int) -> None:
 
 
 @pytest.mark.parametrize("count", [2000, 20_000])
-def test_very_many_splats_in_one_tile(count: int) -> None:
+def test_half_frame_of_very_many_splats_in_one_tile(count: int) -> None:
     scene = frame_scene(count, 16, 16, median_px=60.0, seed=3)
     scene.logit_opacities[:] = -5.0 + torch.rand(count, generator=torch.Generator().manual_seed(4))
     assert check(scene, psnr_db=50.0).status[STATUS_LONGEST] == count
 
 
-def test_splats_that_cover_the_screen() -> None:
+def test_half_frame_of_screen_covering_splats() -> None:
     scene = frame_scene(400, 300, 200, seed=5)
     scene.log_scales[::20] = math.log(4.0)
     scene.logit_opacities[::20] = -1.0
     check(scene)
 
 
-def test_needles_equal_the_reference() -> None:
+def test_half_frame_of_needles_equals_reference() -> None:
     scene = frame_scene(500, 200, 150, seed=6)
     scene.log_scales[:, 0] += 3.5
     scene.log_scales[:, 1:] -= 3.0
     check(scene)
 
 
-def test_a_closed_pixel_stays_closed() -> None:
+def test_half_frame_saturated_pixel_ignores_later_splats() -> None:
     """Opaque splats of every width in front of brighter ones: each pixel closes at another splat of another step."""
     scene = frame_scene(3000, 70, 45, median_px=6.0, seed=7)
     depth = (scene.means @ scene.viewmat[2, :3] + scene.viewmat[2, 3]).argsort()
@@ -127,7 +127,7 @@ def test_a_closed_pixel_stays_closed() -> None:
     assert (frame.alphas > 1 - 10 * STOP).float().mean() > 0.9
 
 
-def test_opaque_walls_end_every_pixel_at_once() -> None:
+def test_half_frame_of_opaque_layers_stops_at_limit() -> None:
     """The third of 0.982 would pass the limit, and is not drawn."""
     scene = frame_scene(40, 48, 32, median_px=500.0, seed=8)
     scene.logit_opacities[:] = 4.0
@@ -135,7 +135,7 @@ def test_opaque_walls_end_every_pixel_at_once() -> None:
     assert (frame.alphas - (1 - (1 - torch.tensor(4.0).sigmoid().item()) ** 2)).abs().max() < 1e-3
 
 
-def test_nothing_is_background() -> None:
+def test_half_frame_without_visible_gaussians_is_background() -> None:
     scene = frame_scene(100, seed=9)
     scene.viewmat[2, 3] -= 100
     frame = rendered(scene)
@@ -144,7 +144,7 @@ def test_nothing_is_background() -> None:
     assert torch.equal(frame.image[..., :3].cpu(), scene.background.expand(45, 70, 3))
 
 
-def test_depths_of_very_different_size() -> None:
+def test_half_frame_with_wide_depth_range() -> None:
     scene = frame_scene(300, seed=10)
     scene.means[0] = (torch.tensor([0.0, 0.0, 300.0]) - scene.viewmat[:3, 3]) @ scene.viewmat[:3, :3]
     scene.log_scales[0] = math.log(300.0)
@@ -152,7 +152,7 @@ def test_depths_of_very_different_size() -> None:
 
 
 @pytest.mark.parametrize("eps2d", [0.0, 1e-6, 1e-3])
-def test_splats_without_a_minimum_size_are_close_to_float32(eps2d: float) -> None:
+def test_half_frame_without_minimum_splat_size_close_to_float32(eps2d: float) -> None:
     scene = frame_scene(2000, median_px=0.3, seed=11)
     scene.log_scales[::2, 0] += 5.0
     scene.log_scales[::3, 1:] -= 9.0
@@ -162,7 +162,7 @@ def test_splats_without_a_minimum_size_are_close_to_float32(eps2d: float) -> Non
     assert (half.alphas - full.alphas).square().mean() <= 1e-4
 
 
-def test_colours_end_at_the_largest_half() -> None:
+def test_half_frame_clamps_colours_to_largest_half() -> None:
     """Such a colour is finite within its splat and changes no other pixel."""
     scene = frame_scene(300, deltas=True, seed=12)
     scene.deltas[0, COLOUR] = 1e9
@@ -175,7 +175,7 @@ def test_colours_end_at_the_largest_half() -> None:
     assert torch.equal(bright.image[elsewhere], rendered(scene).image[elsewhere])
 
 
-def test_the_same_bits_every_time_and_from_anywhere_in_memory() -> None:
+def test_half_frame_is_deterministic_for_any_memory_alignment() -> None:
     scene = frame_scene(20_000, 320, 240, degree=3, median_px=4.0, seed=13).to("cuda")
     first = rendered(scene)
     half = scene.sh.half()
@@ -191,7 +191,7 @@ def test_the_same_bits_every_time_and_from_anywhere_in_memory() -> None:
     assert_near(first, full.image, full.alphas)
 
 
-def test_overflow_is_reported_and_a_second_frame_is_right() -> None:
+def test_half_frame_reports_overflow_and_succeeds_with_larger_capacity() -> None:
     scene = frame_scene(3000, 200, 131, median_px=8.0, seed=14)
     wanted = rendered(scene)
     needed = int(wanted.status[STATUS_NEEDED])
@@ -201,7 +201,7 @@ def test_overflow_is_reported_and_a_second_frame_is_right() -> None:
     assert torch.equal(rendered(scene, capacity=needed).image, wanted.image)
 
 
-def test_coefficients_in_half_precision_are_refused_for_training() -> None:
+def test_half_precision_coefficients_rejected_for_training() -> None:
     s = frame_scene(10).to("cuda")
     with pytest.raises(InvalidInput, match="sh must be float32"):
         render_frame([*s.gaussians[:4], s.sh.half()], s.deltas, s.view, 100, FrameMode.TRAINING)

@@ -13,7 +13,7 @@ from tests.gsplat_core.cuda.frame_checks import assert_near, check, check_lists,
 
 
 @pytest.mark.parametrize("count", [2000, 2049, 5000, 100_000])
-def test_very_many_splats_in_one_tile(count: int) -> None:
+def test_frame_lists_of_very_many_splats_in_one_tile(count: int) -> None:
     s = scene(count, 32, 16, seed=8, deltas=False)
     s.means[:] = (torch.tensor([-0.5, 0.0, 2.0]) - s.viewmat[:3, 3]) @ s.viewmat[:3, :3]
     s.means[:] += torch.rand(count, 1, generator=torch.Generator().manual_seed(1)) * s.viewmat[2, :3]
@@ -26,7 +26,7 @@ def test_very_many_splats_in_one_tile(count: int) -> None:
 
 @pytest.mark.parametrize("count", [100, 128, 200, 256, 500, 512, 900, 1024, 1025])
 @pytest.mark.parametrize("far", [False, True])
-def test_depths_that_are_equal_or_next_to_each_other(count: int, far: bool) -> None:
+def test_frame_lists_with_equal_and_adjacent_depths(count: int, far: bool) -> None:
     s = scene(count, 16, 16, seed=16, deltas=False)
     g = torch.Generator().manual_seed(2)
     s.viewmat[:] = torch.eye(4)
@@ -42,7 +42,7 @@ def test_depths_that_are_equal_or_next_to_each_other(count: int, far: bool) -> N
 
 @pytest.mark.parametrize("clump", [1, 2, 11, 12, 13, 100])
 @pytest.mark.parametrize("count", [120, 250, 500, 1000])
-def test_depths_in_clumps(count: int, clump: int) -> None:
+def test_frame_lists_with_clustered_depths(count: int, clump: int) -> None:
     """Evenly spread depths are sorted by buckets, and others, with too many in one bucket, bitonically."""
     s = scene(count, 16, 16, seed=18, deltas=False)
     g = torch.Generator().manual_seed(3)
@@ -55,7 +55,7 @@ def test_depths_in_clumps(count: int, clump: int) -> None:
     assert check(s).status[STATUS_LONGEST] == count
 
 
-def test_a_large_scene() -> None:
+def test_frame_lists_of_large_scene() -> None:
     s = scene(140_000, 150, 110, degree=0, seed=14, size=0.006)
     s.log_scales[::5000] = 0.5
     s.log_scales[1::2000] = -1.5
@@ -72,13 +72,13 @@ def test_a_large_scene() -> None:
     assert torch.equal(s.render(needed, FrameMode.TRAINING).image, frame.image)
 
 
-def test_a_large_scene_on_very_many_tiles() -> None:
+def test_frame_lists_of_large_scene_on_very_many_tiles() -> None:
     s = scene(66_000, 4096, 4100, degree=0, seed=15, size=0.002)
     assert_near(s.render(1 << 20), plain(s))
 
 
 @pytest.mark.parametrize("mode", [FrameMode.SHARED, FrameMode.TRAINING])
-def test_overflow_is_reported_and_a_second_frame_is_right(mode: FrameMode) -> None:
+def test_frame_lists_report_overflow_and_succeed_with_larger_capacity(mode: FrameMode) -> None:
     s = scene(3000, 200, 131, seed=11, size=0.2)
     s.log_scales[::50] = 1.0
     wanted = s.render(1 << 20, mode)
@@ -92,7 +92,7 @@ def test_overflow_is_reported_and_a_second_frame_is_right(mode: FrameMode) -> No
     assert torch.equal(again.image, wanted.image)
 
 
-def test_overflow_of_a_segment_is_reported_and_a_second_frame_is_right() -> None:
+def test_frame_lists_report_segment_overflow_and_succeed_with_larger_capacity() -> None:
     s = scene(3000, 200, 131, seed=11, size=0.2)
     s.log_scales[::50] = 1.0
     wanted = s.render(1 << 20)

@@ -38,13 +38,13 @@ def assert_same_picture(output, expected):
     torch.testing.assert_close(output.depth[seen], expected.depth[seen], rtol=1e-3, atol=1e-3)
 
 
-def test_pictures_are_those_of_render_from_every_camera(scene, camera):
+def test_frame_renderer_equals_render_from_every_camera(scene, camera):
     renderer = FrameRenderer(scene, camera)
     for x_mm in (0.0, 2.0, -3.0):
         assert_same_picture(renderer.render(shifted(camera, x_mm)).result(), render(scene, shifted(camera, x_mm)))
 
 
-def test_time_moves_the_scene(scene, camera):
+def test_frame_renderer_follows_time_of_field(scene, camera):
     field = BasisField(scene.count, (0.0, 1.0), bumps=6).to("cuda")
     torch.nn.init.normal_(field.weights, std=0.3)
     renderer = FrameRenderer(scene, camera, field)
@@ -57,7 +57,7 @@ def test_time_moves_the_scene(scene, camera):
     assert not torch.allclose(pictures[0], pictures[1], atol=1e-2)
 
 
-def test_parameters_changed_in_place_are_seen(scene, camera):
+def test_frame_renderer_uses_parameters_changed_in_place(scene, camera):
     renderer = FrameRenderer(scene, camera)
     renderer.render().result()
     scene.means.add_(1.5)
@@ -65,7 +65,7 @@ def test_parameters_changed_in_place_are_seen(scene, camera):
 
 
 @pytest.mark.parametrize(("count", "per_tile"), [(300, True), (3000, False)])
-def test_lists_that_are_too_short_are_made_longer(make_gaussians, camera, count, per_tile):
+def test_frame_renderer_grows_short_tile_lists(make_gaussians, camera, count, per_tile):
     # Each of these covers most of the picture: far more instances than the four per Gaussian that are expected.
     scene = make_gaussians(count).to("cuda")
     scene = dataclasses.replace(scene, log_scales=torch.full_like(scene.log_scales, 2.3))
@@ -78,7 +78,7 @@ def test_lists_that_are_too_short_are_made_longer(make_gaussians, camera, count,
     assert_same_picture(output, render(scene, camera))
 
 
-def test_two_frames_of_one_camera_have_the_same_bits(scene, camera):
+def test_frame_renderer_is_deterministic(scene, camera):
     renderer = FrameRenderer(scene, camera)
     first = [t.clone() for t in renderer.render().result()]
     renderer.render(shifted(camera, 4.0)).result()
@@ -86,13 +86,13 @@ def test_two_frames_of_one_camera_have_the_same_bits(scene, camera):
         assert torch.equal(a, b)
 
 
-def test_the_background_equals_that_of_render(scene, camera):
+def test_frame_renderer_background_equals_render(scene, camera):
     background = torch.tensor([0.2, 0.5, 0.9], device="cuda")
     output = FrameRenderer(scene, camera, background=background).render().result()
     assert_same_picture(output, render(scene, camera, background))
 
 
-def test_a_frame_whose_memory_was_reused_is_refused(scene, camera):
+def test_frame_renderer_rejects_result_of_reused_memory(scene, camera):
     renderer = FrameRenderer(scene, camera)
     first = renderer.render()
     renderer.render()
@@ -100,7 +100,7 @@ def test_a_frame_whose_memory_was_reused_is_refused(scene, camera):
         first.result()
 
 
-def test_what_it_cannot_render_is_refused(scene, camera):
+def test_frame_renderer_rejects_unsupported_inputs(scene, camera):
     with pytest.raises(InvalidInput, match="on cpu"):
         FrameRenderer(scene.to("cpu"), camera)
     with pytest.raises(InvalidInput, match="float64"):
@@ -109,7 +109,7 @@ def test_what_it_cannot_render_is_refused(scene, camera):
         FrameRenderer(scene, camera).render(Camera.from_focal(50.0, 64, 64))
 
 
-def test_half_precision_is_near_exact(scene, camera):
+def test_frame_renderer_half_precision_close_to_float32(scene, camera):
     field = BasisField(scene.count, (0.0, 1.0), bumps=6).to("cuda")
     torch.nn.init.normal_(field.weights, std=0.1)
     exact = FrameRenderer(scene, camera, field).render(time_s=0.4).result()

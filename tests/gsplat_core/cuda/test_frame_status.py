@@ -11,7 +11,7 @@ def ints(*values):
     return torch.tensor(values, dtype=torch.int32, device="cuda")
 
 
-def test_the_maximum_of_all_frames_and_how_many_overflowed():
+def test_accumulate_status_keeps_maximum_and_counts_overflows():
     totals, step = ints(0, 0, 0, 0), torch.full((1,), 7, dtype=torch.int64, device="cuda")
     frames = [ints(5, 3, 0, 0), ints(9, 2, 1, 0), ints(4, 6, 1, 0), ints(1, 1, 0, 0)]
     fits = [float(accumulate_status_(status, totals, step)) for status in frames]
@@ -20,7 +20,7 @@ def test_the_maximum_of_all_frames_and_how_many_overflowed():
     assert step.tolist() == [9]
 
 
-def test_wrong_input_is_refused():
+def test_accumulate_status_rejects_invalid_inputs():
     step = torch.ones(1, dtype=torch.int64, device="cuda")
     with pytest.raises(InvalidInput, match="float32"):
         accumulate_status_(ints(1, 2, 0, 0).float(), ints(0, 0, 0, 0), step)
@@ -30,6 +30,6 @@ def test_wrong_input_is_refused():
         accumulate_status_(ints(1, 2, 0, 0), ints(0, 0), step)
 
 
-def test_opcheck():
+def test_accumulate_status_passes_opcheck():
     step = torch.ones(1, dtype=torch.int64, device="cuda")
     torch.library.opcheck(torch.ops.gsplat_core.accumulate_status_, (ints(1, 2, 0, 0), ints(0, 0, 0, 0), step))

@@ -65,7 +65,7 @@ def train(
 
 
 @pytest.mark.parametrize("weights", [LossWeights(squared=True), LossWeights(ssim=0.2, depth=0.5)])
-def test_colours_are_corrected_as_on_the_cpu(make_gaussians, observation, weights):
+def test_fused_step_colour_correction_equals_cpu(make_gaussians, observation, weights):
     """Correct colours by the residual for every loss; the other gradients follow the loss."""
     from gsplat_core.training.steps.photometric import loss_and_gradients
 
@@ -92,7 +92,7 @@ def test_colours_are_corrected_as_on_the_cpu(make_gaussians, observation, weight
     assert torch.equal(others[0], others[2])
 
 
-def test_steps_that_correct_colours_and_steps_that_train_them_can_alternate(make_gaussians, observation):
+def test_fused_step_alternates_colour_correction_and_training(make_gaussians, observation):
     seen = dataclasses.replace(observation, depth=None)
     gaussians, field = make_gaussians(300, sh_degree=0).to("cuda"), NoField()
     step = FusedStep(gaussians, field, FusedAdam(gaussians.tensors()), LossWeights(), seen.camera)
@@ -101,7 +101,7 @@ def test_steps_that_correct_colours_and_steps_that_train_them_can_alternate(make
     assert losses[-1] < 0.95 * losses[0]
 
 
-def test_steps_that_correct_colours_do_not_look_at_depth_and_others_between_them_do(make_gaussians, observation):
+def test_fused_step_colour_correction_ignores_depth(make_gaussians, observation):
     """Two graphs, each captured once: depth and colours take turns in one step's memory."""
     start, rates, depths = make_gaussians(600, sh_degree=0), RATES | {"sh": 0.0}, {}
     seen = dataclasses.replace(observation, depth=1.5 * observation.depth)
@@ -127,7 +127,7 @@ def test_steps_that_correct_colours_do_not_look_at_depth_and_others_between_them
 
 
 @pytest.mark.parametrize("relaxation", [0.0, 1.5])
-def test_the_right_eye_trains_its_own_colours_as_on_the_cpu(make_gaussians, observation, relaxation):
+def test_fused_step_right_eye_colours_equal_cpu(make_gaussians, observation, relaxation):
     """Several steps of both eyes by turns, whose pictures differ in colour: the same as without a captured graph."""
     from gsplat_core.training.steps.photometric import loss_and_gradients, with_eye
 
@@ -154,7 +154,7 @@ def test_the_right_eye_trains_its_own_colours_as_on_the_cpu(make_gaussians, obse
         assert (shown.tensors()[name].cpu() - tensor).norm() <= 0.02 * change + 1e-6, name
 
 
-def test_one_captured_step_serves_two_cameras_by_turns(make_gaussians, observation):
+def test_fused_step_serves_alternating_cameras(make_gaussians, observation):
     """Pose and intrinsics of each observation are those that its step renders with: the same as two eyes trained on the CPU."""
     from gsplat_core.training.steps.photometric import loss_and_gradients
 
@@ -183,7 +183,7 @@ def test_one_captured_step_serves_two_cameras_by_turns(make_gaussians, observati
 
 
 @pytest.mark.parametrize("weights", [LossWeights(), LossWeights(ssim=0.2, depth=0.5), LossWeights(squared=True)])
-def test_it_learns_as_the_cpu_does(make_gaussians, observation, weights):
+def test_fused_step_training_equals_cpu(make_gaussians, observation, weights):
     from gsplat_core.training.steps.photometric import loss_and_gradients
 
     start = make_gaussians(800, sh_degree=1)
@@ -202,7 +202,7 @@ def test_it_learns_as_the_cpu_does(make_gaussians, observation, weights):
         assert (tensor.cpu() - on_cpu.tensors()[name]).norm() < 0.02 * moved, name
 
 
-def test_the_same_bits_twice(make_gaussians, observation):
+def test_fused_step_is_deterministic(make_gaussians, observation):
     results = []
     for _ in range(2):
         gaussians = make_gaussians(3000, sh_degree=2).to("cuda")
@@ -213,7 +213,7 @@ def test_the_same_bits_twice(make_gaussians, observation):
         assert torch.equal(tensor, results[1][1].tensors()[name])
 
 
-def test_a_frame_without_room_changes_nothing_and_the_next_ones_have_room(make_gaussians, observation, camera):
+def test_fused_step_overflowed_frame_changes_nothing_and_next_fits(make_gaussians, observation, camera):
     # Each of these covers most of the picture: more instances than the lists have room for at first.
     scene = make_gaussians(4000)
     gaussians = dataclasses.replace(scene, log_scales=torch.full_like(scene.log_scales, 2.3)).to("cuda")
@@ -233,7 +233,7 @@ def test_a_frame_without_room_changes_nothing_and_the_next_ones_have_room(make_g
     assert losses[-1] < losses[0]
 
 
-def test_other_tensors_are_recorded_anew(make_gaussians, observation, camera):
+def test_fused_step_recaptures_replaced_tensors(make_gaussians, observation, camera):
     gaussians = make_gaussians(500).to("cuda")
     adam = FusedAdam(gaussians.tensors())
     step = FusedStep(gaussians, NoField(), adam, LossWeights(), camera)
@@ -287,7 +287,7 @@ def slanted_wall(slope: float, distance: float) -> Gaussians:
 
 
 @pytest.mark.parametrize("relaxation", [0.0, 1.5])
-def test_losses_of_rays_are_captured_and_learn_as_on_the_cpu(wall_seen, relaxation):
+def test_fused_step_ray_losses_equal_cpu(wall_seen, relaxation):
     """Steps with and without rays by turns, one of them with colour correction, on a deformed scene."""
     from gsplat_core.training.losses import LossContext
     from gsplat_core.training.steps.photometric import loss_and_gradients, with_losses
@@ -317,7 +317,7 @@ def test_losses_of_rays_are_captured_and_learn_as_on_the_cpu(wall_seen, relaxati
         assert (gaussians.tensors()[name].cpu() - tensor).norm() <= 0.1 * change + 1e-6, name
 
 
-def test_a_captured_comparison_of_rays_reads_camera_and_depth_of_its_observation(wall_seen):
+def test_fused_step_ray_losses_read_camera_and_depth_of_observation(wall_seen):
     """One graph for two cameras: the loss of each is that of a step captured for it alone."""
     other_camera = dataclasses.replace(wall_seen.camera, K=wall_seen.camera.K * [[1.1], [1.1], [1.0]])
     other = dataclasses.replace(wall_seen, camera=other_camera, depth=1.2 * wall_seen.depth)
@@ -335,7 +335,7 @@ def test_a_captured_comparison_of_rays_reads_camera_and_depth_of_its_observation
     assert by_turns == pytest.approx([alone[0][0], alone[0][0], alone[1][0]], rel=1e-5)
 
 
-def test_rays_without_room_change_nothing_and_the_next_ones_have_room(make_gaussians, observation):
+def test_fused_step_overflowed_rays_change_nothing_and_next_fit(make_gaussians, observation):
     scene = make_gaussians(4000)
     gaussians = dataclasses.replace(scene, log_scales=torch.full_like(scene.log_scales, 2.3)).to("cuda")
     before, adam = gaussians.clone(), FusedAdam(gaussians.tensors())

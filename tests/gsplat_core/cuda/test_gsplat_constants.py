@@ -14,7 +14,7 @@ from tests.gsplat_core.cuda.test_projection import MODELS, project, to_gpu
 
 @pytest.mark.parametrize("absgrad", [True, False])
 @pytest.mark.parametrize("channels", [1, 2, 3, 4, 5, 9])
-def test_another_ceiling_of_alpha(channels: int, absgrad: bool) -> None:
+def test_cuda_alpha_ceiling_matches_reference(channels: int, absgrad: bool) -> None:
     # Small splats, some opaque: many pixels lie where alpha is between the two ceilings or above both.
     s = scene(150, channels=channels, median_px=1.5, backgrounds=torch.rand(1, channels))
     s.opacities[:, ::2] = 1.0
@@ -29,7 +29,7 @@ def test_another_ceiling_of_alpha(channels: int, absgrad: bool) -> None:
 @pytest.mark.parametrize(("most", "opacity", "clamped"), [
     (0.99, 1.0, True), (0.99, 0.985, False), (0.999, 1.0, True), (0.999, 0.9995, True), (0.999, 0.995, False),
 ])  # fmt: skip
-def test_a_splat_on_its_pixels_centre_at_either_side_of_the_ceiling(channels, most, opacity, clamped) -> None:
+def test_cuda_alpha_ceiling_clamps_value_and_gradient_at_pixel_centre(channels, most, opacity, clamped) -> None:
     s = Scene(
         torch.full((1, 1, 2), 0.5), torch.tensor([[[0.5, 0, 0.5]]]), torch.ones(1, 1, channels),
         torch.full((1, 1), opacity), 1, 1, max_alpha=most,
@@ -48,7 +48,7 @@ def test_a_splat_on_its_pixels_centre_at_either_side_of_the_ceiling(channels, mo
 @pytest.mark.parametrize("model", MODELS)
 @pytest.mark.parametrize("floor", [0.0, 0.005, 0.4])
 @pytest.mark.parametrize("with_opacities", [False, True])
-def test_floor_of_the_compensation(gpu, make_scene, assert_near, model, floor, with_opacities):
+def test_cuda_compensation_floor_matches_reference(gpu, make_scene, assert_near, model, floor, with_opacities):
     # From far below the blur to far above it: compensations on either side of 0.005 and of 0.4.
     scene = make_scene(200, model=model)
     scene.scales[:] *= torch.logspace(-3, 1, 200, dtype=torch.float64)[:, None]

@@ -75,20 +75,20 @@ def place(scene, dtype: torch.dtype):
 
 @pytest.mark.parametrize("packed", [True, False])
 @pytest.mark.parametrize("count", [0, 1, 2, 33])
-def test_very_few_gaussians(make_scene, count, packed):
+def test_rasterization_of_very_few_gaussians(make_scene, count, packed):
     seen = check(make_scene(count), packed=packed, render_mode="RGB+ED")
     assert bool(seen["alpha"].max() > 0.1) == (count > 0)
 
 
 @pytest.mark.parametrize("packed", [True, False])
-def test_all_behind_the_camera(make_scene, packed):
+def test_rasterization_of_gaussians_behind_camera_is_empty(make_scene, packed):
     scene = make_scene(50)
     seen = check(replace(scene, means=scene.means * torch.tensor([1.0, 1.0, -1.0]) - 10), packed=packed)
     assert not any(seen[name].any() for name in ("image", "alpha", *NAMES))
 
 
 @pytest.mark.parametrize("tile_size", [8, 16])
-def test_one_covers_the_screen_and_others_are_behind_and_before_it(make_scene, tile_size):
+def test_rasterization_of_screen_covering_gaussian_among_others(make_scene, tile_size):
     scene = make_scene(80, cameras=2, width=130, height=70)
     scene.means[0] = torch.tensor([0.3, -0.2, 6.0])
     scene.scales[0] = torch.tensor([60.0, 50.0, 0.1])
@@ -97,7 +97,7 @@ def test_one_covers_the_screen_and_others_are_behind_and_before_it(make_scene, t
     assert seen["alpha"].min() > 0.5
 
 
-def test_a_hundred_thousand_in_one_tile(make_scene):
+def test_rasterization_of_100000_wide_gaussians_in_one_tile(make_scene):
     scene = make_scene(100_000, width=16, height=16)
     # Wide and just visible everywhere, so that a pixel goes through thousands of them before it ends.
     scene.means[:] *= torch.tensor([0.1, 0.1, 0.1])
@@ -108,7 +108,7 @@ def test_a_hundred_thousand_in_one_tile(make_scene):
     assert seen["alpha"].min() > 0.99
 
 
-def test_a_hundred_thousand_small_ones_in_one_tile_are_the_same_bits_twice(make_scene):
+def test_rasterization_of_100000_small_gaussians_in_one_tile_is_deterministic(make_scene):
     scene = make_scene(100_000, width=16, height=16)
     weights = (torch.ones(1, 16, 16, 3), torch.ones(1, 16, 16, 1))
     first, second = (render(rasterization, place(scene, torch.float32), weights, packed=False) for _ in range(2))
@@ -116,7 +116,7 @@ def test_a_hundred_thousand_small_ones_in_one_tile_are_the_same_bits_twice(make_
     assert all(torch.equal(first[name], value) for name, value in second.items())
 
 
-def test_grazing_distant_tiny_thin_and_opaque_gaussians(make_scene):
+def test_rasterization_of_grazing_distant_tiny_thin_and_opaque_gaussians(make_scene):
     scene = make_scene(160)
     scene.means[1:20, 2] = torch.linspace(0.011, 0.3, 19)
     scene.means[20:40] *= 1e4
@@ -131,7 +131,7 @@ def test_grazing_distant_tiny_thin_and_opaque_gaussians(make_scene):
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("packed", [True, False])
-def test_what_is_not_finite_is_culled_and_does_not_touch_the_others(make_scene, value, packed):
+def test_rasterization_culls_non_finite_gaussians_without_side_effect(make_scene, value, packed):
     scene = place(make_scene(60, cameras=2), torch.float32)
     columns = [(t.view(60, -1), n) for t in (getattr(scene, name) for name in NAMES[:5]) for n in range(t[0].numel())]
     columns = columns[:11] + columns[11::7]  # every column of the geometry, some of the harmonics
@@ -151,7 +151,7 @@ def test_what_is_not_finite_is_culled_and_does_not_touch_the_others(make_scene, 
 
 
 @pytest.mark.parametrize("layout", ["strided", "shifted", "expanded"])
-def test_inputs_of_any_layout_give_the_same_bits(make_scene, layout):
+def test_rasterization_independent_of_memory_layout(make_scene, layout):
     scene = place(make_scene(200, cameras=2), torch.float32)
     weights = (torch.ones(2, 37, 52, 3), torch.ones(2, 37, 52, 1))
     if layout == "expanded":
@@ -172,7 +172,7 @@ def test_inputs_of_any_layout_give_the_same_bits(make_scene, layout):
         assert torch.equal(seen[name], value), name
 
 
-def test_view_matrices_that_are_not_rigid_see_the_colours_of_their_centres(make_scene):
+def test_rasterization_with_non_rigid_view_matrices_equals_reference(make_scene):
     scene = make_scene(60, cameras=3)
     scene.viewmats[1, :3, :3] *= 2.0
     scene.viewmats[2, :3] += 0.3 * torch.randn(3, 4, generator=torch.Generator().manual_seed(1))

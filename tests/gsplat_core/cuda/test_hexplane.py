@@ -50,7 +50,7 @@ def relative(actual, wanted):
 
 @pytest.mark.parametrize("n", [0, 1, 1300])
 @pytest.mark.parametrize("channels", [1, 5, 16, 32, 40, 64, 100])
-def test_features_equal_the_reference(gpu, n, channels):
+def test_hexplane_features_equal_reference(gpu, n, channels):
     x, planes = points(n), level(channels)
     seen = hexplane_features(*on(gpu, x, *planes))
     torch.testing.assert_close(
@@ -60,7 +60,7 @@ def test_features_equal_the_reference(gpu, n, channels):
 
 @pytest.mark.parametrize("n", [0, 1, 1300])
 @pytest.mark.parametrize("channels", [1, 5, 32, 40, 64, 100])
-def test_feature_gradients_equal_the_reference(gpu, n, channels):
+def test_hexplane_feature_gradients_equal_reference(gpu, n, channels):
     seen = [t.to(gpu).requires_grad_() for t in (points(n), *level(channels))]
     wanted = [t.double().requires_grad_() for t in (points(n), *level(channels))]
     gradient = torch.randn(n, channels, generator=random(2))
@@ -73,7 +73,7 @@ def test_feature_gradients_equal_the_reference(gpu, n, channels):
 
 
 @pytest.mark.parametrize("sizes", [(2, 2, 2, 2), (1, 1, 1, 1), (1, 3, 2, 1)])
-def test_the_smallest_planes(gpu, sizes):
+def test_hexplane_features_of_smallest_planes(gpu, sizes):
     x, planes = points(50), level(8, sizes)
     seen = hexplane_features(*on(gpu, x, *planes))
     torch.testing.assert_close(
@@ -81,7 +81,7 @@ def test_the_smallest_planes(gpu, sizes):
     )
 
 
-def test_a_position_that_is_not_a_number_shows_and_reads_nothing_outside(gpu):
+def test_hexplane_features_of_nan_position_are_nan(gpu):
     x = points(5)
     x[2, 0], x[3, 1] = float("nan"), float("inf")
     features = hexplane_features(*on(gpu, x, *level())).cpu()
@@ -91,7 +91,7 @@ def test_a_position_that_is_not_a_number_shows_and_reads_nothing_outside(gpu):
 
 @pytest.mark.parametrize("channels", [5, 32, 64])
 @pytest.mark.parametrize("n", [0, 1, 700])
-def test_the_two_halves_equal_the_reference(gpu, n, channels):
+def test_hexplane_space_and_modulate_equal_reference(gpu, n, channels):
     x, planes = points(n), level(channels)
     lines = [plane[1] for plane in planes[3:]]
     space = hexplane_space(*on(gpu, x, *planes[:3]))
@@ -104,7 +104,7 @@ def test_the_two_halves_equal_the_reference(gpu, n, channels):
 
 @pytest.mark.parametrize("n", [0, 1, 5, 1001])
 @pytest.mark.parametrize("sizes", [(64, 64, 64, 64, 11), (10, 3), (10, 100, 7), (35, 48, 17)])
-def test_decoding_equals_the_reference(gpu, n, sizes):
+def test_hexplane_decode_equals_reference(gpu, n, sizes):
     x, channels = points(n), sizes[0] // 2
     spaces = [torch.rand(n, c, generator=random(c)) for c in (channels, sizes[0] - channels)]
     lines = [torch.rand(4 + i, s.shape[1], generator=random(i)) for s in spaces for i in range(3)]
@@ -141,7 +141,7 @@ CASES = {
 @pytest.mark.parametrize("time", [-1.0, 0.37, 1.0, 2.5])
 @pytest.mark.parametrize("n", [0, 1, 17, 1003])
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES.keys())
-def test_deltas_equal_the_reference(gpu, case, n, time):
+def test_hexplane_deltas_equal_reference(gpu, case, n, time):
     spaces, x, planes, weights, biases = deltas_case(n, **case)
     now, order = torch.tensor([time]), torch.randperm(n, generator=random(7)).int()
     wanted = reference.hexplane_deltas(*doubled(spaces, x, now, planes, weights, biases), order)
@@ -155,7 +155,7 @@ def test_deltas_equal_the_reference(gpu, case, n, time):
     assert torch.equal(exact, hexplane_deltas(*args))
 
 
-def test_deltas_in_a_graph_follow_the_time(gpu):
+def test_hexplane_deltas_in_graph_follow_time(gpu):
     args = on(gpu, *deltas_case(300))
     now = torch.zeros(3, device=gpu)[1:2]  # a view that is not aligned, as the frame path's controls are
     call = lambda: hexplane_deltas(args[0], args[1], now, *args[2:])
@@ -169,7 +169,7 @@ def test_deltas_in_a_graph_follow_the_time(gpu):
         assert torch.equal(seen, call())
 
 
-def test_misaligned_inputs_are_read_right(gpu):
+def test_hexplane_deltas_with_misaligned_inputs(gpu):
     spaces, x, planes, weights, biases = on(gpu, *deltas_case(40))
     shifted = lambda t: torch.cat([t.new_zeros(1), t.flatten()])[1:].view(t.shape)
     now = torch.tensor([0.2], device=gpu)
@@ -183,7 +183,7 @@ def test_misaligned_inputs_are_read_right(gpu):
     assert torch.equal(seen, wanted)
 
 
-def test_deltas_of_a_position_that_is_not_a_number(gpu):
+def test_hexplane_deltas_of_nan_position_are_nan(gpu):
     spaces, x, planes, weights, biases = deltas_case(40)
     x[7, 1] = float("nan")
     seen = hexplane_deltas(*on(gpu, spaces, x, torch.tensor([0.1]), planes, weights, biases)).cpu()
@@ -194,7 +194,7 @@ def test_deltas_of_a_position_that_is_not_a_number(gpu):
 @pytest.mark.parametrize(
     "sizes", [(64, 4, 32, 2), (32, 2, 64, 3), (32, 2, 128, 9), (20, 1, 32, 1), (16, 2, 129, 1), (512, 1, 128, 1)]
 )
-def test_layers_that_do_not_fit_are_known_and_refused(gpu, sizes):
+def test_hexplane_deltas_reject_unsupported_layers(gpu, sizes):
     channels, levels, width, depth = sizes
     spaces, x, planes, weights, biases = on(gpu, *deltas_case(3, channels, levels, width, depth))
     now = torch.zeros(1, device=gpu)
@@ -207,7 +207,7 @@ def test_layers_that_do_not_fit_are_known_and_refused(gpu, sizes):
                 hexplane_deltas(*args)
 
 
-def test_wrong_input_is_refused_with_its_value(gpu):
+def test_hexplane_deltas_reject_invalid_inputs(gpu):
     spaces, x, planes, weights, biases = on(gpu, *deltas_case(3))
     now = torch.zeros(1, device=gpu)
     with pytest.raises(InvalidInput, match="float64"):
@@ -220,7 +220,7 @@ def test_wrong_input_is_refused_with_its_value(gpu):
         hexplane_deltas(spaces, x, now, planes, weights, [biases[1], *biases[1:]][:2] + [biases[0]])
 
 
-def test_ops_pass_opcheck(gpu):
+def test_hexplane_ops_pass_opcheck(gpu):
     ops, planes = torch.ops.gsplat_core, on(gpu, *level(3))
     x = points(4).to(gpu)
     lines = [plane[0] for plane in planes[3:]]

@@ -41,7 +41,7 @@ def moving_field(scene, sizes):
 
 @pytest.mark.parametrize("count", [0, 1, 500])
 @pytest.mark.parametrize("sizes", SIZES.values(), ids=SIZES.keys())
-def test_the_same_gaussians_as_on_the_cpu(gpu, sizes, count):
+def test_hexplane_field_gaussians_equal_cpu(gpu, sizes, count):
     scene = gaussians(count)
     field = moving_field(scene, sizes)
     there, on_gpu = scene.to(gpu), field.detached_copy().to(gpu)
@@ -55,7 +55,7 @@ def test_the_same_gaussians_as_on_the_cpu(gpu, sizes, count):
 
 
 @pytest.mark.parametrize("sizes", SIZES.values(), ids=SIZES.keys())
-def test_frame_deltas_are_what_forward_adds(gpu, sizes):
+def test_hexplane_field_frame_deltas_equal_forward_change(gpu, sizes):
     scene = gaussians(700)
     field = moving_field(scene, sizes)
     exact = moving_field(scene, sizes).double()
@@ -72,7 +72,7 @@ def test_frame_deltas_are_what_forward_adds(gpu, sizes):
         torch.testing.assert_close(scene.means + here[:, :3], field(scene, 2.7).means)
 
 
-def test_a_field_made_from_gaussians_on_the_gpu_is_there(gpu):
+def test_hexplane_field_created_on_device_of_gaussians(gpu):
     scene = gaussians(20)
     torch.manual_seed(3)
     field = HexPlaneField(scene.to(gpu), WINDOW, **SIZES["small"])
@@ -84,7 +84,7 @@ def test_a_field_made_from_gaussians_on_the_gpu_is_there(gpu):
 
 
 @pytest.mark.parametrize("name", ["small", "wide"])
-def test_training_equals_autograd_and_adam(gpu, name):
+def test_hexplane_training_equals_autograd_and_adam(gpu, name):
     scene = gaussians(400)
     field = moving_field(scene, SIZES[name])
     on_gpu = field.detached_copy().to(gpu)
@@ -123,7 +123,7 @@ def test_training_equals_autograd_and_adam(gpu, name):
         assert close.double().mean() > 0.98
 
 
-def test_a_cut_frame_changes_nothing_of_the_field(gpu):
+def test_hexplane_training_overflowed_frame_changes_nothing(gpu):
     scene = gaussians(50).to(gpu)
     field = moving_field(gaussians(50), SIZES["small"]).to(gpu)
     training = HexPlaneTraining(field)
@@ -135,7 +135,7 @@ def test_a_cut_frame_changes_nothing_of_the_field(gpu):
     assert all(torch.equal(a, b) for a, b in zip(before, training.tensors(), strict=True))
 
 
-def test_fields_that_cannot_train_so_are_refused(gpu):
+def test_hexplane_training_rejects_unsupported_fields(gpu):
     with pytest.raises(InvalidInput, match="10 channels"):
         HexPlaneTraining(HexPlaneField(gaussians(3).to(gpu), WINDOW, **SIZES["odd"]))
     with pytest.raises(InvalidInput, match="on cpu"):

@@ -22,7 +22,7 @@ PENALTIES = {
     "shape",
     [{}, {"channels": 64, "levels": 1, "sizes": (70, 37, 40, 3)}, {"sizes": (2, 2, 2, 2)}, {"sizes": (1, 2, 1, 1)}],
 )
-def test_adam_over_the_planes_equals_the_reference(gpu, shape, penalties):
+def test_hexplane_planes_adam_equals_reference(gpu, shape, penalties):
     case = Case(n=90, **shape)
     ours = case.on(gpu)
     first, second = ([torch.zeros_like(p) for p in ours.planes] for _ in range(2))
@@ -53,7 +53,7 @@ def test_adam_over_the_planes_equals_the_reference(gpu, shape, penalties):
                 assert close.double().mean() > 0.999
 
 
-def test_a_frame_that_overflowed_changes_nothing(gpu):
+def test_hexplane_planes_adam_overflowed_frame_changes_nothing(gpu):
     case = Case(n=50).on(gpu)
     state = case.forward()
     gradient = case.backward(state, case.v_raw)
@@ -70,7 +70,7 @@ def test_a_frame_that_overflowed_changes_nothing(gpu):
     assert not any(torch.equal(a, b) for a, b in zip(before, (*case.planes, *first, *second), strict=True))
 
 
-def test_a_step_in_a_graph_follows_time_and_rate(gpu):
+def test_hexplane_planes_adam_in_graph_follows_time_and_rate(gpu):
     case = Case(n=300).on(gpu)
     start = [p.clone() for p in case.planes]
     first, second = ([torch.zeros_like(p) for p in case.planes] for _ in range(2))

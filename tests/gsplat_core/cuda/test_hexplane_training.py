@@ -40,7 +40,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES.keys())
-def test_deltas_and_gradients_equal_the_reference(gpu, case):
+def test_hexplane_train_deltas_and_gradients_equal_reference(gpu, case):
     case = Case(**case)
     deltas, v_means, v_planes, network = case.exact()
     ours = case.on(gpu)
@@ -62,7 +62,7 @@ def shifted(tensor):
 
 
 @pytest.mark.parametrize("penalties", [Penalties(), Penalties(10.0, 20.0, 5.0)])
-def test_planes_may_start_anywhere_in_memory(gpu, penalties):
+def test_hexplane_train_accepts_misaligned_planes(gpu, penalties):
     case = Case(n=300)
     ours = case.on(gpu)
     ours.planes = [shifted(p) for p in ours.planes]
@@ -87,7 +87,7 @@ def test_planes_may_start_anywhere_in_memory(gpu, penalties):
         assert ((seen - wanted).abs() <= 1e-6 + 1e-5 * wanted.abs()).float().mean() > 0.999
 
 
-def test_the_same_bits_every_time(gpu):
+def test_hexplane_train_is_deterministic(gpu):
     case = Case(n=5000, channels=64).on(gpu)
     results = []
     for _ in range(2):
@@ -99,7 +99,7 @@ def test_the_same_bits_every_time(gpu):
     assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
 
 
-def test_what_is_not_finite_is_left_out(gpu):
+def test_hexplane_train_omits_non_finite_values(gpu):
     case = Case(n=60)
     case.means[3, 1] = float("nan")
     case.means[4, 0] = float("inf")
@@ -118,7 +118,7 @@ def test_what_is_not_finite_is_left_out(gpu):
     assert (v_raw[[3, 4], :3] == 0).all()
 
 
-def test_wrong_input_is_refused(gpu):
+def test_hexplane_train_rejects_invalid_inputs(gpu):
     case = Case(n=5).on(gpu)
     with pytest.raises(InvalidInput, match="float64"):
         hexplane_train(case.means.double(), case.box, case.time, case.planes, case.weights, case.biases)
@@ -129,7 +129,7 @@ def test_wrong_input_is_refused(gpu):
         hexplane_train(case.means, case.box, case.time, [*case.planes[:5], case.planes[0]], case.weights, case.biases)
 
 
-def test_ops_pass_opcheck(gpu):
+def test_hexplane_train_ops_pass_opcheck(gpu):
     ops, case = torch.ops.gsplat_core, Case(n=5, levels=1).on(gpu)
     state = case.forward()
     gradient = case.backward(state, case.v_raw.clone())

@@ -51,7 +51,7 @@ def assert_same(ours, expected):
 
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("ssim_weight", [0.0, 0.2, 1.0])
-def test_equals_the_reference(shape, ssim_weight):
+def test_image_loss_equals_reference(shape, ssim_weight):
     image, target, mask, depth, target_depth = scene(shape)
     for masked, deep, as_bytes, squared in itertools.product((True, False), repeat=4):
         tensors = (
@@ -68,7 +68,7 @@ def test_equals_the_reference(shape, ssim_weight):
 
 @pytest.mark.parametrize("shape", [(1, 1), (7, 5), (64, 64), (101, 150)])
 @pytest.mark.parametrize("ssim_weight", [0.0, 0.2])
-def test_a_frame_equals_the_reference(shape, ssim_weight):
+def test_frame_loss_equals_reference(shape, ssim_weight):
     for masked, deep, squared in itertools.product((True, False), repeat=3):
         image, alphas, target, mask, target_depth = frame(shape)
         tensors = (image, alphas, target, mask if masked else None, target_depth if deep else None)
@@ -78,7 +78,7 @@ def test_a_frame_equals_the_reference(shape, ssim_weight):
         )
 
 
-def test_no_tissue_and_no_depth_give_zero_without_nan():
+def test_frame_loss_without_tissue_or_depth_is_zero():
     image, alphas, target, mask, target_depth = frame((12, 15))
     for result in (
         frame_loss(image, alphas, target, torch.zeros_like(mask), target_depth, 0.2, 1.0),
@@ -92,7 +92,7 @@ def test_no_tissue_and_no_depth_give_zero_without_nan():
     assert not unknown.grad_image[..., 3].any()
 
 
-def test_a_nan_is_unseen_under_the_tool_and_shown_in_tissue():
+def test_image_loss_ignores_masked_nan_and_reports_unmasked_nan():
     image, target, mask, *_ = scene((30, 40, 3))
     mask[10:, :] = 1
     mask[:10, :] = 0
@@ -107,13 +107,13 @@ def test_a_nan_is_unseen_under_the_tool_and_shown_in_tissue():
     assert torch.isnan(result.grad_image).all(dim=2).sum() == 1
 
 
-def test_the_same_bits_twice():
+def test_frame_loss_is_deterministic():
     tensors = frame((512, 640))
     for a, b in zip(frame_loss(*tensors, 0.2, 0.5), frame_loss(*tensors, 0.2, 0.5), strict=True):
         assert torch.equal(a, b)
 
 
-def test_views_that_are_not_contiguous_or_aligned():
+def test_frame_loss_independent_of_memory_layout():
     image, alphas, target, mask, target_depth = frame((31, 44))
     expected = frame_loss(image, alphas, target, mask, target_depth, 0.2, 0.5)
     shifted = [torch.cat([t.flatten()[:1], t.flatten()])[1:].view(t.shape) for t in (image, alphas, target, mask)]
@@ -123,7 +123,7 @@ def test_views_that_are_not_contiguous_or_aligned():
             assert torch.equal(a, b)
 
 
-def test_a_graph_sees_new_pictures():
+def test_frame_loss_in_graph_reads_new_images():
     tensors = frame((64, 80))
     frame_loss(*tensors, 0.2, 0.5)
     graph = torch.cuda.CUDAGraph()
@@ -137,7 +137,7 @@ def test_a_graph_sees_new_pictures():
 
 
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
-def test_opcheck():
+def test_image_loss_ops_pass_opcheck():
     image, target, mask, depth, target_depth = scene((12, 9, 3))
     image.requires_grad_()
     torch.library.opcheck(torch.ops.gsplat_core.image_loss, (image, target, mask, depth, target_depth, 0.2, 0.5))
@@ -145,7 +145,7 @@ def test_opcheck():
     torch.library.opcheck(torch.ops.gsplat_core.frame_loss, (*frame((12, 9)), 0.2, 0.5, True))
 
 
-def test_what_it_cannot_take_is_refused():
+def test_frame_loss_rejects_invalid_inputs():
     image, alphas, target, mask, _ = frame((4, 5))
     with pytest.raises(InvalidInput, match="CUDA"):
         frame_loss(image.cpu(), alphas, target)

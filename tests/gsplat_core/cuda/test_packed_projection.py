@@ -27,7 +27,7 @@ def project(scene, device, **options):
 
 @pytest.mark.parametrize("model", ["pinhole", "ortho", "fisheye"])
 @pytest.mark.parametrize(("count", "batch", "cameras"), [(1500, (2,), 3), (257, (), 1), (0, (), 2), (5, (), 0)])
-def test_rows_and_gradients_are_those_of_the_cpu(gpu, make_scene, assert_near, model, count, batch, cameras):
+def test_packed_projection_equals_cpu(gpu, make_scene, assert_near, model, count, batch, cameras):
     scene = make_scene(count, batch, cameras, model).to(torch.float32)
     wanted, expected = project(scene, "cpu", camera_model=model)
     rows, gradients = project(scene, gpu, camera_model=model)
@@ -40,7 +40,7 @@ def test_rows_and_gradients_are_those_of_the_cpu(gpu, make_scene, assert_near, m
 
 
 @pytest.mark.parametrize("sparse", [False, True])
-def test_equal_inputs_give_equal_bits(gpu, make_scene, sparse):
+def test_packed_projection_is_deterministic(gpu, make_scene, sparse):
     scene = make_scene(2000, (), 3).to(torch.float32)
     (_, first), (_, second) = (project(scene, gpu, sparse_grad=sparse) for _ in range(2))
     for name in LEAVES:
@@ -49,7 +49,7 @@ def test_equal_inputs_give_equal_bits(gpu, make_scene, sparse):
         assert torch.equal(a._values(), b._values()) if a.is_sparse else torch.equal(a, b)
 
 
-def test_values_and_colours_of_rows_are_those_of_the_cpu(gpu, assert_near):
+def test_packed_rows_values_and_colours_equal_cpu(gpu, assert_near):
     generator = torch.Generator().manual_seed(0)
     pairs = Pairs(1, 2, 300)
     ids = (torch.rand(600, generator=generator) < 0.4).nonzero()[:, 0]
@@ -67,7 +67,7 @@ def test_values_and_colours_of_rows_are_those_of_the_cpu(gpu, assert_near):
         assert_near(found.cpu(), wanted)
 
 
-def test_sparse_gradients_of_a_picture_are_those_of_the_cpu(gpu, make_scene, assert_near):
+def test_packed_sparse_image_gradients_equal_cpu(gpu, make_scene, assert_near):
     scene = make_scene(200, (), 2).to(torch.float32)
 
     def run(device):

@@ -41,7 +41,7 @@ def assert_same_bits(seen, wanted) -> None:
         assert torch.equal(s.cpu(), w.cpu())
 
 
-def test_a_frame_and_its_gradient_are_captured_and_replayed_with_another_camera(make_scene):
+def test_plain_chain_captured_frame_and_gradient_follow_camera(make_scene):
     scene = place(make_scene(3000, width=200, height=120))
     opacities, grid = scene.opacities[None], TileGrid(16, math.ceil(200 / 16), math.ceil(120 / 16))
 
@@ -85,7 +85,7 @@ def test_a_frame_and_its_gradient_are_captured_and_replayed_with_another_camera(
 @pytest.mark.filterwarnings("ignore:Synchronization debug mode is a prototype")
 @pytest.mark.parametrize("render_mode", ["RGB", "RGB+ED", "D"])
 @pytest.mark.parametrize("geometry", ["quats", "covars"])
-def test_nothing_but_the_lists_length_makes_the_host_wait(make_scene, render_mode, geometry):
+def test_plain_chain_synchronises_for_list_length_only(make_scene, render_mode, geometry):
     scene = place(make_scene(300, cameras=2))
     leaves = scene.leaves()
     means, quats, scales, opacities, sh, viewmats = leaves
@@ -110,7 +110,7 @@ def test_nothing_but_the_lists_length_makes_the_host_wait(make_scene, render_mod
         torch.cuda.set_sync_debug_mode("default")
 
 
-def test_on_a_side_stream_while_another_one_is_busy(make_scene):
+def test_plain_chain_on_side_stream_beside_busy_stream(make_scene):
     scene = place(make_scene(2000, cameras=2))
     wanted = whole(scene)
     matrix = torch.randn(4096, 4096, device="cuda")
@@ -128,7 +128,7 @@ def test_on_a_side_stream_while_another_one_is_busy(make_scene):
         assert_same_bits(seen, wanted)
 
 
-def test_two_streams_at_once(make_scene):
+def test_plain_chain_on_two_concurrent_streams(make_scene):
     scenes = [place(make_scene(3000, seed=seed)) for seed in range(2)]
     wanted = [whole(scene) for scene in scenes]
     streams = [torch.cuda.Stream() for _ in scenes]
@@ -145,7 +145,7 @@ def test_two_streams_at_once(make_scene):
 
 
 @pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs a second GPU")
-def test_on_the_second_device_while_the_first_is_current(make_scene):
+def test_plain_chain_on_second_device_while_first_is_current(make_scene):
     scene = make_scene(500, cameras=2)
     wanted = whole(place(scene, "cuda:0"))
     torch.cuda.set_device(0)
@@ -158,12 +158,12 @@ def test_on_the_second_device_while_the_first_is_current(make_scene):
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float16, torch.bfloat16])
-def test_other_types_are_refused_by_name(make_scene, dtype):
+def test_plain_chain_rejects_other_dtypes_by_name(make_scene, dtype):
     with pytest.raises(InvalidInput, match=f"float32, got {dtype}".replace(".", r"\.")):
         whole(place(make_scene(5), dtype=dtype))
 
 
-def test_inputs_on_the_cpu_beside_those_on_the_gpu_are_refused(make_scene):
+def test_plain_chain_rejects_mixed_cpu_and_gpu_inputs(make_scene):
     scene = place(make_scene(5))
     for name in ("means", "opacities", "sh", "viewmats", "Ks"):
         with pytest.raises(InvalidInput, match="one device"):
@@ -172,7 +172,7 @@ def test_inputs_on_the_cpu_beside_those_on_the_gpu_are_refused(make_scene):
 
 @pytest.mark.filterwarnings("ignore")  # of torch's compiler, about its own parts
 @pytest.mark.parametrize("backend", ["aot_eager", "inductor"])
-def test_a_compiled_render_is_one_graph_and_equals_the_eager_one(make_scene, assert_compiled_equal, backend):
+def test_plain_chain_compiled_as_one_graph_equals_eager(make_scene, assert_compiled_equal, backend):
     scene = place(make_scene(60))
 
     def render(*leaves: Tensor) -> tuple[Tensor, Tensor]:

@@ -39,7 +39,9 @@ def project(function, scene, covars=False, **options):
 @pytest.mark.parametrize("model", MODELS)
 @pytest.mark.parametrize("options", [{}, {"calc_compensations": True}, {"covars": True, "eps2d": 0.1}])
 @pytest.mark.parametrize(("count", "batch", "cameras"), [(1100, (), 1), (300, (2,), 3), (1, (), 2), (0, (), 1)])
-def test_values_and_gradients_equal_the_reference(gpu, make_scene, assert_near, model, options, count, batch, cameras):
+def test_projection_values_and_gradients_equal_reference(
+    gpu, make_scene, assert_near, model, options, count, batch, cameras
+):
     scene = make_scene(count, batch, cameras, model)
     ours, gradients = project(fully_fused_projection, to_gpu(scene, gpu), camera_model=model, **options)
     exact, expected = project(reference.fully_fused_projection, scene, camera_model=model, **options)
@@ -52,7 +54,7 @@ def test_values_and_gradients_equal_the_reference(gpu, make_scene, assert_near, 
         assert_near(actual, wanted, of_largest=1e-4)
 
 
-def test_what_cannot_be_projected_is_culled_with_gradients_of_zero(gpu, make_scene):
+def test_projection_culls_invalid_gaussians_with_zero_gradient(gpu, make_scene):
     scene = to_gpu(make_scene(12), gpu)
     with torch.no_grad():
         scene.means[0] = torch.nan
@@ -70,19 +72,19 @@ def test_what_cannot_be_projected_is_culled_with_gradients_of_zero(gpu, make_sce
         assert (t[:7] == 0).all()
 
 
-def test_all_behind_the_camera(gpu, make_scene):
+def test_projection_culls_gaussians_behind_camera(gpu, make_scene):
     scene = make_scene(50)
     out, gradients = project(fully_fused_projection, to_gpu(replace(scene, means=scene.means * 0 - 5), gpu))
     assert not out[0].any() and not any(t.any() for t in gradients)
 
 
-def test_gradients_are_the_same_bits_every_time(gpu, make_scene):
+def test_projection_gradients_are_deterministic(gpu, make_scene):
     runs = [project(fully_fused_projection, to_gpu(make_scene(20_000, (), 3), gpu))[1] for _ in range(3)]
     for gradients in runs[1:]:
         assert all(torch.equal(a, b) for a, b in zip(gradients, runs[0], strict=True))
 
 
-def test_runs_on_the_current_stream_and_in_a_graph(gpu, make_scene):
+def test_projection_on_current_stream_and_in_graph(gpu, make_scene):
     scene = to_gpu(make_scene(5000), gpu)
     arguments = (scene.means, None, scene.quats, scene.scales, scene.viewmats, scene.Ks, scene.width, scene.height)
     expected = fully_fused_projection(*arguments)
@@ -102,7 +104,7 @@ def test_runs_on_the_current_stream_and_in_a_graph(gpu, make_scene):
     assert all(torch.equal(a, b) for a, b in zip(replayed[:4], moved[:4], strict=True))
 
 
-def test_inputs_that_are_not_contiguous(gpu, make_scene):
+def test_projection_accepts_non_contiguous_inputs(gpu, make_scene):
     scene = to_gpu(make_scene(200), gpu)
     expected, wanted = project(fully_fused_projection, scene)
     strided = {n: getattr(scene, n).detach().T.contiguous().T for n in ("means", "quats", "scales")}
@@ -112,7 +114,7 @@ def test_inputs_that_are_not_contiguous(gpu, make_scene):
         assert torch.equal(a, b)
 
 
-def test_what_it_cannot_take_is_refused(gpu, make_scene):
+def test_projection_rejects_invalid_inputs(gpu, make_scene):
     scene = to_gpu(make_scene(5), gpu)
     with pytest.raises(InvalidInput, match="one device"):
         project(fully_fused_projection, replace(scene, viewmats=scene.viewmats.cpu()))
@@ -123,7 +125,7 @@ def test_what_it_cannot_take_is_refused(gpu, make_scene):
 
 
 @pytest.mark.parametrize("floor", [(), (0.0,)])
-def test_opcheck(gpu, make_scene, floor):
+def test_projection_ops_pass_opcheck(gpu, make_scene, floor):
     scene = to_gpu(make_scene(10), gpu)
     leaves = [t[None].detach().requires_grad_() for t in (scene.means, scene.quats, scene.scales, scene.viewmats)]
     torch.library.opcheck(

@@ -12,18 +12,18 @@ from tests.gsplat_core.ops.ray_scenes import ray_scene
 
 @pytest.mark.parametrize("factors", [False, True])
 @pytest.mark.parametrize("bins", [BINS, Bins(30.0, 0.05, 300), Bins(0.0, 200.0, 1)])
-def test_random_scene(gpu, bins, factors):
+def test_range_histogram_of_random_scene(gpu, bins, factors):
     s = ray_scene(300)
     assert_close(s, gpu, bins, pixel_factors(s.width, s.height) if factors else None)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (33, 50), (7, 100)])
 @pytest.mark.parametrize("count", [0, 1, 90])
-def test_any_image_size_and_few_splats(gpu, size, count):
+def test_range_histogram_of_any_image_size_and_few_splats(gpu, size, count):
     assert_close(ray_scene(count, *size), gpu)
 
 
-def test_large_scene_is_that_of_the_cpu_and_has_the_same_bits_twice(gpu):
+def test_range_histogram_of_large_scene_equals_cpu_and_is_deterministic(gpu):
     s = ray_scene(20_000, 320, 256)
     first, second, cpu = run(s, device=gpu), run(s, device=gpu), run(s)
     for name, value in first.items():
@@ -32,7 +32,7 @@ def test_large_scene_is_that_of_the_cpu_and_has_the_same_bits_twice(gpu):
         assert error <= 5e-3 * cpu[name].norm(), (name, float(error / cpu[name].norm()))
 
 
-def test_a_graph_sees_new_splats(gpu):
+def test_range_histogram_in_graph_reads_new_splats(gpu):
     ops = torch.ops.gsplat_core
     s = ray_scene(200, 64, 48)
     inputs = [getattr(s, name).to(gpu) for name in TENSORS]
@@ -55,7 +55,7 @@ def test_a_graph_sees_new_splats(gpu):
     assert all(torch.equal(a, b) for a, b in zip(captured, both(), strict=True))
 
 
-def test_indices_out_of_range_are_skipped(gpu):
+def test_range_histogram_skips_indices_out_of_range(gpu):
     s = ray_scene(20, 40, 30)
     inputs = [getattr(s, name).to(gpu) for name in TENSORS]
     offsets, ids = (tensor.to(gpu) for tensor in s.lists())
@@ -70,7 +70,7 @@ def test_indices_out_of_range_are_skipped(gpu):
 
 
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
-def test_opcheck(gpu):
+def test_range_histogram_ops_pass_opcheck(gpu):
     s = ray_scene(20, 40, 30)
     inputs = [getattr(s, name).to(gpu).requires_grad_() for name in TENSORS]
     lists = [tensor.to(gpu) for tensor in s.lists()]

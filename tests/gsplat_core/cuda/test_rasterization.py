@@ -34,9 +34,7 @@ def run(function, scene, device="cuda", **options) -> tuple[list[Tensor], dict]:
         (0, (), 2, {"render_mode": "RGB+ED"}),
     ],
 )
-def test_image_and_gradients_match_the_reference_and_the_cpu(
-    make_scene, assert_near, model, count, batch, cameras, options
-):
+def test_cuda_rasterization_matches_reference_and_cpu(make_scene, assert_near, model, count, batch, cameras, options):
     scene = make_scene(count, batch, cameras, model)
     ours, meta = run(rasterization, scene.to(torch.float32), **options)
     assert meta["means2d"].is_cuda
@@ -51,7 +49,7 @@ def test_image_and_gradients_match_the_reference_and_the_cpu(
             )
 
 
-def test_gaussians_that_are_not_finite_do_not_touch_the_others(make_scene):
+def test_cuda_rasterization_non_finite_gaussians_do_not_affect_others(make_scene):
     scene = make_scene(50).to(torch.float32)
     for row, tensor in enumerate(
         (scene.means, scene.quats, scene.scales, scene.opacities[:, None], scene.sh.flatten(1))
@@ -65,14 +63,14 @@ def test_gaussians_that_are_not_finite_do_not_touch_the_others(make_scene):
         assert not gradient[1:6].any()
 
 
-def test_the_same_bits_twice(make_scene):
+def test_cuda_rasterization_is_deterministic(make_scene):
     scene = make_scene(2000, cameras=2, width=200, height=150).to(torch.float32)
     first, second = (run(rasterization, scene, packed=False, render_mode="RGB+ED")[0] for _ in range(2))
     for a, b in zip(first, second, strict=True):
         assert torch.equal(a, b)
 
 
-def test_packed_shows_the_same_image(make_scene):
+def test_cuda_rasterization_packed_equals_dense_image(make_scene):
     scene = make_scene(300, cameras=2).to(torch.float32)
     dense, packed = (run(rasterization, scene, packed=p)[0] for p in (False, True))
     assert torch.equal(dense[0], packed[0])

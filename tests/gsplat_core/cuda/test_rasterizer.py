@@ -19,7 +19,7 @@ def moved(x_mm):
 
 
 @pytest.mark.parametrize("mode", ["RGB", "ED", "RGB+ED"])
-def test_pictures_from_the_graph_are_those_without(make_gaussians, mode):
+def test_captured_rasterizer_equals_uncaptured(make_gaussians, mode):
     scene = make_gaussians(800, sh_degree=2).to("cuda")
     graph, plain = Rasterizer(render_mode=mode), Rasterizer(render_mode=mode, capture=False)
     pictures = []
@@ -33,7 +33,7 @@ def test_pictures_from_the_graph_are_those_without(make_gaussians, mode):
     assert not torch.equal(pictures[0], pictures[1])
 
 
-def test_other_gaussians_and_sizes_have_their_own_graph(make_gaussians):
+def test_captured_rasterizer_handles_changed_count_and_size(make_gaussians):
     graph, plain = Rasterizer(), Rasterizer(capture=False)
     smaller = Camera.from_focal(60.0, 64, 48)
     for count, camera in ((300, CAMERA), (500, CAMERA), (500, smaller)):
@@ -41,7 +41,7 @@ def test_other_gaussians_and_sizes_have_their_own_graph(make_gaussians):
         torch.testing.assert_close(graph(scene, camera).colors, plain(scene, camera).colors, rtol=1e-3, atol=1e-3)
 
 
-def test_a_small_workspace_grows(make_gaussians):
+def test_captured_rasterizer_grows_small_workspace(make_gaussians):
     scene = make_gaussians(800, sh_degree=2).to("cuda")
     graph = Rasterizer(capacity=TileListCapacity(32, per_tile=True))
     wanted = Rasterizer(capture=False)(scene, CAMERA)
@@ -49,7 +49,7 @@ def test_a_small_workspace_grows(make_gaussians):
     assert graph.capacity is not None and graph.capacity.capacity >= 32
 
 
-def test_tensors_that_require_gradients_get_them(make_gaussians):
+def test_captured_rasterizer_supports_gradients(make_gaussians):
     scene = make_gaussians(100, sh_degree=1).to("cuda").requires_grad_()
     Rasterizer()(scene, CAMERA).colors.sum().backward()
     assert scene.means.grad is not None and scene.means.grad.abs().sum() > 0

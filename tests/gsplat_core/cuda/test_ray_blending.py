@@ -12,17 +12,17 @@ from tests.gsplat_core.ops.ray_scenes import INPUTS, assert_close, exact_contrib
 
 
 @pytest.mark.parametrize("channels", [0, 1, 3, 4, 8, 9, MAX_CHANNELS])
-def test_random_scene_for_any_number_of_channels(gpu, channels):
+def test_blend_rays_with_any_number_of_channels(gpu, channels):
     assert_close(ray_scene(300, channels=channels), gpu)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (33, 50), (7, 100)])
 @pytest.mark.parametrize("count", [0, 1, 90])
-def test_any_image_size_and_few_splats(gpu, size, count):
+def test_blend_rays_of_any_image_size_and_few_splats(gpu, size, count):
     assert_close(ray_scene(count, *size), gpu)
 
 
-def test_opaque_and_thin_splats(gpu):
+def test_blend_rays_of_opaque_and_thin_splats(gpu):
     s = ray_scene(300)
     s.opacities[::2] = 1.0
     s.conics[1::5] = torch.tensor([1e-8, 0.0, 1e-8])
@@ -31,7 +31,7 @@ def test_opaque_and_thin_splats(gpu):
     assert_close(s, gpu)
 
 
-def test_values_that_are_not_finite_are_skipped_and_get_no_gradient(gpu):
+def test_blend_rays_skips_non_finite_splats_without_gradient(gpu):
     s, bad = with_bad_values(ray_scene(200))
     seen = assert_close(s, gpu)
     wanted = replace(s, **{name: getattr(s, name)[~bad] for name in INPUTS}).run(device=gpu)
@@ -43,7 +43,7 @@ def test_values_that_are_not_finite_are_skipped_and_get_no_gradient(gpu):
             assert torch.equal(seen[name], value)
 
 
-def test_large_scene_is_that_of_the_cpu_and_has_the_same_bits_twice(gpu):
+def test_blend_rays_of_large_scene_equals_cpu_and_is_deterministic(gpu):
     s = ray_scene(20_000, 640, 512)
     first, second, cpu = s.run(device=gpu), s.run(device=gpu), s.run()
     for name, value in first.items():
@@ -52,7 +52,7 @@ def test_large_scene_is_that_of_the_cpu_and_has_the_same_bits_twice(gpu):
         assert error <= 5e-3 * cpu[name].norm(), (name, float(error / cpu[name].norm()))
 
 
-def test_indices_out_of_range_are_skipped(gpu):
+def test_blend_rays_skips_indices_out_of_range(gpu):
     s = ray_scene(20)
     offsets, ids = (tensor.to(gpu) for tensor in s.lists())
     inputs = [getattr(s, name).to(gpu).requires_grad_() for name in INPUTS]
@@ -64,7 +64,7 @@ def test_indices_out_of_range_are_skipped(gpu):
     assert all(bool(tensor.grad.isfinite().all()) for tensor in inputs)
 
 
-def test_captured_in_a_graph(gpu):
+def test_blend_rays_captured_in_graph(gpu):
     s = ray_scene(300)
     lists = [tensor.to(gpu) for tensor in s.lists()]
     inputs = [getattr(s, name).to(gpu).requires_grad_() for name in INPUTS]
@@ -89,14 +89,14 @@ def test_captured_in_a_graph(gpu):
 
 
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor:UserWarning")  # raised by opcheck itself
-def test_opcheck(gpu):
+def test_blend_rays_passes_opcheck(gpu):
     s = ray_scene(30, 20, 18)
     lists = [tensor.to(gpu) for tensor in s.lists()]
     splats = [getattr(s, name).to(gpu).requires_grad_() for name in INPUTS]
     torch.library.opcheck(torch.ops.gsplat_core.blend_rays.default, (*splats, *lists, s.width, s.height))
 
 
-def test_contributions_are_the_largest_weights(gpu):
+def test_splat_contributions_are_largest_weights(gpu):
     s = ray_scene(300)
     splats = [tensor.to(gpu) for tensor in (s.means2d, s.conics, s.opacities)]
     lists = [tensor.to(gpu) for tensor in s.lists()]

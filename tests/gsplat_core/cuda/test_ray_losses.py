@@ -11,7 +11,7 @@ from tests.gsplat_core.ops.ray_planes import compared, planes
 
 @pytest.mark.parametrize("model", ["pinhole", "ortho", "fisheye"])
 @pytest.mark.parametrize("size", [(37, 45), (2, 9), (0, 7), (300, 520)])
-def test_values_and_gradients_equal_the_reference(gpu, size, model):
+def test_ray_losses_equal_reference_and_are_deterministic(gpu, size, model):
     seen, again = (compared(size, model, gpu, torch.float32) for _ in range(2))
     for name, value in compared(size, model, "cpu", torch.float64).items():
         assert torch.equal(seen[name], again[name]), name
@@ -19,7 +19,7 @@ def test_values_and_gradients_equal_the_reference(gpu, size, model):
         torch.testing.assert_close(seen[name].cpu().double(), value, rtol=1e-4, atol=1e-5 * scale, msg=name)
 
 
-def test_a_captured_graph_reads_new_depths_and_intrinsics(gpu):
+def test_ray_losses_in_graph_read_new_depths_and_intrinsics(gpu):
     depths, alphas, normals, known, tissue, K = (each.to(gpu) for each in planes((60, 80)))
 
     def losses() -> tuple[torch.Tensor, ...]:
@@ -44,7 +44,7 @@ def test_a_captured_graph_reads_new_depths_and_intrinsics(gpu):
 
 
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor:UserWarning")  # raised by opcheck itself
-def test_opcheck(gpu):
+def test_ray_losses_pass_opcheck(gpu):
     depths, alphas, normals, known, tissue, K = (each.to(gpu) for each in planes((6, 8)))
     leaves = [each.requires_grad_() for each in (depths, alphas, normals)]
     torch.library.opcheck(torch.ops.gsplat_core.ray_depth_loss.default, (leaves[0], known, tissue.view(torch.uint8)))

@@ -16,7 +16,7 @@ def largest_difference(a, b):
 
 @pytest.mark.parametrize("model", ["pinhole", "fisheye", "ortho"])
 @pytest.mark.parametrize("background", [None, (0.2, 0.4, 0.6)])
-def test_both_ways_give_the_same_picture(gpu, make_gaussians, model, background):
+def test_render_with_and_without_gradient_gives_same_image(gpu, make_gaussians, model, background):
     gaussians = make_gaussians(500).to(gpu)
     camera = Camera(CAMERA.K, CAMERA.width_px, CAMERA.height_px, model=model)
     behind = None if background is None else torch.tensor(background, device=gpu)
@@ -30,7 +30,7 @@ def test_both_ways_give_the_same_picture(gpu, make_gaussians, model, background)
     assert not render(gaussians, camera, behind, depth=False).depth.any()
 
 
-def test_lists_that_are_too_short_are_made_longer(gpu, make_gaussians, monkeypatch):
+def test_render_grows_short_tile_lists(gpu, make_gaussians, monkeypatch):
     gaussians = make_gaussians(500).to(gpu)
     expected = render(gaussians, CAMERA)
     monkeypatch.setattr(rendering, "SMALLEST_SCENE", 1)
@@ -39,7 +39,7 @@ def test_lists_that_are_too_short_are_made_longer(gpu, make_gaussians, monkeypat
     assert torch.equal(seen.image, expected.image) and torch.equal(seen.depth, expected.depth)
 
 
-def test_an_empty_scene_is_the_background(gpu, make_gaussians):
+def test_render_of_empty_scene_is_background(gpu, make_gaussians):
     seen = render(make_gaussians(0).to(gpu), CAMERA, torch.tensor([0.1, 0.2, 0.3], device=gpu))
     torch.testing.assert_close(seen.image.cpu(), torch.tensor([0.1, 0.2, 0.3]).expand(70, 90, 3))
     assert not seen.alpha.any()

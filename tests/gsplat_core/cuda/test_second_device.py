@@ -47,7 +47,7 @@ def on_both(work: Callable[[str], dict[str, Tensor]]) -> None:
 
 @pytest.mark.parametrize("make_field", [None, basis, hexplane])
 @pytest.mark.parametrize("precision", ["fp32", "fp16"])
-def test_frames_equal_those_of_the_first_device(make_gaussians, make_field, precision):
+def test_frames_on_second_device_equal_first_device(make_gaussians, make_field, precision):
     def frames(device: str) -> dict[str, Tensor]:
         torch.manual_seed(0)
         scene = make_gaussians(3000, sh_degree=2)
@@ -65,7 +65,7 @@ def test_frames_equal_those_of_the_first_device(make_gaussians, make_field, prec
 
 
 @pytest.mark.parametrize("make_field", [basis, hexplane])
-def test_training_equals_that_of_the_first_device(make_gaussians, make_field):
+def test_training_on_second_device_equals_first_device(make_gaussians, make_field):
     with torch.no_grad():
         seen = render(make_gaussians(600, seed=4), CAMERA)
     image = (seen.image.clamp(0, 1) * 255).round().to(torch.uint8)

@@ -42,7 +42,7 @@ VARIANTS = [
 @pytest.mark.parametrize("options", VARIANTS)
 @pytest.mark.parametrize("packed", [False, True])
 @pytest.mark.parametrize(("batch", "cameras"), [((), 1), ((), 3), ((2, 1), 2)])
-def test_every_variant_equals_the_chain(make_scene, calls, options, packed, batch, cameras):
+def test_single_call_variants_equal_chain(make_scene, calls, options, packed, batch, cameras):
     scene = make_scene(150, batch, cameras, width=90, height=70)
     leaves = inputs(scene)
     seen, meta = run(rasterization, scene, leaves, packed=packed, **options)
@@ -73,7 +73,7 @@ def test_every_variant_equals_the_chain(make_scene, calls, options, packed, batc
 
 @pytest.mark.parametrize("model", ["pinhole", "ortho", "fisheye"])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
-def test_degrees_and_camera_models_equal_the_reference(make_scene, model, degree):
+def test_single_call_degrees_and_camera_models_equal_reference(make_scene, model, degree):
     scene = make_scene(80, cameras=2, model=model, degree=4)
     leaves = inputs(scene)
     seen, _ = run(rasterization, scene, leaves, sh_degree=degree, packed=False)
@@ -90,7 +90,7 @@ def test_degrees_and_camera_models_equal_the_reference(make_scene, model, degree
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4])
 @pytest.mark.parametrize("per_camera", [False, True])
-def test_plain_colours_equal_the_chain(make_scene, calls, count, per_camera):
+def test_single_call_plain_colours_equal_chain(make_scene, calls, count, per_camera):
     scene = make_scene(120, cameras=2)
     random = torch.Generator().manual_seed(8)
     colors = torch.rand(*((2,) if per_camera else ()), 120, count, generator=random)
@@ -102,13 +102,13 @@ def test_plain_colours_equal_the_chain(make_scene, calls, count, per_camera):
     assert_same(seen, run(step_by_step.rasterization, scene, leaves, **options)[0])
 
 
-def test_coefficients_per_camera_equal_the_chain(make_scene):
+def test_single_call_coefficients_per_camera_equal_chain(make_scene):
     scene = make_scene(90, cameras=2)
     leaves = inputs(scene, colors=scene.sh * torch.tensor([1.0, -0.5])[:, None, None, None])
     assert_same(*(run(f, scene, leaves, packed=False)[0] for f in (rasterization, step_by_step.rasterization)))
 
 
-def test_covariances_in_place_of_quaternions_equal_the_chain(make_scene):
+def test_single_call_covariances_equal_chain(make_scene):
     scene = make_scene(100)
     covars, _ = quat_scale_to_covar_preci(scene.quats.float(), scene.scales.float(), compute_preci=False)
     leaves = inputs(scene, covars=covars)
@@ -119,7 +119,7 @@ def test_covariances_in_place_of_quaternions_equal_the_chain(make_scene):
 
 @pytest.mark.parametrize("packed", [False, True])
 @pytest.mark.parametrize("count", [0, 1, 31, 33, 129])
-def test_few_gaussians_and_none_that_is_seen(make_scene, count, packed):
+def test_single_call_with_few_and_invisible_gaussians(make_scene, count, packed):
     scene = make_scene(count)
     behind = replace(scene, means=-scene.means)
     for each in (scene, behind):
@@ -130,7 +130,7 @@ def test_few_gaussians_and_none_that_is_seen(make_scene, count, packed):
         check_lists(meta)
 
 
-def test_large_splats_and_many_in_one_tile_equal_the_chain(make_scene):
+def test_single_call_with_large_and_crowded_splats_equals_chain(make_scene):
     scene = make_scene(6000, width=200, height=40)
     scene.scales[:40] = 5.0
     scene.opacities[:] *= 0.1
@@ -142,7 +142,7 @@ def test_large_splats_and_many_in_one_tile_equal_the_chain(make_scene):
     assert all(torch.equal(seen[name], again[name]) for name in seen)
 
 
-def test_without_gradients_nothing_is_followed(make_scene):
+def test_single_call_without_gradients_tracks_nothing(make_scene):
     scene = make_scene(100)
     leaves = inputs(scene)
     with torch.no_grad():
@@ -153,7 +153,7 @@ def test_without_gradients_nothing_is_followed(make_scene):
     assert torch.equal(image, run(rasterization, scene, leaves)[0]["image"])
 
 
-def test_the_tile_size_and_subclasses_are_left_to_the_chain(make_scene, calls):
+def test_single_call_delegates_tile_size_and_subclasses_to_chain(make_scene, calls):
     scene = make_scene(20)
 
     class Named(torch.Tensor):
@@ -173,7 +173,7 @@ def test_the_tile_size_and_subclasses_are_left_to_the_chain(make_scene, calls):
 
 
 @pytest.mark.parametrize("packed", [False, True])
-def test_other_constants_are_left_to_the_chain(make_scene, calls, packed):
+def test_single_call_delegates_other_constants_to_chain(make_scene, calls, packed):
     scene = make_scene(60)
     scene.opacities[::2] = 1.0
     scene.means[0], scene.scales[0] = (
@@ -193,7 +193,7 @@ def test_other_constants_are_left_to_the_chain(make_scene, calls, packed):
 
 
 @pytest.mark.parametrize("packed", [False, True])
-def test_opcheck(make_scene, packed):
+def test_single_call_ops_pass_opcheck(make_scene, packed):
     scene = make_scene(30, cameras=2)
     t = {name: value.detach() for name, value in inputs(scene).items()}
     Ks = scene.Ks.float().cuda()
@@ -219,7 +219,7 @@ def test_opcheck(make_scene, packed):
 @pytest.mark.parametrize("packed", [False, True])
 @pytest.mark.parametrize("training", [False, True])
 @pytest.mark.parametrize(("count", "cameras"), [(0, 1), (150, 1), (3000, 3)])
-def test_the_reserved_capacity_does_not_change_the_result(make_scene, packed, training, count, cameras):
+def test_single_call_result_independent_of_reserved_capacity(make_scene, packed, training, count, cameras):
     scene = make_scene(count, cameras=cameras, width=200, height=70)
     scene.scales[: count // 20] *= 20  # footprints that a whole warp lists
     t = {name: value.detach() for name, value in inputs(scene).items()}
@@ -240,7 +240,7 @@ def test_the_reserved_capacity_does_not_change_the_result(make_scene, packed, tr
             assert torch.equal(wanted, found), capacity
 
 
-def test_scenes_that_grow_and_shrink_between_calls(make_scene, calls):
+def test_single_call_with_growing_and_shrinking_scenes(make_scene, calls):
     scene = make_scene(500, width=120, height=90)
     for scale in (1.0, 8.0, 8.0, 0.2, 0.2, 4.0):
         leaves = inputs(scene, scales=scene.scales * scale)
@@ -250,7 +250,7 @@ def test_scenes_that_grow_and_shrink_between_calls(make_scene, calls):
     assert calls == [True] * 6
 
 
-def test_calls_of_threads_on_their_own_streams_do_not_mix(make_scene):
+def test_single_call_threads_on_separate_streams_do_not_interfere(make_scene):
     scenes = [make_scene(count, width=90, height=70) for count in (40, 400, 2000)]
     given = [{name: t.detach() for name, t in inputs(scene).items()} for scene in scenes]
 

@@ -13,7 +13,7 @@ from tests.gsplat_core.cuda.single_call_checks import assert_same, inputs, run
 
 
 @pytest.mark.parametrize("mode", ["RGB", "RGB+ED", "ED"])
-def test_gradient_of_the_background_equals_the_chain(make_scene, mode):
+def test_single_call_background_gradient_equals_chain(make_scene, mode):
     scene = make_scene(100, cameras=2)
     found = []
     for function in (rasterization, step_by_step.rasterization):
@@ -26,7 +26,7 @@ def test_gradient_of_the_background_equals_the_chain(make_scene, mode):
 @pytest.mark.parametrize("degree", [0, 1, 2, 3, 4, None])
 @pytest.mark.parametrize("bases", [16, 25])
 @pytest.mark.parametrize("cameras", [1, 2])
-def test_gradients_of_the_gaussians_alone_equal_the_chain(make_scene, degree, bases, cameras):
+def test_single_call_gaussian_gradients_equal_chain(make_scene, degree, bases, cameras):
     degree = min(degree, math.isqrt(bases) - 1) if degree is not None else None
     scene = make_scene(150, cameras=cameras, degree=4)
     leaves = inputs(scene, colors=scene.sh[:, :bases] if degree is not None else scene.sh[:, 0])
@@ -40,7 +40,7 @@ def test_gradients_of_the_gaussians_alone_equal_the_chain(make_scene, degree, ba
 
 
 @pytest.mark.parametrize("wanted", [("means",), ("colors",), ("quats", "opacities"), ("viewmats",), ("scales",)])
-def test_gradients_only_where_they_are_asked_for(make_scene, wanted):
+def test_single_call_computes_requested_gradients_only(make_scene, wanted):
     scene = make_scene(100, cameras=2)
     every = inputs(scene)
     all_gradients, _ = run(rasterization, scene, every)
@@ -52,7 +52,7 @@ def test_gradients_only_where_they_are_asked_for(make_scene, wanted):
 
 
 @pytest.mark.parametrize("packed", [False, True])
-def test_means2d_keeps_its_gradient_and_the_absolute_one(make_scene, packed):
+def test_single_call_means2d_has_gradient_and_absolute_gradient(make_scene, packed):
     scene = make_scene(200, cameras=2, width=90, height=70)
     found = []
     for function in (rasterization, step_by_step.rasterization):
@@ -70,7 +70,7 @@ def test_means2d_keeps_its_gradient_and_the_absolute_one(make_scene, packed):
 
 @pytest.mark.parametrize("packed", [False, True])
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
-def test_losses_over_meta_reach_the_inputs(make_scene, packed, mode):
+def test_single_call_losses_over_meta_reach_inputs(make_scene, packed, mode):
     scene = make_scene(100, cameras=2)
     found = []
     for function in (rasterization, step_by_step.rasterization):
@@ -88,7 +88,7 @@ def test_losses_over_meta_reach_the_inputs(make_scene, packed, mode):
     assert_same(*found)
 
 
-def test_backward_can_be_repeated_and_second_order_is_refused(make_scene):
+def test_single_call_backward_repeatable_and_second_order_rejected(make_scene):
     scene = make_scene(40)
     leaves = inputs(scene)
     image, _, _ = rasterization(

@@ -9,7 +9,7 @@ from gsplat_core import reference, spherical_harmonics
 @pytest.mark.parametrize("degree", range(5))
 @pytest.mark.parametrize(("cameras", "count"), [(1, 0), (1, 1), (3, 1003)])
 @pytest.mark.parametrize("masked", [False, True])
-def test_values_and_gradients_equal_the_reference(gpu, assert_near, degree, cameras, count, masked):
+def test_spherical_harmonics_values_and_gradients_equal_reference(gpu, assert_near, degree, cameras, count, masked):
     generator = torch.Generator().manual_seed(degree)
     dirs = torch.randn(cameras, count, 3, generator=generator)
     coeffs = torch.randn(count, 25, 3, generator=generator)
@@ -33,7 +33,7 @@ def test_values_and_gradients_equal_the_reference(gpu, assert_near, degree, came
 @pytest.mark.parametrize("degree", range(5))
 @pytest.mark.parametrize("bases", ["all", "more"])
 @pytest.mark.parametrize("rows", [1, 3])
-def test_sets_are_copied_in_runs_of_any_length_and_place(gpu, assert_near, degree, bases, rows):
+def test_spherical_harmonics_of_any_set_count_and_alignment(gpu, assert_near, degree, bases, rows):
     """Sets per warp and block that are not full, coefficients that are not used, and tensors that start anywhere."""
     generator = torch.Generator().manual_seed(degree)
     count = (degree + 1) ** 2 + (2 if bases == "more" else 0)
@@ -59,7 +59,7 @@ def shifted(tensor):
 
 
 @pytest.mark.parametrize("rows", [1, 2])
-def test_what_is_not_finite_gets_no_gradient_where_the_colour_has_none(gpu, rows):
+def test_spherical_harmonics_non_finite_values_without_upstream_gradient(gpu, rows):
     coeffs = torch.randn(40, 16, 3, device=gpu)
     dirs = torch.randn(rows, 40, 3, device=gpu)
     coeffs[3, 5, 1], coeffs[4, 0, 0], dirs[:, 6, 1], dirs[:, 7] = torch.nan, torch.inf, torch.nan, 0
@@ -73,7 +73,7 @@ def test_what_is_not_finite_gets_no_gradient_where_the_colour_has_none(gpu, rows
     assert leaves[0].grad[:, :3].any() and leaves[1].grad[8:].any()
 
 
-def test_the_same_bits_twice_and_in_a_graph(gpu):
+def test_spherical_harmonics_deterministic_and_captured_in_graph(gpu):
     generator = torch.Generator().manual_seed(0)
     dirs, weights = (torch.randn(2, 1000, 3, generator=generator).to(gpu) for _ in range(2))
     coeffs = torch.randn(1000, 16, 3, generator=generator).to(gpu)
@@ -95,7 +95,7 @@ def test_the_same_bits_twice_and_in_a_graph(gpu):
     assert all(torch.equal(a, b) for a, b in zip(replayed, moved, strict=True))
 
 
-def test_opcheck(gpu):
+def test_spherical_harmonics_ops_pass_opcheck(gpu):
     dirs, coeffs = (torch.randn(*shape, device=gpu, requires_grad=True) for shape in ((2, 9, 3), (9, 16, 3)))
     masks = torch.rand(2, 9, device=gpu) < 0.7
     ops = torch.ops.gsplat_core
@@ -104,7 +104,7 @@ def test_opcheck(gpu):
     torch.library.opcheck(ops.spherical_harmonics_backward.default, (3, *plain, masks, plain[0], True))
 
 
-def test_coefficients_that_are_not_contiguous(gpu):
+def test_spherical_harmonics_accept_non_contiguous_coefficients(gpu):
     generator = torch.Generator().manual_seed(0)
     coeffs = torch.randn(3, 16, 100, generator=generator).to(gpu).permute(2, 1, 0)
     dirs = torch.randn(3, 100, generator=generator).to(gpu).T

@@ -10,7 +10,7 @@ from tests.gsplat_core.ops.ray_scenes import gaussians, intrinsics, splat_result
 
 
 @pytest.mark.parametrize("count", [0, 1, 7, 5000])
-def test_values_and_gradients_equal_the_reference(gpu, count):
+def test_splat_rays_equal_reference_and_are_deterministic(gpu, count):
     seen, again, wanted = splat_results(count, gpu), splat_results(count, gpu), splat_results(count, None)
     for name, value in wanted.items():
         assert torch.equal(seen[name], again[name]), name
@@ -20,14 +20,14 @@ def test_values_and_gradients_equal_the_reference(gpu, count):
 
 
 @pytest.mark.parametrize("model", ["ortho", "fisheye"])
-def test_other_projections_are_those_of_the_cpu(gpu, model):
+def test_splat_rays_of_other_projections_equal_cpu(gpu, model):
     tensors = [tensor.float() for tensor in (*gaussians(300), torch.eye(4), intrinsics(70, 45))]
     for seen, wanted in zip(splat_rays(*(t.to(gpu) for t in tensors), model), splat_rays(*tensors, model), strict=True):
         torch.testing.assert_close(seen.cpu(), wanted, rtol=1e-3, atol=1e-4)
 
 
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor:UserWarning")  # raised by opcheck itself
-def test_opcheck(gpu):
+def test_splat_rays_pass_opcheck(gpu):
     inputs = [tensor.float().to(gpu).requires_grad_() for tensor in gaussians(9)]
     camera = torch.eye(4, device=gpu), intrinsics(70, 45).float().to(gpu)
     torch.library.opcheck(torch.ops.gsplat_core.splat_rays.default, (*inputs, *camera))

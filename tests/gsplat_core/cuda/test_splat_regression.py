@@ -26,7 +26,7 @@ def evaluate(function, points, *splats):
 @pytest.mark.parametrize("dims", [1, 2, 3, 4])
 @pytest.mark.parametrize("channels", [1, 3, 6])
 @pytest.mark.parametrize(("points", "splats"), [(1, 1), (300, 70), (20_001, 5)])
-def test_values_and_gradients_equal_the_reference(gpu, assert_near, dims, channels, points, splats):
+def test_splat_regression_values_and_gradients_equal_reference(gpu, assert_near, dims, channels, points, splats):
     tensors = scene(points, splats, dims, channels)
     ours = evaluate(splat_regression, *(t.to(gpu) for t in tensors))
     exact = evaluate(reference.splat_regression, *(t.double() for t in tensors))
@@ -35,13 +35,13 @@ def test_values_and_gradients_equal_the_reference(gpu, assert_near, dims, channe
 
 
 @pytest.mark.parametrize(("points", "splats", "channels"), [(0, 3, 2), (5, 0, 2), (5, 3, 0)])
-def test_empty_inputs(gpu, points, splats, channels):
+def test_splat_regression_with_empty_inputs(gpu, points, splats, channels):
     out = evaluate(splat_regression, *(t.to(gpu) for t in scene(points, splats, 2, channels)))
     assert [tuple(t.shape) for t in out] == [(points, channels), (splats, 2), (splats, 2, 2), (splats, channels)]
     assert all(not t.any() for t in out)
 
 
-def test_unusable_splats_and_points_have_no_effect(gpu):
+def test_splat_regression_ignores_unusable_splats(gpu):
     points, centres, factors, values = (t.to(gpu) for t in scene(60, 7, 2, 3))
     wanted = evaluate(splat_regression, points, centres[3:], factors[3:], values[3:])
     factors[0] = torch.tensor([[1.0, 2], [2, 4]], device=gpu)
@@ -54,7 +54,7 @@ def test_unusable_splats_and_points_have_no_effect(gpu):
         assert torch.equal(actual[3:], expected)
 
 
-def test_the_same_bits_twice_and_in_a_graph(gpu):
+def test_splat_regression_deterministic_and_captured_in_graph(gpu):
     tensors = [t.to(gpu) for t in scene(30_000, 65, 3, 5)]
     gradient = torch.rand(30_000, 5, device=gpu)
     ops = torch.ops.gsplat_core
@@ -74,7 +74,7 @@ def test_the_same_bits_twice_and_in_a_graph(gpu):
 
 
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
-def test_opcheck(gpu):
+def test_splat_regression_ops_pass_opcheck(gpu):
     points, *splats = (t.to(gpu) for t in scene(60, 7, 2, 3))
     leaves = [t.requires_grad_() for t in splats]
     torch.library.opcheck(torch.ops.gsplat_core.splat_regression, (points, *leaves))

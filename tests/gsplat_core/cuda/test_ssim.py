@@ -28,7 +28,7 @@ def images(shape, seed=0):
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_values_and_gradients_equal_the_reference(shape):
+def test_ssim_map_values_and_gradients_equal_reference(shape):
     image, target = images(shape)
     weights = torch.randn(shape, generator=torch.Generator().manual_seed(5))
     results = []
@@ -41,7 +41,7 @@ def test_values_and_gradients_equal_the_reference(shape):
         torch.testing.assert_close(ours, expected, rtol=1e-3, atol=1e-4)
 
 
-def test_no_pixels():
+def test_ssim_map_without_pixels():
     empty = torch.zeros(0, 5, 3, device="cuda")
     assert ssim_map(empty, empty).shape == (0, 5, 3)
 
@@ -53,7 +53,7 @@ def test_no_pixels():
     "shape",
     [(1, 3, 11, 11), (1, 1, 11, 90), (1, 3, 70, 13), (2, 3, 33, 64), (1, 3, 97, 650), (2, 16, 14, 17), (3, 11, 14, 17)],
 )
-def test_fused_ssim_is_the_mean_of_the_map_of_every_picture(shape, layout, padding):
+def test_fused_ssim_equals_mean_of_ssim_maps(shape, layout, padding):
     pair = [t.movedim(-1, 0).reshape(shape) for t in images((*shape[2:], shape[0] * shape[1]), seed=2)]
     if layout == "pixels":
         pair = [t.movedim(1, -1).contiguous().movedim(-1, 1) for t in pair]
@@ -73,7 +73,7 @@ def test_fused_ssim_is_the_mean_of_the_map_of_every_picture(shape, layout, paddi
 
 
 @pytest.mark.parametrize("border", [0, 1, 5, 32, 40])
-def test_the_border_counts_neither_in_the_mean_nor_in_the_gradient(border):
+def test_ssim_mean_excludes_border_from_value_and_gradient(border):
     image, target = (t.requires_grad_() for t in images((97, 130, 3)))
     inner = ssim_map(image, target)[border : 97 - border, border : 130 - border]
     mean = torch.ops.gsplat_core.ssim_mean(image.detach(), target.detach(), border)
@@ -86,7 +86,7 @@ def test_the_border_counts_neither_in_the_mean_nor_in_the_gradient(border):
 
 
 @pytest.mark.filterwarnings("ignore:Synchronization debug mode:UserWarning")
-def test_fused_ssim_does_not_wait():
+def test_fused_ssim_does_not_synchronise():
     first, second = (t.movedim(-1, 0)[None] for t in images((20, 24, 3)))
     try:
         torch.cuda.set_sync_debug_mode("error")
@@ -96,7 +96,7 @@ def test_fused_ssim_does_not_wait():
 
 
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
-def test_opcheck():
+def test_ssim_ops_pass_opcheck():
     image, target = images((12, 9, 3))
     torch.library.opcheck(torch.ops.gsplat_core.ssim_map, (image.requires_grad_(), target.requires_grad_()))
     torch.library.opcheck(torch.ops.gsplat_core.ssim_mean, (image.detach(), target.detach(), 2))

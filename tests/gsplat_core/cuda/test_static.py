@@ -20,19 +20,19 @@ def trained(strategy, device, steps=20):
     return trainer
 
 
-def test_the_gpu_trains_as_the_processor_does():
+def test_static_training_on_gpu_equals_cpu():
     own, other = (trained("none", device) for device in ("cuda", "cpu"))
     assert own.gaussians().device.type == "cuda"
     assert np.abs([own.psnr_db(k) - other.psnr_db(k) for k in range(5)]).max() < 0.05
 
 
 @pytest.mark.parametrize("strategy", ["adc", "mcmc"])
-def test_the_same_seed_gives_the_same_bits(strategy):
+def test_static_training_with_same_seed_is_deterministic(strategy):
     first, second = (trained(strategy, "cuda").gaussians() for _ in range(2))
     assert first.count == second.count and torch.equal(first.means, second.means) and torch.equal(first.sh, second.sh)
 
 
-def test_features_and_gradients_are_those_of_the_processor():
+def test_gsplat_hexplane_features_and_gradients_equal_cpu():
     torch.manual_seed(0)
     field = HexPlaneField(1.3, {"output_coordinate_dim": 5, "resolution": [6, 7, 8, 4]}, (1, 2))
     xyzt, weights = torch.rand(50, 4) * 3 - 1.5, torch.rand(50, 10)

@@ -27,7 +27,7 @@ METHODS = pytest.mark.parametrize("method", ["fragments", "points"])
 
 @METHODS
 @pytest.mark.parametrize("supersampling", [1, 2])
-def test_samples_have_the_expected_mean_and_variance(gpu, method, supersampling):
+def test_stochastic_samples_have_expected_mean_and_variance(gpu, method, supersampling):
     gaussians = random_scene()
     sums = sampled(raw(gaussians.to(gpu)), method=method, samples=4096, supersampling=supersampling)
     z = z_scores(sums, MOMENTS[method](gaussians.to(dtype=torch.float64), CAMERA, supersampling), 4096, supersampling)
@@ -37,7 +37,7 @@ def test_samples_have_the_expected_mean_and_variance(gpu, method, supersampling)
     assert z.abs().max() < 5.5
 
 
-def test_tiny_and_huge_splats_have_the_expected_points(gpu):
+def test_stochastic_points_of_tiny_and_huge_splats_have_expected_mean(gpu):
     gaussians = random_scene(12, smallest=0.001, largest=0.003).append(random_scene(3, smallest=30, largest=60, seed=1))
     sums = sampled(raw(gaussians.to(gpu)), method="points", samples=4096)
     z = z_scores(sums, point_moments(gaussians.to(dtype=torch.float64), CAMERA), 4096)
@@ -46,7 +46,7 @@ def test_tiny_and_huge_splats_have_the_expected_points(gpu):
 
 @METHODS
 @pytest.mark.parametrize("samples", [1, 6])
-def test_the_cpu_draws_nearly_the_same_samples(gpu, method, samples):
+def test_stochastic_samples_nearly_equal_cpu(gpu, method, samples):
     gaussians = random_scene(500, largest=0.1)
     ours = sampled(raw(gaussians.to(gpu)), method=method, samples=samples).cpu()
     theirs = sampled(raw(gaussians), method=method, samples=samples)
@@ -64,7 +64,7 @@ def test_poisson_draws_are_exact(gpu):
 
 
 @METHODS
-def test_permuted_and_culled_splats_give_the_same_bytes(gpu, method):
+def test_stochastic_samples_independent_of_order_and_culling(gpu, method):
     gaussians = random_scene(20_000, largest=0.1)
     wanted = sampled(raw(gaussians.to(gpu)), method=method, samples=6)
     assert torch.equal(wanted, sampled(raw(gaussians.to(gpu)), method=method, samples=6))
@@ -78,7 +78,7 @@ def test_permuted_and_culled_splats_give_the_same_bytes(gpu, method):
 
 @METHODS
 @pytest.mark.parametrize("queue_splats", [1, 33, 1000])
-def test_several_rounds_of_the_queue_equal_one(gpu, method, queue_splats):
+def test_stochastic_queue_rounds_equal_single_round(gpu, method, queue_splats):
     scene = raw(random_scene(1500, largest=0.5).to(gpu))
     wanted = sampled(scene, method=method, samples=5)
     assert torch.equal(wanted, sampled(scene, method=method, samples=5, queue_bytes=72 * queue_splats))
@@ -89,7 +89,7 @@ def test_several_rounds_of_the_queue_equal_one(gpu, method, queue_splats):
 
 
 @METHODS
-def test_a_large_picture_with_huge_and_tiny_splats(gpu, method):
+def test_stochastic_large_image_with_huge_and_tiny_splats(gpu, method):
     camera = Camera.from_focal(900, 1280, 720)
     gaussians = random_scene(30_000, smallest=0.001, largest=0.02).append(random_scene(40, 0.5, 3, seed=1))
     ours = sampled(raw(gaussians.to(gpu)), camera, method=method, samples=2).cpu()
@@ -97,7 +97,7 @@ def test_a_large_picture_with_huge_and_tiny_splats(gpu, method):
     assert float((ours[..., 3] != theirs[..., 3]).float().mean()) < 0.01
 
 
-def test_formats_and_depth_order(gpu):
+def test_stochastic_scene_formats_and_depth_orders_agree(gpu):
     gaussians = random_scene().to(gpu)
     covars, _ = quat_scale_to_covar_preci(gaussians.quats, gaussians.scales, compute_preci=False, triu=True)
     scene = SplatScene(means=gaussians.means, covars=covars, opacities=gaussians.opacities, sh=gaussians.sh)
@@ -109,7 +109,7 @@ def test_formats_and_depth_order(gpu):
 
 
 @METHODS
-def test_it_is_captured_in_a_graph(gpu, method):
+def test_stochastic_sampling_captured_in_graph(gpu, method):
     scene = raw(random_scene(300).to(gpu))
     wanted = sampled(scene, method=method, samples=5)
     viewmat, K = CAMERA.matrices(gpu)
@@ -129,7 +129,7 @@ def test_it_is_captured_in_a_graph(gpu, method):
 
 
 @METHODS
-def test_an_empty_scene_and_hostile_values(gpu, method):
+def test_stochastic_sampling_of_empty_scene_and_non_finite_values(gpu, method):
     assert not sampled(raw(random_scene(0).to(gpu)), method=method, samples=4).any()
     gaussians = random_scene(40)
     wanted = sampled(raw(gaussians.to(gpu)), method=method, samples=4)
@@ -139,7 +139,7 @@ def test_an_empty_scene_and_hostile_values(gpu, method):
     assert torch.equal(wanted, sampled(raw(gaussians.append(bad).to(gpu)), method=method, samples=4))
 
 
-def test_opcheck(gpu):
+def test_stochastic_sampling_passes_opcheck(gpu):
     viewmat, K = CAMERA.matrices(gpu)
     options = [CAMERA.width_px, CAMERA.height_px, 0, 0, 0, 0, 2, 1, 0, 1 << 20]
     arguments = (list(raw(random_scene(5).to(gpu))), viewmat, K, new_sums(CAMERA, gpu), options)

@@ -50,14 +50,14 @@ def trained(strategy, device, steps=6):
     ],
     ids=["adc", "mcmc"],
 )
-def test_the_same_seed_gives_the_same_bits(strategy, gpu):
+def test_strategies_with_same_seed_are_deterministic(strategy, gpu):
     first, second = (trained(copy.deepcopy(strategy), gpu) for _ in range(2))
     assert len(first[0]["means"]) > COUNT
     for one, other in zip(first, second, strict=True):
         assert all(torch.equal(one[name], other[name]) for name in one)
 
 
-def test_statistics_and_relocation_equal_those_of_the_cpu(gpu):
+def test_strategy_statistics_and_relocation_equal_cpu(gpu):
     states = {}
     for device in ("cpu", gpu):
         strategy = DefaultStrategy(refine_scale2d_stop_iter=10)
@@ -84,7 +84,7 @@ def test_statistics_and_relocation_equal_those_of_the_cpu(gpu):
         torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-6)
 
 
-def test_selective_adam_and_ssim_equal_those_of_the_cpu(gpu):
+def test_selective_adam_and_fused_ssim_equal_cpu(gpu):
     random = torch.Generator().manual_seed(0)
     start, gradient = (torch.randn(50, 3, generator=random) for _ in range(2))
     visible = torch.rand(50, generator=random) < 0.5

@@ -11,7 +11,7 @@ from tests.gsplat_core.ops.test_surface_motion import exact_path, path_scene
 
 @pytest.mark.parametrize(("steps", "count"), [(0, 5), (1, 0), (1, 1), (3, 257), (20, 3000)])
 @pytest.mark.parametrize("cells", [(1, 1), (12, 16)])
-def test_paths_are_those_of_plain_torch_and_the_same_bits_twice(gpu, steps, count, cells):
+def test_surface_path_equals_reference_and_is_deterministic(gpu, steps, count, cells):
     points, flows, cameras = path_scene(steps, count, cells)
     found, again = (surface_path(points.to(gpu), flows.to(gpu), cameras) for _ in range(2))
     assert torch.equal(found, again)
@@ -19,7 +19,7 @@ def test_paths_are_those_of_plain_torch_and_the_same_bits_twice(gpu, steps, coun
     assert int((~close.all(dim=2).all(dim=1)).sum()) <= count // 100
 
 
-def test_points_that_no_picture_shows_stay(gpu):
+def test_surface_path_keeps_points_outside_view(gpu):
     _, flows, cameras = path_scene(3, 1)
     points = torch.tensor([[0, 0, -50], [float("nan"), 0, 50], [900, 0, 50]], device=gpu)
     found = surface_path(points, flows.to(gpu), cameras)

@@ -14,24 +14,24 @@ def assert_close(scene, gpu, *, absgrad=False):
 
 
 @pytest.mark.parametrize("channels", [1, 2, 3, 4, 5, 8, 9, 16, 35])
-def test_any_number_of_channels(gpu, channels):
+def test_surfel_blending_with_any_number_of_channels(gpu, channels):
     s = surfel_scene(60, 40, 33, channels=channels)
     scene = blend_scene(s, backgrounds=torch.rand(1, channels, dtype=torch.float64))
     assert_close(scene, gpu, absgrad=channels <= 16)
 
 
 @pytest.mark.parametrize(("tile_size", "size"), [(4, (9, 7)), (16, (1, 1)), (20, (33, 50)), (33, (40, 40))])
-def test_any_tile_and_image_size(gpu, tile_size, size):
+def test_surfel_blending_with_any_tile_and_image_size(gpu, tile_size, size):
     s = surfel_scene(60, *size, cameras=2)
     assert_close(blend_scene(s, tile_size=tile_size, backgrounds=torch.rand(2, 4, dtype=torch.float64)), gpu)
 
 
 @pytest.mark.parametrize("count", [0, 1])
-def test_few_surfels(gpu, count):
+def test_surfel_blending_of_few_surfels(gpu, count):
     assert_close(blend_scene(surfel_scene(count)), gpu)
 
 
-def test_opaque_surfels_and_masks(gpu):
+def test_surfel_blending_of_opaque_surfels_with_masks(gpu):
     s = surfel_scene(150, 40, 33, scale=0.5)
     s.opacities[::2] = 1.0
     masks = torch.ones(1, 3, 3, dtype=torch.bool)
@@ -39,7 +39,7 @@ def test_opaque_surfels_and_masks(gpu):
     assert_close(blend_scene(s, masks=masks), gpu)
 
 
-def test_values_that_are_not_finite_are_skipped_and_get_no_gradient(gpu):
+def test_surfel_blending_skips_non_finite_surfels_without_gradient(gpu):
     lists = tuple(tensor.to(gpu) for tensor in blend_scene(surfel_scene(60)).lists())
     s = blend_scene(surfel_scene(60))
     s.means2d[0, 0, 1] = s.ray_transforms[0, 1, 2, 0] = s.colors[0, 2, 0] = s.normals[0, 3, 2] = float("nan")
@@ -51,7 +51,7 @@ def test_values_that_are_not_finite_are_skipped_and_get_no_gradient(gpu):
         assert not seen[f"v_{name}"][:, :5].any(), name
 
 
-def test_large_scene_is_that_of_the_cpu_and_has_the_same_bits_twice(gpu):
+def test_surfel_blending_of_large_scene_equals_cpu_and_is_deterministic(gpu):
     s = blend_scene(surfel_scene(20_000, 640, 512, scale=0.02))
     first, second, cpu = s.run(device=gpu, absgrad=True), s.run(device=gpu, absgrad=True), s.run(absgrad=True)
     for name, value in first.items():
@@ -60,7 +60,7 @@ def test_large_scene_is_that_of_the_cpu_and_has_the_same_bits_twice(gpu):
         assert error <= 5e-3 * cpu[name].norm(), (name, float(error / cpu[name].norm()))
 
 
-def test_indices_out_of_range_are_skipped(gpu):
+def test_surfel_blending_skips_indices_out_of_range(gpu):
     s = blend_scene(surfel_scene(20))
     inputs = s.to(torch.float32, gpu)
     offsets, ids = (tensor.to(gpu) for tensor in s.lists())
@@ -72,7 +72,7 @@ def test_indices_out_of_range_are_skipped(gpu):
     assert all(bool(value.grad.isfinite().all()) for name, value in inputs.items())
 
 
-def test_captured_in_a_graph(gpu):
+def test_surfel_blending_captured_in_graph(gpu):
     s = blend_scene(surfel_scene(200))
     inputs = s.to(torch.float32, gpu)
     lists = [tensor.to(gpu) for tensor in s.lists()]
@@ -99,7 +99,7 @@ def test_captured_in_a_graph(gpu):
     assert all(torch.equal(a, b) for a, b in zip(results, wanted, strict=True))
 
 
-def test_rendering_is_that_of_the_cpu(gpu):
+def test_surfel_rendering_equals_cpu(gpu):
     s = surfel_scene(300, 64, 48, cameras=2)
     names = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks")
     tensors = {name: getattr(s, name).float() for name in names}

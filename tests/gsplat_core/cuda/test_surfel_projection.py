@@ -13,7 +13,7 @@ from tests.gsplat_core.ops.surfel_scenes import close, surfel_scene
 @pytest.mark.parametrize(
     ("count", "batch", "cameras"), [(0, (), 1), (1, (), 1), (300, (), 3), (300, (2,), 2), (5, (0,), 2)]
 )
-def test_batches_and_cameras(gpu, count, batch, cameras):
+def test_surfel_projection_of_batches_and_cameras_equals_reference(gpu, count, batch, cameras):
     s = surfel_scene(count, batch=batch, cameras=cameras)
     s = replace(s, **{name: getattr(s, name).float().double() for name in ("means", "quats", "scales")})
     seen, wanted = s.project(torch.float32, gpu), s.project()
@@ -21,7 +21,7 @@ def test_batches_and_cameras(gpu, count, batch, cameras):
     close(seen, wanted, 1e-5)
 
 
-def test_bad_values_are_culled_without_gradient(gpu):
+def test_surfel_projection_culls_invalid_surfels_without_gradient(gpu):
     s = surfel_scene(40)
     s.means[0, 0] = s.quats[1, 2] = s.scales[2, 1] = float("nan")
     s.means[3, 2] = -1
@@ -33,7 +33,7 @@ def test_bad_values_are_culled_without_gradient(gpu):
         assert not seen[name][:5].any()
 
 
-def test_large_scene_is_that_of_the_cpu_and_has_the_same_bits_twice(gpu):
+def test_surfel_projection_of_large_scene_equals_cpu_and_is_deterministic(gpu):
     s = surfel_scene(20_000, 640, 512, cameras=2)
     first, second, cpu = s.project(torch.float32, gpu), s.project(torch.float32, gpu), s.project(torch.float32)
     for name, value in first.items():

@@ -30,7 +30,7 @@ def train_once() -> None:
     torch.cuda.synchronize()
 
 
-def test_threads_that_end_leave_no_stream_and_no_event():
+def test_ended_threads_release_streams_and_events():
     before, inside = resources(), []
 
     def work() -> None:

@@ -56,9 +56,7 @@ def pairs(found: tuple[Tensor, Tensor, Tensor]) -> set[tuple[int, int]]:
 @pytest.mark.parametrize("tile_size", [16, 7])
 @pytest.mark.parametrize("image_dims", [(1,), (), (2, 3)])
 @pytest.mark.parametrize("sort", [True, False])
-def test_boxes_equal_those_of_the_cpu_and_of_the_reference(
-    tile_size: int, image_dims: tuple[int, ...], sort: bool
-) -> None:
+def test_isect_tiles_of_boxes_equals_cpu_and_reference(tile_size: int, image_dims: tuple[int, ...], sort: bool) -> None:
     here = splats(500, image_dims)[:3]
     seen = isect_tiles(*cuda(here), *grid(tile_size), sort)
     assert seen[0].is_cuda
@@ -68,7 +66,7 @@ def test_boxes_equal_those_of_the_cpu_and_of_the_reference(
 
 @pytest.mark.parametrize("median_px", [0.5, 3.0, 40.0])
 @pytest.mark.parametrize("tile_size", [16, 5])
-def test_exact_test_lists_what_the_ellipse_touches_and_no_more(tile_size: int, median_px: float) -> None:
+def test_isect_tiles_exact_test_lists_touched_tiles_only(tile_size: int, median_px: float) -> None:
     means2d, radii, depths, conics, opacities = splats(800, median_px=median_px, seed=3)
     *where, gpu_conics, gpu_opacities = cuda([means2d, radii, depths, conics, opacities])
     found = isect_tiles(*where, *grid(tile_size), conics=gpu_conics, opacities=gpu_opacities)
@@ -89,7 +87,7 @@ def test_exact_test_lists_what_the_ellipse_touches_and_no_more(tile_size: int, m
 
 
 @pytest.mark.parametrize("exact", [True, False])
-def test_bin_splats_is_isect_tiles_and_offsets_in_one(exact: bool) -> None:
+def test_bin_splats_equals_isect_tiles_with_offsets(exact: bool) -> None:
     means2d, radii, depths, conics, opacities = cuda(splats(700, (2, 2)))
     options = {"conics": conics, "opacities": opacities} if exact else {}
     size, across, down = grid(16)
@@ -102,7 +100,7 @@ def test_bin_splats_is_isect_tiles_and_offsets_in_one(exact: bool) -> None:
 
 @pytest.mark.parametrize("image_dims", [(1,), (2, 3)])
 @pytest.mark.parametrize("share", [1.3, 1.0, 0.6, 0.001, 0.0])
-def test_lists_of_a_capacity_are_those_of_the_reference(image_dims: tuple[int, ...], share: float) -> None:
+def test_bin_splats_with_capacity_equals_reference(image_dims: tuple[int, ...], share: float) -> None:
     here = splats(400, image_dims, median_px=8.0)[:3]
     capacity = int(share * int(isect_tiles(*here, *grid(16))[0].sum()))
     seen = bin_splats(*cuda(here), grid(16), capacity=capacity)
@@ -114,7 +112,7 @@ def test_lists_of_a_capacity_are_those_of_the_reference(image_dims: tuple[int, .
 
 
 @pytest.mark.parametrize("count", [0, 5])
-def test_lists_of_a_capacity_without_any_splats(count: int) -> None:
+def test_bin_splats_with_capacity_without_splats(count: int) -> None:
     means2d, radii, depths, conics, opacities = cuda(splats(count))
     exact = {"conics": conics, "opacities": opacities}
     _, order, offsets, needed = bin_splats(means2d, radii * 0, depths, grid(16), **exact, capacity=9)
@@ -123,13 +121,13 @@ def test_lists_of_a_capacity_without_any_splats(count: int) -> None:
     assert needed.tolist() == [0]
 
 
-def test_a_capacity_out_of_range_is_refused() -> None:
+def test_bin_splats_rejects_capacity_out_of_range() -> None:
     for capacity in (-1, 2**31):
         with pytest.raises(InvalidInput, match=f"got {capacity}"):
             bin_splats(*cuda(splats(5))[:3], grid(16), capacity=capacity)
 
 
-def test_lists_of_a_capacity_are_made_in_a_graph_and_say_when_it_is_too_small() -> None:
+def test_bin_splats_with_capacity_in_graph_reports_overflow() -> None:
     means2d, radii, depths, conics, opacities = cuda(splats(600))
     exact = {"conics": conics, "opacities": opacities}
     small = means2d.clone()
@@ -147,7 +145,7 @@ def test_lists_of_a_capacity_are_made_in_a_graph_and_say_when_it_is_too_small() 
         assert (int(lists[3]) > needed // 2) == (means is means2d)
 
 
-def test_large_splats_are_written_by_their_warp_as_small_ones_by_a_thread() -> None:
+def test_isect_tiles_of_mixed_footprints_equals_reference() -> None:
     """Cover sizes from one tile to the whole image, and none, next to each other: 256 rows of tiles, 40 columns."""
     random = torch.Generator().manual_seed(4)
     where = [torch.rand(1, 300, n, generator=random) for n in (2, 2)]
@@ -166,7 +164,7 @@ def test_large_splats_are_written_by_their_warp_as_small_ones_by_a_thread() -> N
     assert len(on_gpu ^ on_cpu) <= 1e-3 * len(on_cpu)
 
 
-def test_packed_splats_give_the_lists_of_their_images() -> None:
+def test_isect_tiles_packed_equals_dense_lists() -> None:
     means2d, radii, depths, conics, opacities = cuda(splats(300, (3,)))
     visible = (radii > 0).all(-1)
     image_ids, gaussian_ids = torch.where(visible)
@@ -179,7 +177,7 @@ def test_packed_splats_give_the_lists_of_their_images() -> None:
 
 
 @pytest.mark.parametrize("count", [0, 1, 64])
-def test_nothing_visible_gives_empty_lists(count: int) -> None:
+def test_bin_splats_without_visible_splats_gives_empty_lists(count: int) -> None:
     means2d, radii, depths, conics, opacities = cuda(splats(count))
     counts, order, offsets = bin_splats(means2d, radii * 0, depths, grid(16), conics=conics, opacities=opacities)
     assert order.numel() == 0
@@ -189,7 +187,7 @@ def test_nothing_visible_gives_empty_lists(count: int) -> None:
     assert not offsets.any()
 
 
-def test_splats_that_are_not_finite_or_far_away_are_in_no_list() -> None:
+def test_bin_splats_omits_non_finite_and_far_splats() -> None:
     means2d, radii, depths, conics, opacities = splats(14)
     means2d[:], radii[:], opacities[:] = 50.0, 20, 0.9
     means2d[0, 0, 0], means2d[0, 1, 1], means2d[0, 2, 0] = math.nan, math.inf, -3e38
@@ -202,7 +200,7 @@ def test_splats_that_are_not_finite_or_far_away_are_in_no_list() -> None:
     assert set(order.tolist()) == {13}
 
 
-def test_an_image_id_that_is_no_images_is_in_no_list() -> None:
+def test_isect_tiles_omits_invalid_image_ids() -> None:
     means2d, radii, depths, _, _ = (t[0] for t in cuda(splats(50)))
     image_ids = torch.full((50,), 7, device="cuda")
     counts, _, order = isect_tiles(means2d, radii, depths, *grid(16), packed=True, n_images=2, image_ids=image_ids)
@@ -210,7 +208,7 @@ def test_an_image_id_that_is_no_images_is_in_no_list() -> None:
     assert not order.numel()
 
 
-def test_a_splat_over_everything_is_in_every_tile() -> None:
+def test_bin_splats_lists_huge_splat_in_every_tile() -> None:
     _, across, down = grid(8)
     means2d = torch.tensor([[[1e4, -1e4]]], device="cuda")
     radii = torch.full((1, 1, 2), 2**31 - 1, dtype=torch.int32, device="cuda")
@@ -221,7 +219,7 @@ def test_a_splat_over_everything_is_in_every_tile() -> None:
     assert torch.equal(offsets.flatten(), torch.arange(across * down, dtype=torch.int32, device="cuda"))
 
 
-def test_the_same_lists_twice_and_on_a_side_stream() -> None:
+def test_bin_splats_is_deterministic_and_runs_on_side_stream() -> None:
     means2d, radii, depths, conics, opacities = cuda(splats(100_000, median_px=1.0))
     found = [bin_splats(means2d, radii, depths, grid(16), conics=conics, opacities=opacities) for _ in range(2)]
     assert_equal(found[0], found[1])
@@ -233,7 +231,7 @@ def test_the_same_lists_twice_and_on_a_side_stream() -> None:
     assert_equal(found[0], aside)
 
 
-def test_strided_inputs_are_taken() -> None:
+def test_bin_splats_accepts_strided_inputs() -> None:
     means2d, radii, depths, conics, opacities = cuda(splats(400))
     wanted = bin_splats(means2d, radii, depths, grid(16), conics=conics, opacities=opacities)
     wide = torch.cat([conics, conics], -1)[..., :3]
@@ -241,7 +239,7 @@ def test_strided_inputs_are_taken() -> None:
     assert_equal(bin_splats(turned, radii, depths, grid(16), conics=wide, opacities=opacities), wanted)
 
 
-def test_ops_pass_opcheck() -> None:
+def test_tile_ops_pass_opcheck() -> None:
     means2d, radii, depths, conics, opacities = (t[0] for t in cuda(splats(40)))
     ops = torch.ops.gsplat_core
     args = (means2d, radii, depths, conics, opacities, None, 1, *grid(16))

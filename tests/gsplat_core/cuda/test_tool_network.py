@@ -48,7 +48,7 @@ def finder(gpu):
 
 
 @both_networks
-def test_logits_are_those_of_the_cpu(gpu, path):
+def test_tool_network_logits_equal_cpu(gpu, path):
     network, on_cpu = TorchToolNetwork(path, gpu), TorchToolNetwork(path, torch.device("cpu"))
     for planes in inputs(path):
         wanted = on_cpu.logits(planes)
@@ -56,7 +56,7 @@ def test_logits_are_those_of_the_cpu(gpu, path):
         np.testing.assert_allclose(network.logits(planes), wanted, rtol=0, atol=BOUND)
 
 
-def test_masks_of_drawn_pictures_are_those_of_the_cpu(finder):
+def test_tool_network_masks_of_drawn_images_equal_cpu(finder):
     on_cpu = NetworkToolFinder()
     for image in pictures():
         assert (finder.find(image) != on_cpu.find(image)).mean() <= BOUND
@@ -64,14 +64,14 @@ def test_masks_of_drawn_pictures_are_those_of_the_cpu(finder):
 
 @pytest.mark.recordings
 @pytest.mark.parametrize("name", ["heart", "cutting", "others/colonoscopy_a"])
-def test_masks_of_recordings_are_those_of_the_cpu(recordings_dir, finder, name):
+def test_tool_network_masks_of_recordings_equal_cpu(recordings_dir, finder, name):
     on_cpu = NetworkToolFinder()
     for frame in open_recording(recordings_dir / name, max_frames=10):
         assert (finder.find(frame.image) != on_cpu.find(frame.image)).mean() <= BOUND
 
 
 @both_networks
-def test_equal_inputs_give_equal_bytes_in_every_order_and_object(gpu, path):
+def test_tool_network_deterministic_across_order_and_instances(gpu, path):
     first, second = TorchToolNetwork(path, gpu), TorchToolNetwork(path, gpu)
     given = inputs(path)
     wanted = [first.logits(planes).tobytes() for planes in given]
@@ -90,7 +90,7 @@ def busy(stop, started):
         started.set()
 
 
-def test_masks_do_not_depend_on_other_threads_and_streams(finder):
+def test_tool_network_masks_independent_of_threads_and_streams(finder):
     """Networks are also captured while another thread launches kernels."""
     wanted = [finder.find(image).tobytes() for image in pictures()]
     stop, started = threading.Event(), threading.Event()
@@ -115,7 +115,7 @@ def test_masks_do_not_depend_on_other_threads_and_streams(finder):
     assert found == [wanted * 2] * 50
 
 
-def test_memory_is_allocated_once(gpu):
+def test_tool_network_allocates_memory_once(gpu):
     network = TorchToolNetwork(NETWORK, gpu)
     planes = inputs(NETWORK)[0]
     network.logits(planes)
@@ -126,7 +126,7 @@ def test_memory_is_allocated_once(gpu):
     assert torch.cuda.memory_stats()["allocation.all.allocated"] == before
 
 
-def test_the_graph_is_captured_with_its_priority(gpu):
+def test_tool_network_graph_captured_with_priority(gpu):
     """The first run loads the kernels, the second one is captured."""
     priorities = []
 

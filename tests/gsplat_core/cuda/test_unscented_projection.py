@@ -18,7 +18,7 @@ def moved(values, device):
 
 @pytest.mark.parametrize("rolls", [None, RollingShutterType.ROLLING_TOP_TO_BOTTOM])
 @pytest.mark.parametrize("name", CAMERAS)
-def test_values_and_gradients_are_those_of_the_cpu_and_the_same_bits_twice(gpu, name, rolls):
+def test_unscented_projection_equals_cpu_and_is_deterministic(gpu, name, rolls):
     given, options = wide_scene(3000), dict(CAMERAS[name])
     if rolls is not None:
         end = exp(torch.tensor([[0.04, 0.02, 0.0, 0.03, -0.05, 0.2]], dtype=torch.float64)) @ given["viewmats"]
@@ -42,7 +42,7 @@ def test_values_and_gradients_are_those_of_the_cpu_and_the_same_bits_twice(gpu, 
         assert close.float().mean() > 0.99
 
 
-def test_capture_in_a_graph(gpu):
+def test_unscented_projection_captured_in_graph(gpu):
     given = moved({name: value.float() for name, value in wide_scene(500).items()}, gpu)
     options = {name: value.float().to(gpu) for name, value in CAMERAS["distorted"].items()}
     run = lambda: fully_fused_projection_with_ut(**given, width=W, height=H, **options)
@@ -59,7 +59,7 @@ def test_capture_in_a_graph(gpu):
 
 
 @pytest.mark.parametrize("kind", ["plain", "packed", "unscented", "eval3d"])
-def test_pictures_and_gradients_are_those_of_the_cpu(gpu, kind):
+def test_unscented_images_and_gradients_equal_cpu(gpu, kind):
     results = []
     for device in ("cpu", gpu, gpu):
         given = pictures.scene()
@@ -79,7 +79,7 @@ def test_pictures_and_gradients_are_those_of_the_cpu(gpu, kind):
 
 
 @pytest.mark.parametrize("channels", [1, 3, 21])
-def test_blending_along_rays_without_gradients(gpu, channels):
+def test_blending_along_rays_without_gradients_equals_cpu(gpu, channels):
     results = []
     for device in ("cpu", gpu, gpu):
         given = moved(pictures.scene(), device)

@@ -52,7 +52,7 @@ def on_device(leaves):
 
 @pytest.mark.parametrize("channels", [1, 3, 4, 6, 9])
 @pytest.mark.parametrize("count", [0, 1, 700])
-def test_values_and_gradients_equal_the_reference(gpu, assert_near, count, channels):
+def test_weighted_sums_values_and_gradients_equal_reference(gpu, assert_near, count, channels):
     inputs = splats(count, channels)
     ours = evaluate(on_device, [t.to(gpu) for t in inputs])
     exact = evaluate(lambda leaves: reference.weighted_sums(*leaves, WIDTH, HEIGHT), [t.double() for t in inputs])
@@ -60,7 +60,7 @@ def test_values_and_gradients_equal_the_reference(gpu, assert_near, count, chann
         assert_near(actual.cpu(), wanted, of_largest=2e-5)
 
 
-def test_the_same_bits_twice_and_in_any_order(gpu):
+def test_weighted_sums_deterministic_and_independent_of_order(gpu):
     inputs = [t.to(gpu) for t in splats(3000)]
     first, again = evaluate(on_device, inputs), evaluate(on_device, inputs)
     assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
@@ -70,7 +70,7 @@ def test_the_same_bits_twice_and_in_any_order(gpu):
     assert all(torch.equal(a, b[order]) for a, b in zip(turned[1:], first[1:], strict=True))
 
 
-def test_a_splat_larger_than_the_picture(gpu, assert_near):
+def test_weighted_sums_of_splat_larger_than_image(gpu, assert_near):
     inputs = list(splats(40))
     inputs[1][::4] *= 1e-4
     ours = evaluate(on_device, [t.to(gpu) for t in inputs])
@@ -81,7 +81,7 @@ def test_a_splat_larger_than_the_picture(gpu, assert_near):
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), 3e38])
 @pytest.mark.parametrize("at", range(5))
-def test_a_splat_with_a_hostile_value_affects_no_other(gpu, at, value):
+def test_weighted_sums_invalid_splat_does_not_affect_others(gpu, at, value):
     inputs = [t.to(gpu) for t in splats(60)]
     lists = lists_of(inputs[0], inputs[1], inputs[3])
     inputs[at][0] = value
@@ -92,7 +92,7 @@ def test_a_splat_with_a_hostile_value_affects_no_other(gpu, at, value):
     assert all(leaf.grad.isfinite().all() for leaf in leaves)
 
 
-def test_lists_that_do_not_fit_are_skipped(gpu):
+def test_weighted_sums_skip_invalid_lists(gpu):
     inputs = [t.to(gpu) for t in splats(5)]
     offsets, ids = lists_of(inputs[0], inputs[1], inputs[3])
     wrong = torch.full_like(ids, 7)
@@ -100,7 +100,7 @@ def test_lists_that_do_not_fit_are_skipped(gpu):
     assert weighted_sums(*inputs, WIDTH, HEIGHT, offsets - 1000, ids).isfinite().all()
 
 
-def test_a_replayed_cuda_graph_equals_the_eager_call(gpu):
+def test_weighted_sums_replayed_graph_equals_eager(gpu):
     inputs = [t.to(gpu) for t in splats(300)]
     lists = lists_of(inputs[0], inputs[1], inputs[3])
     v_sums = torch.rand(5, HEIGHT, WIDTH, device=gpu)
@@ -121,7 +121,7 @@ def test_a_replayed_cuda_graph_equals_the_eager_call(gpu):
     assert all(torch.equal(a, b) for a, b in zip(seen, wanted, strict=True))
 
 
-def test_opcheck(gpu):
+def test_weighted_sums_pass_opcheck(gpu):
     inputs = [t.to(gpu) for t in splats(20)]
     lists = lists_of(inputs[0], inputs[1], inputs[3])
     torch.library.opcheck(
@@ -190,24 +190,24 @@ def check_frame(inputs, gpu):
 
 @pytest.mark.parametrize("model", ["pinhole", "ortho", "fisheye"])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
-def test_frames_of_every_degree_and_camera_model_equal_the_reference(gpu, degree, model):
+def test_weighted_frame_of_every_degree_and_camera_model_equals_reference(gpu, degree, model):
     assert check_frame(frame_inputs(400, degree, model), gpu).alphas.max() > 0.5
 
 
 @pytest.mark.parametrize("size", [(1, 1), (16, 16), (17, 33), (200, 131)])
 @pytest.mark.parametrize("count", [0, 1, 127, 129, 1000])
-def test_frames_of_any_size_equal_the_reference(gpu, count, size):
+def test_weighted_frame_of_any_size_equals_reference(gpu, count, size):
     width, height = size
     check_frame(frame_inputs(count, background=count % 2 == 0, seed=count, width=width, height=height), gpu)
 
 
-def test_a_tile_with_more_splats_than_a_batch_equals_the_reference(gpu):
+def test_weighted_frame_of_tile_exceeding_batch_equals_reference(gpu):
     inputs = frame_inputs(3000, width=20, height=20)
     inputs[0][2] += 1
     check_frame(inputs, gpu)
 
 
-def test_frame_of_any_order_gives_the_same_bytes(gpu):
+def test_weighted_frame_independent_of_order(gpu):
     inputs = frame_inputs(3000, degree=2)
     first = frame_of(inputs, gpu)
     order = torch.randperm(3000, generator=torch.Generator().manual_seed(4))
@@ -220,7 +220,7 @@ def test_frame_of_any_order_gives_the_same_bytes(gpu):
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), 3e38])
 @pytest.mark.parametrize("at", range(7))
-def test_a_hostile_value_affects_no_other_splat_of_a_frame(gpu, at, value):
+def test_weighted_frame_invalid_splat_does_not_affect_others(gpu, at, value):
     inputs = frame_inputs(60)
     tensors = [*inputs[0], inputs[1], inputs[2]]
     without = [[t[1:] for t in inputs[0]], inputs[1][1:], inputs[2][1:], *inputs[3:]]
@@ -231,7 +231,7 @@ def test_a_hostile_value_affects_no_other_splat_of_a_frame(gpu, at, value):
         assert torch.equal(frame.image, frame_of(without, gpu).image)
 
 
-def test_a_frame_that_does_not_fit_says_so(gpu):
+def test_weighted_frame_reports_overflow(gpu):
     inputs = moved(frame_inputs(500), gpu)
     small = render_weighted_frame(*inputs, 10, **LIMITS)
     assert small.status[STATUS_OVERFLOW] == 1
@@ -242,7 +242,7 @@ def test_a_frame_that_does_not_fit_says_so(gpu):
 
 
 @pytest.mark.parametrize("depth", [True, False])
-def test_the_renderer_shows_the_same_picture_with_and_without_gradients(gpu, depth):
+def test_weighted_sum_renderer_same_image_with_and_without_gradients(gpu, depth):
     gaussians, harmonics, factors, _, view = frame_inputs(800, degree=2)
     scene = Gaussians(*gaussians)
     scene = replace(scene, extra={OPACITY: harmonics, FACTOR: factors}).to(gpu)
@@ -258,7 +258,7 @@ def test_the_renderer_shows_the_same_picture_with_and_without_gradients(gpu, dep
         assert (off > 2e-4).double().mean() < 2e-3, (float(off.max()), float((off > 2e-4).double().mean()))
 
 
-def test_a_tile_with_very_many_splats_does_not_overflow(gpu):
+def test_weighted_frame_of_very_many_splats_in_one_tile(gpu):
     count = 400_000
     gaussians, harmonics, factors, scalars, view = frame_inputs(1, degree=0, width=16, height=16)
     gaussians = [t.expand(count, *t.shape[1:]).clone() for t in gaussians]
@@ -274,7 +274,7 @@ def test_a_tile_with_very_many_splats_does_not_overflow(gpu):
     torch.testing.assert_close(frame.alphas.cpu().double(), alphas, rtol=1e-4, atol=1e-4)
 
 
-def test_opcheck_of_a_frame(gpu):
+def test_weighted_frame_passes_opcheck(gpu):
     gaussians, harmonics, factors, scalars, view = moved(frame_inputs(20), gpu)
     torch.library.opcheck(
         torch.ops.gsplat_core.render_weighted_frame.default,

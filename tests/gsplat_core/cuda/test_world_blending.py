@@ -11,7 +11,7 @@ from tests.gsplat_core.ops.test_world_blending import blend, cast, gradients, tw
 
 
 @pytest.mark.parametrize(("channels", "masked"), [(1, False), (3, True), (8, False), (11, False), (35, False)])
-def test_results_and_gradients_are_those_of_plain_torch(gpu, channels, masked):
+def test_world_blending_equals_reference(gpu, channels, masked):
     given, colors, offsets, ids, more = two_pictures(channels, masked)
     expected = blend(given, colors, offsets, ids, **more)
     single = {name: value.to(gpu) for name, value in cast({**given, **more}, torch.float32).items()}
@@ -27,14 +27,14 @@ def test_results_and_gradients_are_those_of_plain_torch(gpu, channels, masked):
         assert (of_device[name] - wanted).abs().max() < 0.05 * scale, name
 
 
-def test_gradients_have_the_same_bits_twice(gpu):
+def test_world_blending_gradients_are_deterministic(gpu):
     inputs = two_pictures(3, False)
     first, second = (gradients(*inputs, torch.float32, gpu) for _ in range(2))
     for name in ("means", "quats", "scales", "colors", "opacities"):
         assert torch.equal(first[name], second[name]), name
 
 
-def test_gaussians_that_are_not_finite_are_not_shown(gpu):
+def test_world_blending_omits_non_finite_gaussians(gpu):
     given, colors, offsets, ids, more = two_pictures(3, False)
     hidden = {**given, "opacities": given["opacities"].clone()}
     hidden["opacities"][[3, 5]] = 0
@@ -47,7 +47,7 @@ def test_gaussians_that_are_not_finite_are_not_shown(gpu):
     assert torch.equal(*pictures)
 
 
-def test_ids_out_of_range_are_skipped(gpu):
+def test_world_blending_skips_ids_out_of_range(gpu):
     given, colors, offsets, ids, more = two_pictures(3, False)
     single = {name: value.to(gpu) for name, value in cast({**given, **more}, torch.float32).items()}
     own, others = {name: single[name] for name in given}, {name: single[name] for name in more}
