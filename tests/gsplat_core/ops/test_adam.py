@@ -17,7 +17,7 @@ def state(*shape, seed=0, dtype=torch.float32):
 
 
 @pytest.mark.parametrize("shape", [(), (1,), (0, 3), (7, 3), (1000, 16, 3), (70001,)])
-def test_equals_torchs_adam(shape):
+def test_adam_step_equals_torch_adam(shape):
     parameter, first, second = state(*shape)
     other = parameter.clone().requires_grad_()
     optimiser = torch.optim.Adam([other], lr=0.02, betas=(0.9, 0.999), eps=1e-10)
@@ -31,7 +31,7 @@ def test_equals_torchs_adam(shape):
 
 
 @pytest.mark.parametrize("row_size", [1, 3, 48])
-def test_equals_the_reference_where_gradients_are_not_finite(row_size):
+def test_adam_step_equals_reference_with_non_finite_gradients(row_size):
     ours = state(2000, 48)
     expected = [t.double() for t in ours]
     generator = torch.Generator().manual_seed(2)
@@ -49,7 +49,7 @@ def test_equals_the_reference_where_gradients_are_not_finite(row_size):
             torch.testing.assert_close(a.double(), b, rtol=1e-5, atol=2e-6)
 
 
-def test_a_skipped_row_keeps_its_bits():
+def test_adam_step_keeps_skipped_row_unchanged():
     parameter, first, second = state(5, 3)
     adam_step(parameter, torch.ones(5, 3), first, second, 1, 0.1)
     before = [t.clone() for t in (parameter, first, second)]
@@ -63,7 +63,7 @@ def test_a_skipped_row_keeps_its_bits():
 
 @pytest.mark.parametrize("row_size", [1, 3, 4000])
 @pytest.mark.parametrize("share", [0.0, 0.5, 0.95, 1.0])
-def test_rows_that_are_not_shown_keep_their_bits_and_are_not_counted(row_size, share):
+def test_adam_step_leaves_hidden_rows_unchanged_and_uncounted(row_size, share):
     generator = torch.Generator().manual_seed(4)
     rows = 12 if row_size == 4000 else 3000
     shown = torch.rand(rows, generator=generator) < share
@@ -82,7 +82,7 @@ def test_rows_that_are_not_shown_keep_their_bits_and_are_not_counted(row_size, s
         torch.testing.assert_close(now.double(), wanted, rtol=1e-5, atol=2e-6)
 
 
-def test_the_number_of_threads_does_not_change_a_bit():
+def test_adam_step_independent_of_thread_count():
     gradient = torch.randn(100_003, generator=torch.Generator().manual_seed(3))
     gradient[::101] = torch.nan
     shown = torch.rand(100_003, generator=torch.Generator().manual_seed(4)) < 0.7
@@ -99,14 +99,14 @@ def test_the_number_of_threads_does_not_change_a_bit():
 
 
 @pytest.mark.slow
-def test_opcheck():
+def test_adam_op_passes_opcheck():
     parameter, first, second = state(10, 3)
     arguments = (parameter, torch.ones(10, 3), first, second, 1, 0.1, 0.9, 0.999, 1e-8, 3)
     torch.library.opcheck(torch.ops.gsplat_core.adam_, arguments)
     torch.library.opcheck(torch.ops.gsplat_core.adam_, (*arguments, torch.arange(10) % 2 == 0))
 
 
-def test_what_it_cannot_take_is_refused():
+def test_adam_step_rejects_invalid_inputs():
     parameter, first, second = state(4, 3)
     gradient = torch.ones(4, 3)
     with pytest.raises(InvalidInput, match=r"gsplat_core\.reference"):
@@ -129,7 +129,7 @@ def test_what_it_cannot_take_is_refused():
         )
 
 
-def test_a_step_told_by_tensors_is_the_step_told_by_numbers():
+def test_adam_step_at_equals_adam_step():
     gradient = torch.randn(50, 3, generator=torch.Generator().manual_seed(5))
     gradient[7, 1] = torch.nan
     on_host, at, skipped = state(50, 3), state(50, 3), torch.full((1,), 4)

@@ -28,7 +28,7 @@ def gradient_of(n, seed=1):
 
 @pytest.mark.parametrize("n", [0, 1, 2500])
 @pytest.mark.parametrize("b", [1, 4, 16, 26, 33])
-def test_forward_and_backward_equal_the_reference(n, b):
+def test_basis_field_forward_and_backward_equal_reference(n, b):
     field = bumps(n, b)
     gradient = gradient_of(n)
     for tau in (-3.0, 0.0, b / 2, b + 30.0):
@@ -41,7 +41,7 @@ def test_forward_and_backward_equal_the_reference(n, b):
         assert all((s[~active] == 0).all() for s in seen)
 
 
-def test_the_reference_gradient_is_the_derivative():
+def test_basis_field_reference_passes_gradcheck():
     centers, log_widths, weights = (t.requires_grad_() for t in bumps(3, 6, torch.float64))
     assert torch.autograd.gradcheck(lambda c, l, w: reference.basis_field(c, l, w, 2.2), (centers, log_widths, weights))
     gradient = gradient_of(3).double()
@@ -51,7 +51,7 @@ def test_the_reference_gradient_is_the_derivative():
         torch.testing.assert_close(parameter.grad, wanted)
 
 
-def test_autograd_goes_through_the_compiled_backward():
+def test_basis_field_autograd_uses_compiled_backward():
     field = tuple(t.requires_grad_() for t in bumps(20, 10))
     gradient = gradient_of(20)
     basis_field(*field, 4.4).backward(gradient)
@@ -61,7 +61,7 @@ def test_autograd_goes_through_the_compiled_backward():
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor:UserWarning")  # raised by opcheck itself
-def test_ops_pass_opcheck():
+def test_basis_field_ops_pass_opcheck():
     field = tuple(t.requires_grad_() for t in bumps(5, 7))
     tau, rates = torch.tensor([3.0]), torch.tensor(RATES)
     for padded in (False, True):
@@ -82,7 +82,7 @@ def training_state(n, b, dtype=torch.float32):
 
 
 @pytest.mark.parametrize(("n", "b"), [(0, 5), (1, 4), (300, 26)])
-def test_fused_adam_equals_the_reference_over_many_steps(n, b):
+def test_basis_field_fused_adam_equals_reference_over_many_steps(n, b):
     seen, seen_m, seen_v = training_state(n, b)
     wanted, wanted_m, wanted_v = training_state(n, b, torch.float64)
     seen_steps, wanted_steps = torch.zeros(n, b, dtype=torch.int32), torch.zeros(n, b, dtype=torch.int32)
@@ -98,7 +98,7 @@ def test_fused_adam_equals_the_reference_over_many_steps(n, b):
         assert difference.numel() == 0 or difference.mean() < 1e-3 * rate
 
 
-def test_momentum_does_not_move_what_the_frame_does_not_show():
+def test_basis_field_adam_leaves_hidden_gaussians_unchanged():
     seen, m, v = training_state(50, 7)
     steps = torch.zeros(50, 7, dtype=torch.int32)
     basis_field_backward_adam_(gradient_of(50), 3.0, seen, m, v, steps, RATES)
@@ -111,7 +111,7 @@ def test_momentum_does_not_move_what_the_frame_does_not_show():
     assert not any(torch.equal(a[1::2], b[1::2]) for a, b in zip(after, before, strict=True))
 
 
-def test_fused_adam_is_torch_adam_while_every_bump_is_active():
+def test_basis_field_fused_adam_equals_torch_adam_with_all_bumps_active():
     seen, m, v = training_state(50, 3)
     wanted = [t.clone().requires_grad_() for t in seen]
     optimiser = torch.optim.Adam([{"params": [p], "lr": r} for p, r in zip(wanted, (1e-3, 2e-3, 3e-3), strict=True)])
@@ -126,7 +126,7 @@ def test_fused_adam_is_torch_adam_while_every_bump_is_active():
         torch.testing.assert_close(s, w.detach(), rtol=1e-4, atol=3e-5)
 
 
-def test_inactive_bumps_and_their_moments_stay_bit_for_bit():
+def test_basis_field_adam_leaves_inactive_bumps_unchanged():
     field, m, v = training_state(40, 26)
     before = [t.clone() for t in field]
     steps = torch.zeros(40, 26, dtype=torch.int32)
@@ -140,7 +140,7 @@ def test_inactive_bumps_and_their_moments_stay_bit_for_bit():
         assert (moment[inactive] == 0).all()
 
 
-def test_nan_shows_in_its_own_gaussian_only_and_only_while_active():
+def test_basis_field_nan_affects_only_own_gaussian_while_active():
     for which in (0, 1, 2):
         field = bumps(9, 20)
         field[which][4, 2] = float("nan")
@@ -151,7 +151,7 @@ def test_nan_shows_in_its_own_gaussian_only_and_only_while_active():
     assert basis_field(*field, 18.0).isfinite().all(), "the NaN weight is of a bump far from this time"
 
 
-def test_padded_rows_give_the_same_and_their_padding_is_not_looked_at():
+def test_basis_field_padding_is_ignored():
     field = bumps(50, 26)
     padded = basis_field(*field, 3.0, padded=True)
     assert torch.equal(padded[:, :13], basis_field(*field, 3.0)) and (padded[:, 13:] == 0).all()
@@ -174,7 +174,7 @@ def test_padded_rows_give_the_same_and_their_padding_is_not_looked_at():
 
 @pytest.mark.parametrize("bad", [float("nan"), float("-inf"), 1e30])
 @pytest.mark.parametrize("function", [basis_field_backward_adam_, reference.basis_field_backward_adam_])
-def test_a_gradient_that_is_not_finite_leaves_its_gaussian_alone(function, bad):
+def test_basis_field_adam_skips_gaussian_with_non_finite_gradient(function, bad):
     field, m, v = training_state(20, 7)
     steps = torch.zeros(20, 7, dtype=torch.int32)
     function(gradient_of(20), 3.0, field, m, v, steps, RATES)
@@ -187,7 +187,7 @@ def test_a_gradient_that_is_not_finite_leaves_its_gaussian_alone(function, bad):
         assert not torch.equal(now[1::3], old[1::3])
 
 
-def test_extreme_widths_do_not_overflow():
+def test_basis_field_extreme_widths_do_not_overflow():
     field = bumps(3, 4)
     field[1][0, :] = 500.0
     field[1][1, :] = -500.0
@@ -195,7 +195,7 @@ def test_extreme_widths_do_not_overflow():
         torch.testing.assert_close(basis_field(*field, tau), reference.basis_field(*field, tau), rtol=2e-5, atol=2e-6)
 
 
-def test_the_result_does_not_depend_on_the_number_of_threads():
+def test_basis_field_independent_of_thread_count():
     def train(threads):
         old = torch.get_num_threads()
         torch.set_num_threads(threads)
@@ -210,7 +210,7 @@ def test_the_result_does_not_depend_on_the_number_of_threads():
     assert all(torch.equal(a, b) for a, b in zip(train(1), train(2), strict=True))
 
 
-def test_wrong_input_is_refused_with_its_value():
+def test_basis_field_rejects_invalid_inputs():
     centers, log_widths, weights = field = bumps(3, 4)
     with pytest.raises(InvalidInput, match=r"\[3, 4, 12\]"):
         basis_field(centers, log_widths, weights[..., :12], 0.0)

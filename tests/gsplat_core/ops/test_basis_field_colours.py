@@ -12,7 +12,7 @@ from tests.gsplat_core.ops.test_basis_field import bumps, gradient_of
 
 @pytest.mark.parametrize("n", [0, 1, 2500])
 @pytest.mark.parametrize("b", [1, 4, 16, 33])
-def test_added_colours_equal_the_reference_and_are_what_was_asked_for(n, b):
+def test_add_colours_equals_reference_and_reaches_requested_change(n, b):
     centers, log_widths, weights = bumps(n, b)
     change = gradient_of(n)[:, :3]
     for tau in (-9.0, 0.0, b / 2, b + 30.0):
@@ -29,7 +29,7 @@ def test_added_colours_equal_the_reference_and_are_what_was_asked_for(n, b):
 
 
 @pytest.mark.parametrize("module", [compiled, reference])
-def test_colours_that_cannot_be_added_leave_the_others_alone(module):
+def test_add_colours_skips_gaussians_with_invalid_change_only(module):
     centers, log_widths, weights = bumps(5, 8)
     centers[1, 3] = float("nan")
     centers[4] += 5.0  # nearly over
@@ -43,11 +43,11 @@ def test_colours_that_cannot_be_added_leave_the_others_alone(module):
 
 
 @pytest.mark.parametrize("change", [torch.ones(4, 3), torch.ones(5, 4), torch.ones(5, 3, dtype=torch.float64)])
-def test_colours_of_another_shape_or_type_are_refused(change):
+def test_add_colours_rejects_other_shape_or_dtype(change):
     with pytest.raises(InvalidInput):
         basis_field_add_colours_(*bumps(5, 8), 0.5, change)
 
 
-def test_the_op_passes_opcheck():
+def test_add_colours_op_passes_opcheck():
     op = torch.ops.gsplat_core.basis_field_add_colours_.default
     torch.library.opcheck(op, (*bumps(5, 7), torch.tensor([3.0]), torch.ones(5, 3)))

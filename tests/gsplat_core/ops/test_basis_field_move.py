@@ -11,7 +11,7 @@ from tests.gsplat_core.ops.test_basis_field import bumps, gradient_of
 
 @pytest.mark.parametrize("n", [0, 1, 2500])
 @pytest.mark.parametrize("b", [1, 4, 16, 26, 33])
-def test_moving_to_deltas_equals_the_reference_and_gets_there(n, b):
+def test_move_to_equals_reference_and_reaches_target(n, b):
     for tau in (-3.0, 0.0, b / 2, b + 30.0):
         field, exact = bumps(n, b), bumps(n, b, torch.float64)
         target = gradient_of(n, seed=2)
@@ -25,7 +25,7 @@ def test_moving_to_deltas_equals_the_reference_and_gets_there(n, b):
             assert share == 0 if tau == b + 30.0 else share > (0.99 if tau == b / 2 and b > 1 else 0)
 
 
-def test_what_cannot_be_moved_is_left_alone():
+def test_move_to_leaves_invalid_gaussians_unchanged():
     field = bumps(5, 8)
     target = gradient_of(5)
     target[0, 7] = float("nan")
@@ -38,7 +38,7 @@ def test_what_cannot_be_moved_is_left_alone():
     assert torch.equal(field[2].nan_to_num(), before.nan_to_num())
 
 
-def test_moving_refuses_other_shapes_and_passes_opcheck():
+def test_move_to_rejects_other_shapes_and_passes_opcheck():
     field, target = bumps(5, 7), gradient_of(5)
     with pytest.raises(InvalidInput, match="target"):
         basis_field_move_to_(*field, 3.0, target[:, :12])

@@ -29,7 +29,7 @@ def scene(cameras: int, points: int, seen: int, seed: int = 0) -> tuple[torch.Te
 @given(
     st.integers(1, 6), st.integers(1, 9), st.integers(1, 60), st.sampled_from([0.0, 0.7]), st.sampled_from([1e-6, 3.0])
 )
-def test_equations_are_those_of_plain_torch(cameras, points, seen, flat_px, damping):
+def test_bundle_cost_and_equations_equal_reference(cameras, points, seen, flat_px, damping):
     poses, where, sights = scene(cameras, points, seen, seed=seen)
     options = {"spread_px": 1.5, "flat_px": flat_px}
     wanted = reference.bundle_cost(poses, where, sights, **options)
@@ -48,7 +48,7 @@ def test_equations_are_those_of_plain_torch(cameras, points, seen, flat_px, damp
         torch.testing.assert_close(found.right, expected.right, rtol=0, atol=1e-8 * float(g.abs().max()))
 
 
-def test_the_equations_are_half_the_gradient_of_the_cost():
+def test_bundle_equations_are_half_gradient_of_cost():
     """With Cauchy's weights, g and h are half of spread² times the derivatives of the cost."""
     poses, where, sights = scene(3, 8, 50)
     twist = torch.zeros(3, 6, dtype=torch.float64, requires_grad=True)
@@ -64,7 +64,7 @@ def test_the_equations_are_half_the_gradient_of_the_cost():
 
 @pytest.mark.parametrize("count", [3, 4, 40])
 @pytest.mark.parametrize("size", [1e-6, 0.02, 0.5])
-def test_a_camera_is_placed_as_by_plain_torch(count, size):
+def test_place_camera_equals_reference(count, size):
     poses, where, _ = scene(1, count, 0, seed=count)
     local = where @ poses[0, :3, :3].T + poses[0, :3, 3]
     rays = local[:, :2] / local[:, 2:]
@@ -88,14 +88,14 @@ def test_a_camera_is_placed_as_by_plain_torch(count, size):
     assert cost < cost_of(start)
 
 
-def test_a_camera_without_points_stays():
+def test_place_camera_without_points_keeps_pose():
     poses, where, sights = scene(1, 0, 0)
     assert torch.equal(place_camera(poses[0], where, sights.rays, 300.0, spread_px=1.0, rounds=5), poses[0])
     with pytest.raises(InvalidInput, match=r"rays must be \[N, 2\]"):
         place_camera(poses[0], where, torch.ones(2, 2, dtype=torch.float64), 300.0, spread_px=1.0, rounds=5)
 
 
-def test_points_behind_the_camera_are_moved_to_the_nearest_depth():
+def test_bundle_moves_points_behind_camera_to_nearest_depth():
     poses, where, sights = scene(2, 30, 80)
     where[:4, 2] = torch.tensor([-3.0, 0.0, 1e-9, -1e-9])
     found = bundle_equations(poses, where, sights, spread_px=1.0, damping=1.0)
@@ -106,7 +106,7 @@ def test_points_behind_the_camera_are_moved_to_the_nearest_depth():
     assert bundle_cost(poses, where, sights, spread_px=1.0) == pytest.approx(cost, rel=1e-12)
 
 
-def test_scenes_without_observations_have_only_the_damping():
+def test_bundle_equations_without_observations_contain_damping_only():
     poses, where, sights = scene(2, 3, 0)
     found = bundle_equations(poses, where, sights, spread_px=1.0, damping=2.0)
     torch.testing.assert_close(found.S.view(12, 12), 2e-9 * torch.eye(12, dtype=torch.float64))
@@ -114,14 +114,14 @@ def test_scenes_without_observations_have_only_the_damping():
     assert bundle_cost(poses, where, sights, spread_px=1.0) == 0
 
 
-def test_numbers_that_are_not_finite_stay_visible():
+def test_bundle_non_finite_values_propagate():
     poses, where, sights = scene(2, 5, 30)
     where[int(sights.point[0])] = float("nan")
     assert not bool(bundle_equations(poses, where, sights, spread_px=1.0, damping=1.0).S.isfinite().all())
     assert bundle_cost(poses, where, sights, spread_px=1.0) != bundle_cost(poses, where, sights, spread_px=1.0)
 
 
-def test_opcheck():
+def test_bundle_ops_pass_opcheck():
     poses, where, sights = scene(3, 5, 20)
     ops = torch.ops.gsplat_core
     torch.library.opcheck(ops.bundle_cost.default, (poses, where, *sights, 1.0, 0.5))
@@ -129,7 +129,7 @@ def test_opcheck():
     torch.library.opcheck(ops.place_camera.default, (poses[0], where, sights.rays[:5], 300.0, 1.0, 3))
 
 
-def test_wrong_arguments_are_refused():
+def test_bundle_ops_reject_invalid_arguments():
     poses, where, sights = scene(2, 3, 6)
     for arguments, message in [
         ((poses[:, :3], where, sights), r"poses must be \[C, 4, 4\]"),

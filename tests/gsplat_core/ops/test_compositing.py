@@ -16,18 +16,18 @@ from tests.gsplat_core.ops.compositing_scenes import Scene, assert_close, scene
 
 
 @pytest.mark.parametrize("channels", [1, 2, 3, 4, 5, 7, 8, 9, 32])
-def test_random_scene_for_any_number_of_channels(channels: int) -> None:
+def test_compositing_with_any_number_of_channels(channels: int) -> None:
     assert_close(scene(300, channels=channels, backgrounds=torch.rand(1, channels)), absgrad=True)
 
 
 @pytest.mark.parametrize("tile_size", [4, 5, 8, 16, 20, 33, 64])
 @pytest.mark.parametrize("size", [(1, 1), (33, 50)])
-def test_any_tile_and_image_size(tile_size: int, size: tuple[int, int]) -> None:
+def test_compositing_with_any_tile_and_image_size(tile_size: int, size: tuple[int, int]) -> None:
     assert_close(scene(120, *size, tile_size=tile_size, backgrounds=torch.rand(1, 3)), absgrad=True)
 
 
 @pytest.mark.parametrize("image_dims", [(), (3,), (2, 2), (0,)])
-def test_leading_dimensions(image_dims: tuple[int, ...]) -> None:
+def test_compositing_with_leading_dimensions(image_dims: tuple[int, ...]) -> None:
     s = scene(60, 40, 20, image_dims=image_dims, backgrounds=torch.rand(*image_dims, 3))
     seen = s.run(rasterize_to_pixels, torch.float32)
     assert seen["image"].shape == (*image_dims, 20, 40, 3)
@@ -36,13 +36,13 @@ def test_leading_dimensions(image_dims: tuple[int, ...]) -> None:
         assert_close(s)
 
 
-def test_depth_channel_of_large_values_keeps_its_gradient() -> None:
+def test_compositing_gradient_of_large_depth_channel() -> None:
     s = scene(500, channels=4)
     s.colors[..., 3] = 60 + 0.1 * s.colors[..., 3]
     assert_close(s, absgrad=True)
 
 
-def test_opaque_splats_stop_the_pixel_and_pass_no_gradient_at_the_ceiling() -> None:
+def test_compositing_of_opaque_splats_stops_pixel_without_gradient_at_ceiling() -> None:
     s = scene(400, median_px=6.0)
     s.opacities[:, ::2] = 1.0
     assert_close(s, absgrad=True)
@@ -60,7 +60,7 @@ def assert_close_or_zero(s: Scene) -> dict[str, Tensor]:
     return seen
 
 
-def test_a_pixel_ends_before_the_splat_that_would_leave_too_little() -> None:
+def test_compositing_stops_before_splat_exceeding_transmittance_limit() -> None:
     # Three splats of 0.95 leave 1.25e-4; a fourth would leave 6e-6 and is not blended, and nothing after it is.
     alphas = [0.95, 0.95, 0.95, 0.95, 0.01]
     s = Scene(
@@ -77,7 +77,7 @@ def test_a_pixel_ends_before_the_splat_that_would_leave_too_little() -> None:
     assert not seen["v_colors"][0, 3:].any()
 
 
-def test_faint_splats_and_negative_sigma_are_skipped() -> None:
+def test_compositing_skips_faint_splats_and_negative_sigma() -> None:
     # Below 1/255 at the centre; indefinite conics, whose sigma is negative along an axis.
     s = scene(60, median_px=5.0)
     s.opacities[:, ::3] = 0.9 / 255
@@ -86,7 +86,7 @@ def test_faint_splats_and_negative_sigma_are_skipped() -> None:
     assert_close(s)
 
 
-def test_thin_huge_and_tiny_splats() -> None:
+def test_compositing_of_thin_huge_and_tiny_splats() -> None:
     s = scene(200, 90, 60, median_px=4.0)
     direction = torch.tensor([[1.0, 1.0], [-1.0, 1.0]]) / math.sqrt(2)
     thin = direction.T @ torch.diag(torch.tensor([1 / 80.0**2, 1 / 0.6**2])) @ direction
@@ -97,7 +97,7 @@ def test_thin_huge_and_tiny_splats() -> None:
     assert_close(s, absgrad=True)
 
 
-def test_values_that_are_not_finite_are_skipped_and_get_no_gradient() -> None:
+def test_compositing_skips_non_finite_splats_without_gradient() -> None:
     s = scene(200, channels=3)
     bad = torch.zeros(200, dtype=torch.bool)
     for row, value in enumerate((math.nan, math.inf, -math.inf)):
@@ -117,7 +117,7 @@ def test_values_that_are_not_finite_are_skipped_and_get_no_gradient() -> None:
     assert_close(s)
 
 
-def test_masked_tiles_show_the_background_only() -> None:
+def test_compositing_masked_tiles_show_background_only() -> None:
     masks = torch.rand(2, 3, 5, generator=torch.Generator().manual_seed(2)) > 0.4
     s = scene(150, image_dims=(2,), masks=masks, backgrounds=torch.rand(2, 3))
     seen = assert_close(s)
@@ -126,7 +126,7 @@ def test_masked_tiles_show_the_background_only() -> None:
 
 
 @pytest.mark.parametrize("count", [0, 1])
-def test_empty_and_nearly_empty_scenes(count: int) -> None:
+def test_compositing_of_empty_and_nearly_empty_scenes(count: int) -> None:
     background = torch.tensor([[0.1, 0.2, 0.3]])
     seen = scene(count, 33, 17, median_px=0.01, backgrounds=background).run(rasterize_to_pixels, torch.float32)
     if count == 0:
@@ -137,7 +137,7 @@ def test_empty_and_nearly_empty_scenes(count: int) -> None:
 
 
 @pytest.mark.slow
-def test_very_many_splats_in_one_tile() -> None:
+def test_compositing_of_very_many_splats_in_one_tile() -> None:
     s = scene(20_000, 16, 16, median_px=8.0)
     s.opacities[:] = 0.004  # just visible, so that many are blended before the pixel ends
     # A splat is blended where its alpha is at least 1/255. Rounding decides for a splat within a few float32 steps
@@ -153,7 +153,7 @@ def test_very_many_splats_in_one_tile() -> None:
     assert_close(s)
 
 
-def test_packed_splats_equal_the_dense_ones() -> None:
+def test_compositing_packed_equals_dense() -> None:
     s = scene(80, image_dims=(2,))
     offsets, flatten_ids = s.lists()
     dense = rasterize_to_pixels(s.means2d, s.conics, s.colors, s.opacities, s.width, s.height, 16, offsets, flatten_ids)
@@ -162,7 +162,7 @@ def test_packed_splats_equal_the_dense_ones() -> None:
     assert all(torch.equal(d, p) for d, p in zip(dense, packed, strict=True))
 
 
-def test_the_same_bits_for_any_number_of_threads_and_every_time() -> None:
+def test_compositing_deterministic_and_independent_of_thread_count() -> None:
     s = scene(3000, 300, 200, channels=4, backgrounds=torch.rand(1, 4))
     threads = torch.get_num_threads()
     try:
@@ -177,7 +177,7 @@ def test_the_same_bits_for_any_number_of_threads_and_every_time() -> None:
 
 
 @pytest.mark.slow
-def test_the_reference_gradient_is_the_derivative() -> None:
+def test_compositing_reference_passes_gradcheck() -> None:
     s = scene(6, 5, 4, channels=2, median_px=2.0, seed=4)
     inputs = [t.double().requires_grad_() for t in (s.means2d, s.conics, s.colors, s.opacities, torch.rand(1, 2))]
     lists = s.lists()
@@ -188,7 +188,7 @@ def test_the_reference_gradient_is_the_derivative() -> None:
     )
 
 
-def test_wrong_arguments_are_named() -> None:
+def test_compositing_names_invalid_arguments() -> None:
     s = scene(5)
     offsets, flatten_ids = s.lists()
     rest = (s.width, s.height, 16, offsets, flatten_ids)
@@ -212,7 +212,7 @@ def test_wrong_arguments_are_named() -> None:
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor:UserWarning")  # raised by opcheck itself
 @pytest.mark.parametrize("background", [True, False])
 @pytest.mark.parametrize("limit", [(), (0.999,)])
-def test_ops_pass_opcheck(background: bool, limit: tuple[float, ...]) -> None:
+def test_compositing_ops_pass_opcheck(background: bool, limit: tuple[float, ...]) -> None:
     s = scene(30, 20, 18)
     offsets, flatten_ids = s.lists()
     splats = [t[0].requires_grad_() for t in (s.means2d, s.conics, s.colors, s.opacities)]

@@ -33,7 +33,7 @@ def exact(inputs: list[torch.Tensor], image: torch.Tensor, mask: torch.Tensor, *
 
 @pytest.mark.parametrize("steps", [0, 1, 5])
 @pytest.mark.parametrize(("width", "height", "count"), [(37, 29, 60), (64, 48, 300), (1, 1, 5), (17, 3, 40), (5, 5, 0)])
-def test_equals_plain_torch(width, height, count, steps):
+def test_correct_colours_equals_reference(width, height, count, steps):
     scene = ray_scene(count, width, height)
     inputs, (image, mask) = splats(scene), target(scene)
     seen = correct_colours(*inputs, image, mask, steps=steps, **OPTIONS)
@@ -42,7 +42,7 @@ def test_equals_plain_torch(width, height, count, steps):
     assert count < 60 or steps == 0 or float((seen - inputs[2]).abs().max()) > 0.1
 
 
-def test_opaque_splats_and_a_long_list():
+def test_correct_colours_with_opaque_splats_and_long_list():
     """More splats per tile than one pass over the blocks takes, with pixels that end before the last one."""
     scene = ray_scene(500, 32, 32)
     scene.opacities[::3] = 1.0
@@ -53,7 +53,7 @@ def test_opaque_splats_and_a_long_list():
     torch.testing.assert_close(seen.double(), wanted, rtol=1e-3, atol=2e-4)
 
 
-def test_the_picture_comes_closer_with_each_correction():
+def test_correct_colours_reduces_error_with_each_step():
     scene = ray_scene(200, 48, 40)
     inputs, (image, mask) = splats(scene), target(scene, tissue=1.0)
 
@@ -69,7 +69,7 @@ def test_the_picture_comes_closer_with_each_correction():
     assert errors == sorted(errors, reverse=True) and errors[5] < 0.9 * errors[0]
 
 
-def test_nothing_changes_without_tissue_and_colours_do_not_fall_below_0():
+def test_correct_colours_unchanged_without_tissue_and_never_negative():
     scene = ray_scene(80)
     inputs, (image, mask) = splats(scene), target(scene)
     assert torch.equal(correct_colours(*inputs, image, mask * 0, steps=4, **OPTIONS), inputs[2])
@@ -77,7 +77,7 @@ def test_nothing_changes_without_tissue_and_colours_do_not_fall_below_0():
     assert bool((dark >= inputs[2].clamp(max=0) - 1e-6).all()) and bool((dark <= inputs[2] + 1e-6).all())
 
 
-def test_values_that_are_not_finite_keep_their_colours_and_change_no_other():
+def test_correct_colours_leaves_non_finite_splats_unchanged():
     scene, _ = with_bad_values(ray_scene(100))
     inputs, (image, mask) = splats(scene), target(scene)
     inputs[2][7] = float("nan")
@@ -95,7 +95,7 @@ def test_values_that_are_not_finite_keep_their_colours_and_change_no_other():
     torch.testing.assert_close(seen[usable], wanted, rtol=1e-4, atol=1e-5)
 
 
-def test_results_do_not_depend_on_the_number_of_threads():
+def test_correct_colours_independent_of_thread_count():
     scene = ray_scene(500, 90, 70)
     inputs, (image, mask) = splats(scene), target(scene)
     found, before = [], torch.get_num_threads()
@@ -108,14 +108,14 @@ def test_results_do_not_depend_on_the_number_of_threads():
     assert all(torch.equal(found[0], other) for other in found[1:])
 
 
-def test_opcheck():
+def test_correct_colours_passes_opcheck():
     scene = ray_scene(8, 20, 10)
     image, mask = target(scene)
     op = torch.ops.gsplat_core.correct_colours
     torch.library.opcheck(op, (*splats(scene), image, mask, 2, 1.0, 0.3))
 
 
-def test_wrong_arguments_are_refused():
+def test_correct_colours_rejects_invalid_arguments():
     scene = ray_scene(5, 20, 20)
     inputs, (image, mask) = splats(scene), target(scene)
     with pytest.raises(InvalidInput, match="do not cover"):

@@ -27,7 +27,7 @@ def evaluate(function, quats, scales, dtype, **options):
 @pytest.mark.parametrize("triu", [False, True])
 @pytest.mark.parametrize("wanted", [(True, True), (True, False), (False, True)])
 @pytest.mark.parametrize("shape", [(50,), (2, 3, 7), (1,), (0,)])
-def test_matches_reference(assert_near, triu, wanted, shape):
+def test_covariance_matches_reference(assert_near, triu, wanted, shape):
     options = {"compute_covar": wanted[0], "compute_preci": wanted[1], "triu": triu}
     ours = evaluate(quat_scale_to_covar_preci, *inputs(*shape), torch.float32, **options)
     exact = evaluate(reference.quat_scale_to_covar_preci, *inputs(*shape), torch.float64, **options)
@@ -35,14 +35,14 @@ def test_matches_reference(assert_near, triu, wanted, shape):
         assert_near(actual, expected, of_largest=1e-5)
 
 
-def test_eigenvalues_are_the_squared_scales_and_the_precision_is_the_inverse():
+def test_covariance_eigenvalues_are_squared_scales_and_precision_is_inverse():
     quats, scales = (t.double() for t in inputs(20))
     covar, preci = reference.quat_scale_to_covar_preci(quats, scales)
     torch.testing.assert_close(torch.linalg.eigvalsh(covar), (scales**2).sort(-1).values)
     torch.testing.assert_close(covar @ preci, torch.eye(3).double().expand(20, 3, 3))
 
 
-def test_a_quarter_turn_about_z_swaps_x_and_y():
+def test_covariance_of_quarter_turn_about_z_swaps_x_and_y():
     covar, _ = quat_scale_to_covar_preci(torch.tensor([1.0, 0, 0, 1]), torch.tensor([1.0, 2, 3]))
     torch.testing.assert_close(covar, torch.diag(torch.tensor([4.0, 1, 9])))
     # An eighth of a turn tells the direction: x stretched to 3 turns towards +y.
@@ -51,7 +51,7 @@ def test_a_quarter_turn_about_z_swaps_x_and_y():
     torch.testing.assert_close(covar[:2, :2], torch.tensor([[5.0, 4], [4, 5]]))
 
 
-def test_triu_is_the_upper_triangle():
+def test_covariance_triu_equals_upper_triangle():
     quats, scales = inputs(4)
     full, _ = quat_scale_to_covar_preci(quats, scales)
     triu, _ = quat_scale_to_covar_preci(quats, scales, triu=True)
@@ -59,7 +59,7 @@ def test_triu_is_the_upper_triangle():
     torch.testing.assert_close(triu, full[:, rows, columns])
 
 
-def test_reference_gradcheck():
+def test_covariance_reference_passes_gradcheck():
     quats, scales = (t.double().requires_grad_() for t in inputs(5))
     assert torch.autograd.gradcheck(reference.quat_scale_to_covar_preci, (quats, scales))
 
@@ -67,7 +67,7 @@ def test_reference_gradcheck():
 # opcheck itself reads .grad of tensors that are not leaves.
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
 @pytest.mark.parametrize("triu", [False, True])
-def test_opcheck(triu):
+def test_covariance_ops_pass_opcheck(triu):
     quats, scales = inputs(5)
     leaves = quats.requires_grad_(), scales.requires_grad_()
     torch.library.opcheck(torch.ops.gsplat_core.quat_scale_to_covar_preci, (*leaves, True, True, triu))
@@ -76,7 +76,7 @@ def test_opcheck(triu):
     torch.library.opcheck(torch.ops.gsplat_core.quat_scale_to_covar_preci_backward, arguments)
 
 
-def test_wrong_arguments_are_refused():
+def test_covariance_rejects_invalid_arguments():
     quats, scales = inputs(5)
     for arguments, message in [
         ((quats[:, :3], scales), r"quats must be \[..., 4\] \(wxyz\), got \[5, 3\]"),

@@ -31,7 +31,7 @@ NOISE = {"scale": 0.7, "opacity_at_half": 0.01, "steepness": 100.0}
 
 @pytest.mark.parametrize(("images", "count"), [(1, 1), (3, 1003), (2, 0), (0, 5)])
 @pytest.mark.parametrize("with_radii", [True, False])
-def test_statistics_equal_the_reference(assert_near, images, count, with_radii):
+def test_gradient_norms_equal_reference(assert_near, images, count, with_radii):
     gradients, radii = screen(images, count)
     start = torch.rand(3, count)
     ours, exact = start.clone(), start.double()
@@ -43,7 +43,7 @@ def test_statistics_equal_the_reference(assert_near, images, count, with_radii):
     assert_near(ours, exact, of_largest=1e-6)
 
 
-def test_an_image_counts_only_the_gaussians_with_two_positive_radii():
+def test_gradient_norms_count_only_gaussians_with_two_positive_radii():
     radii = torch.tensor([[[4, 2], [0, 5], [5, 0], [-1, 3]], [[1, 9], [1, 1], [0, 0], [0, 0]]], dtype=torch.int32)
     sums, counts, largest = torch.zeros(4), torch.zeros(4), torch.full((4,), 0.02)
     gradients = torch.tensor([3.0, 4.0]).expand(2, 4, 2)
@@ -54,7 +54,7 @@ def test_an_image_counts_only_the_gaussians_with_two_positive_radii():
 
 
 @pytest.mark.parametrize("count", [0, 1, 7, 1003])
-def test_noise_equals_the_reference(assert_near, count):
+def test_diffuse_positions_equals_reference(assert_near, count):
     means, *rest = gaussians(count)
     ours, exact = means.clone(), means.double()
     diffuse_positions_(ours, *rest, **NOISE)
@@ -64,7 +64,7 @@ def test_noise_equals_the_reference(assert_near, count):
         assert (ours != means).any()
 
 
-def test_a_transparent_gaussian_moves_along_its_axes_and_a_visible_one_hardly():
+def test_diffuse_positions_moves_transparent_gaussian_along_axes():
     quarter = torch.tensor([1.0, 0, 0, 1]).expand(2, 4)  # about z: the first axis lies along y
     scales = torch.tensor([2.0, 1.0, 0.5]).log().expand(2, 3)
     means, logits = torch.zeros(2, 3), torch.tensor([-30.0, 0.0])
@@ -76,7 +76,7 @@ def test_a_transparent_gaussian_moves_along_its_axes_and_a_visible_one_hardly():
 
 @pytest.mark.parametrize("where", range(4))
 @pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_a_gaussian_whose_new_position_is_not_finite_stays(where, value):
+def test_diffuse_positions_keeps_gaussian_with_non_finite_new_position(where, value):
     means, *rest = gaussians(9)
     rest = [each.clone() for each in rest]
     if where == 2 and value == math.inf:
@@ -91,7 +91,7 @@ def test_a_gaussian_whose_new_position_is_not_finite_stays(where, value):
     torch.testing.assert_close(moved, exact.float(), rtol=1e-4, atol=1e-5)
 
 
-def test_a_rotation_of_length_zero_leaves_the_position():
+def test_diffuse_positions_keeps_gaussian_with_zero_rotation():
     means, quats, *rest = gaussians(3)
     quats[1] = 0
     moved = means.clone()
@@ -99,7 +99,7 @@ def test_a_rotation_of_length_zero_leaves_the_position():
     assert torch.equal(moved[1], means[1])
 
 
-def test_opcheck():
+def test_densification_ops_pass_opcheck():
     ops = torch.ops.gsplat_core
     torch.library.opcheck(
         ops.accumulate_gradient_norms_.default, (*screen(2, 9), 1.0, 2.0, 0.5, *(torch.zeros(9) for _ in range(3)))
@@ -110,7 +110,7 @@ def test_opcheck():
     torch.library.opcheck(ops.diffuse_positions_.default, (*gaussians(9), *NOISE.values()))
 
 
-def test_wrong_arguments_are_refused():
+def test_densification_ops_reject_invalid_arguments():
     gradients, radii = screen(2, 5)
     sums = torch.zeros(5)
     with pytest.raises(InvalidInput, match=r"radii must be int32, got torch.int64"):

@@ -14,7 +14,7 @@ SHAPES = [((), 37, 45), ((2, 3), 20, 31), ((1,), 3, 3), ((4,), 2, 9), ((), 1, 1)
 
 
 @pytest.mark.parametrize(("leading", "height", "width"), SHAPES)
-def test_normals_and_gradients_equal_the_reference(leading, height, width):
+def test_depth_to_normal_values_and_gradients_equal_reference(leading, height, width):
     seen, wanted = (compared(leading, height, width, "cpu", dtype) for dtype in (torch.float32, torch.float64))
     for name, value in wanted.items():
         scale = float(value.abs().max()) if value.numel() else 0.0
@@ -23,14 +23,14 @@ def test_normals_and_gradients_equal_the_reference(leading, height, width):
         assert all(value.any() for value in wanted.values())
 
 
-def test_the_reference_is_differentiated_correctly():
+def test_depth_to_normal_reference_passes_gradcheck():
     depths, poses, K = maps((2,), 6, 7, torch.float64)
     depths = torch.where(depths > 0, depths, 35.0)
     leaves = [each.requires_grad_() for each in (depths, poses, K)]
     assert torch.autograd.gradcheck(depth_maps.depth_to_normal, leaves, fast_mode=True)
 
 
-def test_a_pixel_without_direction_has_no_normal_and_no_gradient():
+def test_depth_to_normal_pixel_without_direction_has_zero_normal():
     depths = torch.zeros(5, 7, 1)
     depths[2, 3] = 4.0
     depths.requires_grad_()
@@ -41,13 +41,13 @@ def test_a_pixel_without_direction_has_no_normal_and_no_gradient():
         assert not gradient.any()
 
 
-def test_the_unit_of_length_does_not_change_normals():
+def test_depth_to_normal_independent_of_length_unit():
     depths, poses, K = maps((), 12, 16)
     expected = depth_to_normal(depths, poses, K)
     torch.testing.assert_close(depth_to_normal(depths * 1e-5, poses, K), expected, rtol=1e-4, atol=1e-5)
 
 
-def test_cameras_and_distances_along_rays_are_differentiated_by_torch():
+def test_depth_to_normal_supports_pose_gradients_and_ray_distances():
     depths, poses, K = maps((), 8, 9)
     poses.requires_grad_()
     depth_to_normal(depths, poses, K).sum().backward()
@@ -56,7 +56,7 @@ def test_cameras_and_distances_along_rays_are_differentiated_by_torch():
     torch.testing.assert_close(along, depth_maps.depth_to_normal(depths, poses.detach(), K, z_depth=False))
 
 
-def test_a_second_derivative_is_refused():
+def test_depth_to_normal_rejects_second_derivative():
     depths, poses, K = maps((), 8, 9)
     depths.requires_grad_()
     (gradient,) = torch.autograd.grad(depth_to_normal(depths, poses, K).sum(), depths, create_graph=True)
@@ -72,14 +72,14 @@ def test_a_second_derivative_is_refused():
         (2, torch.eye(4), r"Ks must be .*\[4, 4\]"),
     ],
 )
-def test_wrong_shapes_are_named(name, value, message):
+def test_depth_to_normal_names_invalid_shapes(name, value, message):
     given = list(maps((), 4, 5))
     given[name] = value
     with pytest.raises(InvalidInput, match=message):
         depth_to_normal(*given)
 
 
-def test_mixed_dtypes_are_named():
+def test_depth_to_normal_names_mixed_dtypes():
     depths, poses, K = maps((), 4, 5)
     with pytest.raises(InvalidInput, match=r"one floating-point dtype .* camtoworlds: torch.float64"):
         depth_to_normal(depths, poses.double(), K)

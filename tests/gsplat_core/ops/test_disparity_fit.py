@@ -19,13 +19,13 @@ def check_against_reference(left, right, sixteenths, device="cpu"):
 
 
 @every_case
-def test_values_are_those_of_the_reference(case):
+def test_disparity_fit_equals_reference(case):
     kind, height, width, lowest, count = case
     left, right = pair(kind, height, width)
     check_against_reference(left, right, match_disparities(left, right, lowest, count).sixteenths)
 
 
-def test_any_start_is_taken(rng):
+def test_disparity_fit_accepts_any_start(rng):
     left, right = pair("texture", 31, 47)
     wild = torch.from_numpy(rng.integers(-2000, 2000, (31, 47)).astype("int32"))
     wild[::3, ::5] = UNKNOWN
@@ -35,7 +35,7 @@ def test_any_start_is_taken(rng):
     assert not found.px.any() and found.error_px.isinf().all()
 
 
-def test_a_start_that_is_off_by_half_a_pixel_is_put_right():
+def test_disparity_fit_corrects_start_off_by_half_pixel():
     left, right = pair("texture", 80, 160)
     off = torch.full((80, 160), 16 * SHIFT_PX + 8, dtype=torch.int32)
     found = fit_disparities(left, right, off)
@@ -44,18 +44,18 @@ def test_a_start_that_is_off_by_half_a_pixel_is_put_right():
     assert found.error_px[20:-20, 40:-20].max() < 0.5
 
 
-def test_no_pixels():
+def test_disparity_fit_without_pixels():
     nothing = torch.zeros(0, 5, dtype=torch.uint8)
     assert fit_disparities(nothing, nothing, nothing.int()).px.shape == (0, 5)
 
 
-def test_opcheck():
+def test_disparity_fit_passes_opcheck():
     left, right = pair("texture", 12, 20)
     start = torch.zeros(12, 20, dtype=torch.int32)
     torch.library.opcheck(torch.ops.gsplat_core.fit_disparities, (left, right, start))
 
 
-def test_what_it_cannot_take_is_refused():
+def test_disparity_fit_rejects_invalid_inputs():
     left, right = pair("texture", 12, 20)
     with pytest.raises(InvalidInput, match=r"sixteenths must be int32 \[12, 20\], got torch.float32"):
         fit_disparities(left, right, torch.zeros(12, 20))

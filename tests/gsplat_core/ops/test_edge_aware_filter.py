@@ -30,16 +30,16 @@ def check_against_reference(shape, device="cpu", strength=100.0, grey_step=5.0):
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_values_are_those_of_the_reference(shape):
+def test_edge_aware_filter_equals_reference(shape):
     check_against_reference(shape)
 
 
 @pytest.mark.parametrize(("strength", "grey_step"), [(0.0, 5.0), (1e4, 200.0), (3.0, 0.01)])
-def test_any_strength(strength, grey_step):
+def test_edge_aware_filter_equals_reference_at_any_strength(strength, grey_step):
     check_against_reference((2, 30, 50, 3), strength=strength, grey_step=grey_step)
 
 
-def test_an_edge_of_the_guide_stays_and_what_lies_between_becomes_even():
+def test_edge_aware_filter_keeps_guide_edge_and_smooths_between():
     guide = torch.zeros(40, 60, dtype=torch.uint8)
     guide[:, 30:] = 200
     planes = torch.where(guide > 0, 5.0, 1.0) + 0.5 * torch.randn(40, 60, generator=torch.Generator().manual_seed(1))
@@ -47,30 +47,30 @@ def test_an_edge_of_the_guide_stays_and_what_lies_between_becomes_even():
     assert (smooth[:, :30] - 1).abs().max() < 0.25 and (smooth[:, 30:] - 5).abs().max() < 0.25
 
 
-def test_the_mean_stays_where_the_guide_has_no_edges():
+def test_edge_aware_filter_keeps_mean_without_guide_edges():
     planes, guide = case((2, 21, 35, 0))
     smooth = smooth_within_edges(planes, torch.zeros_like(guide), 100.0, 5.0)
     torch.testing.assert_close(smooth.mean((1, 2)), planes.mean((1, 2)), rtol=0, atol=1e-4)
     assert smooth.std() < 0.2 * planes.std()
 
 
-def test_what_was_given_is_left_alone():
+def test_edge_aware_filter_does_not_modify_input():
     planes, guide = case((2, 9, 11, 3))
     before = planes.clone()
     smooth_within_edges(planes, guide, 100.0, 5.0)
     assert torch.equal(planes, before)
 
 
-def test_no_pixels():
+def test_edge_aware_filter_without_pixels():
     nothing = torch.zeros(2, 0, 5)
     assert smooth_within_edges(nothing, torch.zeros(0, 5, dtype=torch.uint8), 1.0, 1.0).shape == (2, 0, 5)
 
 
-def test_opcheck():
+def test_edge_aware_filter_passes_opcheck():
     torch.library.opcheck(torch.ops.gsplat_core.smooth_within_edges, (*case((2, 8, 9, 3)), 100.0, 5.0))
 
 
-def test_what_it_cannot_take_is_refused():
+def test_edge_aware_filter_rejects_invalid_inputs():
     planes, guide = case((2, 8, 9, 3))
     with pytest.raises(InvalidInput, match="float32"):
         smooth_within_edges(planes.double(), guide, 1.0, 1.0)

@@ -35,12 +35,12 @@ def assert_equal_to_the_oracle(assert_near, scene: FlowScene, before: Camera = B
 
 @pytest.mark.parametrize("count", [0, 1, 5, 400])
 @pytest.mark.parametrize("size", [(70, 45), (1, 1), (16, 16), (33, 18)])
-def test_random_scenes_of_any_size(assert_near, count, size):
+def test_blend_flow_of_any_size_equals_reference(assert_near, count, size):
     camera = Camera.from_focal(60.0, *size)
     assert_equal_to_the_oracle(assert_near, flow_scene(count, camera), camera)
 
 
-def test_opaque_and_thin_and_huge_splats(assert_near):
+def test_blend_flow_of_opaque_thin_and_huge_splats(assert_near):
     scene = flow_scene(300, median_px=6.0)
     scene.opacities[::2] = 1.0
     direction = torch.tensor([[1.0, 1.0], [-1.0, 1.0]]) / math.sqrt(2)
@@ -51,7 +51,7 @@ def test_opaque_and_thin_and_huge_splats(assert_near):
     assert float(blended[..., 3].max()) > 0.99
 
 
-def test_depth_is_limited_to_the_reach_of_the_splat():
+def test_blend_flow_limits_depth_to_reach_of_splat():
     scene = flow_scene(1)
     scene.means2d[:], scene.conics[:], scene.opacities[:] = 20.0, torch.tensor([1e-3, 0, 1e-3]), 0.9
     scene.rays[:] = torch.tensor([10.0, 3.0, 0, 0, 0, 0, 0, 0, 2.0, 0])
@@ -62,7 +62,7 @@ def test_depth_is_limited_to_the_reach_of_the_splat():
     assert float(depth[18]) == 8.0 and float(depth[22]) == 12.0
 
 
-def test_points_behind_the_second_camera_have_no_weight(assert_near):
+def test_blend_flow_ignores_points_behind_second_camera(assert_near):
     scene = flow_scene(200)
     scene.planes[::3, 2] = -40.0
     front = FlowScene(*(tensor[torch.arange(200) % 3 != 0] for tensor in scene))
@@ -71,7 +71,7 @@ def test_points_behind_the_second_camera_have_no_weight(assert_near):
     assert torch.isfinite(blended).all()
 
 
-def test_splats_with_values_that_are_not_finite_are_skipped():
+def test_blend_flow_skips_non_finite_splats():
     scene = flow_scene(120)
     bad = torch.zeros(120, dtype=torch.bool)
     places = [(tensor, column) for tensor in scene if tensor.ndim == 2 for column in range(tensor.shape[1])]
@@ -87,7 +87,7 @@ def test_splats_with_values_that_are_not_finite_are_skipped():
 
 
 @pytest.mark.slow
-def test_reference_gradcheck():
+def test_blend_flow_reference_passes_gradcheck():
     scene = flow_scene(12, Camera.from_focal(60.0, 18, 17)).converted(torch.float64)
     camera = Camera.from_focal(60.0, 18, 17)
     offsets, ids = FlowScene(*(tensor.detach().float() for tensor in scene)).lists(camera)
@@ -97,7 +97,7 @@ def test_reference_gradcheck():
 
 # opcheck itself reads .grad of tensors that are not leaves.
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
-def test_opcheck():
+def test_blend_flow_ops_pass_opcheck():
     scene = flow_scene(30)
     offsets, ids = scene.lists(BEFORE)
     rest = (offsets, ids, intrinsics_of(BEFORE, AFTER), BEFORE.width_px, BEFORE.height_px)
@@ -107,7 +107,7 @@ def test_opcheck():
     torch.library.opcheck(torch.ops.gsplat_core.blend_flow_backward.default, (*scene[:4], planes.detach(), *rest, v))
 
 
-def test_wrong_arguments_are_refused():
+def test_blend_flow_rejects_invalid_arguments():
     scene = flow_scene(5)
     offsets, ids = scene.lists(BEFORE)
     cases = [

@@ -48,7 +48,7 @@ def by_reference(inputs: list[Tensor], **options: Any) -> tuple[Tensor, Tensor]:
 
 
 @pytest.mark.parametrize("expected_depth", [False, True])
-def test_reference_is_rasterization_of_the_deformed_and_activated_gaussians(assert_near, expected_depth):
+def test_frame_reference_equals_rasterization_of_deformed_gaussians(assert_near, expected_depth):
     means, quats, log_scales, logits, sh, d, viewmat, K, background = inputs = raw_gaussians()
     image, alphas = by_reference(inputs, expected_depth=expected_depth)
     colored = torch.cat([sh[:, :1] + d[:, None, 10:13], sh[:, 1:]], 1)
@@ -62,7 +62,7 @@ def test_reference_is_rasterization_of_the_deformed_and_activated_gaussians(asse
     assert_near(alphas, wanted_alphas[0, ..., 0], of_largest=1e-12)
 
 
-def test_reference_leaves_out_what_is_not_finite_and_gives_it_no_gradient():
+def test_frame_reference_omits_non_finite_gaussians_without_gradient():
     inputs = raw_gaussians()
     with torch.no_grad():
         inputs[0][0, 1] = inputs[5][1, 13] = math.nan
@@ -79,7 +79,7 @@ def test_reference_leaves_out_what_is_not_finite_and_gives_it_no_gradient():
         assert leaf.grad[5:].any()
 
 
-def test_reference_refuses_wrong_shapes():
+def test_frame_reference_rejects_invalid_shapes():
     for index, name in ((1, "quats"), (2, "log_scales"), (3, "logit_opacities"), (4, "sh"), (5, "deltas")):
         inputs = raw_gaussians()
         inputs[index] = inputs[index][1:]
@@ -87,7 +87,7 @@ def test_reference_refuses_wrong_shapes():
             by_reference(inputs)
 
 
-def test_cpu_tensors_and_float64_are_refused_with_what_to_use_instead():
+def test_render_frame_rejects_cpu_and_float64_with_alternative():
     with pytest.raises(InvalidInput, match=r"runs on CUDA only .* gsplat_core.render"):
         rendered(raw_gaussians(dtype=torch.float32))
     with pytest.raises(InvalidInput, match=r"must be float32, got torch.float64.*gsplat_core.reference"):
@@ -99,7 +99,7 @@ def test_cpu_tensors_and_float64_are_refused_with_what_to_use_instead():
     [(0, "means"), (1, "quats"), (2, "log_scales"), (3, "logit_opacities"), (4, "sh"), (5, "deltas"), (6, "viewmat"),
      (7, "K"), (8, "background")],
 )  # fmt: skip
-def test_wrong_shapes_are_named(index, name):
+def test_render_frame_names_invalid_shapes(index, name):
     inputs = raw_gaussians(dtype=torch.float32)
     inputs[index] = inputs[index][..., :-1] if name != "logit_opacities" else inputs[index][:, None]
     with pytest.raises(InvalidInput, match=f"^{name} must be"):
@@ -115,12 +115,12 @@ def test_wrong_shapes_are_named(index, name):
         ({"mode": FrameMode.SEGMENTS, "capacity": 1025}, "at most 1024"),
     ],
 )
-def test_wrong_options_are_refused(options, message):
+def test_render_frame_rejects_invalid_options(options, message):
     with pytest.raises(InvalidInput, match=message):
         rendered(raw_gaussians(dtype=torch.float32), **options)
 
 
-def test_gaussians_are_five_tensors():
+def test_render_frame_requires_five_gaussian_tensors():
     inputs = raw_gaussians(dtype=torch.float32)
     view = View(*inputs[6:8], WIDTH, HEIGHT)
     with pytest.raises(InvalidInput, match=r"means, quats, log_scales, logit_opacities, sh, got 4 tensors"):
@@ -128,7 +128,7 @@ def test_gaussians_are_five_tensors():
 
 
 @pytest.mark.parametrize("mode", FrameMode)
-def test_fake_kernel_has_the_shapes_of_a_frame(mode):
+def test_render_frame_fake_kernel_has_frame_shapes(mode):
     training = mode == FrameMode.TRAINING
     with FakeTensorMode():
         inputs = [torch.empty_like(t, device="cpu") for t in raw_gaussians(dtype=torch.float32)]

@@ -23,7 +23,7 @@ def points(n, dtype=torch.float32, reach=1.2, seed=1):
 
 @pytest.mark.parametrize("n", [0, 1, 1300])
 @pytest.mark.parametrize("channels", [1, 5, 16, 32, 40])
-def test_features_and_gradients_equal_the_reference(n, channels):
+def test_hexplane_features_and_gradients_equal_reference(n, channels):
     seen = [t.requires_grad_() for t in (points(n), *level(channels))]
     wanted = [t.detach().clone().requires_grad_() for t in seen]
     ours, theirs = hexplane_features(*seen), reference.hexplane_features(*wanted)
@@ -36,7 +36,7 @@ def test_features_and_gradients_equal_the_reference(n, channels):
         torch.testing.assert_close(s.grad / scale, w.grad / scale, rtol=1e-4, atol=1e-5)
 
 
-def test_points_on_and_beyond_the_border_read_the_border():
+def test_hexplane_features_clamp_points_to_border():
     planes = level(4)
     for corner in (-1.0, 1.0):
         inside = torch.full((1, 4), corner)
@@ -47,13 +47,13 @@ def test_points_on_and_beyond_the_border_read_the_border():
         torch.testing.assert_close(hexplane_features(inside, *planes)[0], value)
 
 
-def test_the_reference_is_differentiable():
+def test_hexplane_reference_passes_gradcheck():
     inputs = [points(3, torch.float64, reach=0.9), *level(2, (3, 4, 3, 2), torch.float64)]
     assert torch.autograd.gradcheck(reference.hexplane_features, [t.requires_grad_() for t in inputs])
 
 
 @pytest.mark.parametrize("n", [0, 1, 700])
-def test_the_two_halves_equal_the_whole(n):
+def test_hexplane_space_and_modulate_equal_features(n):
     planes, time = level(), 0.37
     x = points(n)
     x[:, 3] = time
@@ -75,7 +75,7 @@ def network(*sizes):
 
 @pytest.mark.parametrize("n", [0, 1, 5, 48, 1001])
 @pytest.mark.parametrize("sizes", [(64, 64, 64, 64, 11), (10, 3), (10, 100, 7), (35, 48, 17)])
-def test_decoding_equals_the_reference(n, sizes):
+def test_hexplane_decode_equals_reference(n, sizes):
     x, channels = points(n), sizes[0] // 2
     spaces = [torch.rand(n, c, generator=torch.Generator().manual_seed(c)) for c in (channels, sizes[0] - channels)]
     lines = [
@@ -87,19 +87,19 @@ def test_decoding_equals_the_reference(n, sizes):
         torch.testing.assert_close(seen, wanted, rtol=1e-5, atol=1e-5)
 
 
-def test_decoding_shows_a_feature_that_is_not_a_number():
+def test_hexplane_decode_propagates_nan_feature():
     space = torch.rand(7, 16)
     space[4, 3] = float("nan")
     out = hexplane_decode([space], points(7), [], *network(16, 32, 5))
     assert out[4].isnan().all() and out[[0, 1, 2, 3, 5, 6]].isfinite().all()
 
 
-def test_layers_that_do_not_fit_are_refused():
+def test_hexplane_decode_rejects_mismatched_layers():
     with pytest.raises(RuntimeError, match="layer 0 must take 16 inputs"):
         hexplane_decode([torch.rand(7, 16)], points(7), [], *network(8, 3))
 
 
-def test_gradients_do_not_depend_on_the_number_of_threads():
+def test_hexplane_gradients_independent_of_thread_count():
     inputs = (points(4000), *level())
     gradient = torch.randn(4000, 32, generator=torch.Generator().manual_seed(3))
     results = []
@@ -111,7 +111,7 @@ def test_gradients_do_not_depend_on_the_number_of_threads():
     assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
 
 
-def test_a_position_that_is_not_a_number_shows_and_reads_nothing_outside():
+def test_hexplane_features_of_nan_position_are_nan():
     x = points(5)
     x[2, 0], x[3, 1] = float("nan"), float("inf")
     features = hexplane_features(x, *level())
@@ -121,7 +121,7 @@ def test_a_position_that_is_not_a_number_shows_and_reads_nothing_outside():
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor:UserWarning")  # raised by opcheck itself
-def test_ops_pass_opcheck():
+def test_hexplane_ops_pass_opcheck():
     ops, planes = torch.ops.gsplat_core, level(3)
     inputs = [t.requires_grad_() for t in (points(4), *level(3))]
     torch.library.opcheck(ops.hexplane_features.default, inputs)
@@ -132,7 +132,7 @@ def test_ops_pass_opcheck():
     torch.library.opcheck(ops.hexplane_modulate.default, (torch.rand(4, 3), points(4), *lines))
 
 
-def test_wrong_input_is_refused_with_its_value():
+def test_hexplane_ops_reject_invalid_inputs():
     planes = level(4)
     with pytest.raises(InvalidInput, match=r"\[6, 3\]"):
         hexplane_features(points(6)[:, :3], *planes)

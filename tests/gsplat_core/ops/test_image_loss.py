@@ -44,14 +44,14 @@ def assert_equals_reference(image, target, mask, depth, target_depth, ssim_weigh
 
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("ssim_weight", [0.0, 0.2, 1.0])
-def test_equals_the_reference(shape, ssim_weight):
+def test_image_loss_equals_reference(shape, ssim_weight):
     for masked, deep, squared in itertools.product((True, False), repeat=3):
         image, target, mask, depth, target_depth = scene(shape)
         depths = (depth, target_depth) if deep else (None, None)
         assert_equals_reference(image, target, mask if masked else None, *depths, ssim_weight, 0.5, squared)
 
 
-def test_the_squared_error_takes_floats_as_targets_and_is_as_steep_as_l1_at_a_hundredth():
+def test_squared_image_loss_accepts_float_target_and_matches_l1_slope():
     image, target, mask, *_ = scene((18, 270, 3))
     assert_equals_reference(image, target.float() / 255, mask, None, None, 0.2, 0.0, squared=True)
     off_by_a_hundredth = target.double() / 255 + 0.01
@@ -62,12 +62,12 @@ def test_the_squared_error_takes_floats_as_targets_and_is_as_steep_as_l1_at_a_hu
 
 @settings(max_examples=20, deadline=None)
 @given(st.integers(1, 24), st.integers(1, 40), st.integers(0, 1000), st.sampled_from([0.0, 0.1, 0.9]))
-def test_equals_the_reference_on_any_size(height, width, seed, keep):
+def test_image_loss_equals_reference_for_any_size(height, width, seed, keep):
     image, target, mask, depth, target_depth = scene((height, width, 3), seed, keep)
     assert_equals_reference(image, target, mask, depth, target_depth, 0.2, 1.0)
 
 
-def test_bytes_and_floats_of_one_target_give_the_same_bits():
+def test_image_loss_equal_for_byte_and_float_target():
     image, target, mask, *_ = scene((20, 33, 3))
     for a, b in zip(
         image_loss(image, target, mask, ssim_weight=0.3),
@@ -77,14 +77,14 @@ def test_bytes_and_floats_of_one_target_give_the_same_bits():
         assert a is b is None or torch.equal(a, b)
 
 
-def test_a_mask_may_be_of_any_type_and_any_non_zero_value():
+def test_image_loss_accepts_any_mask_dtype_and_value():
     image, target, mask, *_ = scene((9, 14, 3))
     expected = image_loss(image, target, mask, ssim_weight=0.2).grad_image
     for other in (mask.bool(), mask.float(), mask * 255, mask.to(torch.int64)):
         assert torch.equal(image_loss(image, target, other, ssim_weight=0.2).grad_image, expected)
 
 
-def test_no_tissue_and_no_depth_give_zero_without_nan():
+def test_image_loss_without_tissue_or_depth_is_zero():
     image, target, mask, depth, target_depth = scene((12, 15, 3))
     result = image_loss(image, target, torch.zeros_like(mask), depth, target_depth, 0.2, 1.0)
     assert result.loss.item() == 0
@@ -95,7 +95,7 @@ def test_no_tissue_and_no_depth_give_zero_without_nan():
     assert not unknown.grad_depth.any()
 
 
-def test_a_nan_is_unseen_under_the_tool_and_shown_in_tissue():
+def test_image_loss_ignores_masked_nan_and_reports_unmasked_nan():
     image, target, mask, *_ = scene((30, 40, 3))
     mask[10:, :] = 1
     mask[:10, :] = 0
@@ -110,7 +110,7 @@ def test_a_nan_is_unseen_under_the_tool_and_shown_in_tissue():
         assert torch.isnan(result.grad_image).all(dim=2).sum() == 1
 
 
-def test_backward_gives_the_gradients_that_it_returns():
+def test_image_loss_backward_equals_returned_gradients():
     image, target, mask, depth, target_depth = scene((17, 23, 3))
     image.requires_grad_(), depth.requires_grad_()
     result = image_loss(image, target, mask, depth, target_depth, 0.2, 0.5)
@@ -120,7 +120,7 @@ def test_backward_gives_the_gradients_that_it_returns():
     assert torch.equal(depth.grad, 3 * result.grad_depth)
 
 
-def test_the_number_of_threads_does_not_change_a_bit():
+def test_image_loss_independent_of_thread_count():
     arguments = *scene((200, 90, 3)), 0.2, 0.5
     before = torch.get_num_threads()
     results = []
@@ -135,7 +135,7 @@ def test_the_number_of_threads_does_not_change_a_bit():
 # opcheck itself reads .grad of tensors that are not leaves.
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
 @pytest.mark.parametrize("deep", [False, True])
-def test_opcheck(deep):
+def test_image_loss_passes_opcheck(deep):
     image, target, mask, depth, target_depth = scene((12, 9, 3))
     image.requires_grad_()
     depths = (depth.requires_grad_(), target_depth) if deep else (None, None)
@@ -144,7 +144,7 @@ def test_opcheck(deep):
 
 
 @pytest.mark.slow
-def test_gradcheck_of_the_reference():
+def test_image_loss_reference_passes_gradcheck():
     image, target, mask, depth, target_depth = scene((6, 7, 3))
     image, depth = image.double().requires_grad_(), depth.double().requires_grad_()
     for squared in (False, True):
@@ -154,7 +154,7 @@ def test_gradcheck_of_the_reference():
         assert torch.autograd.gradcheck(loss, (image, depth), fast_mode=True)
 
 
-def test_what_it_cannot_take_is_refused():
+def test_image_loss_rejects_invalid_inputs():
     image, target, mask, depth, target_depth = scene((4, 5, 3))
     with pytest.raises(InvalidInput, match=r"gsplat_core\.reference"):
         image_loss(image.double(), target)

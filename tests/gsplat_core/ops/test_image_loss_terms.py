@@ -34,7 +34,7 @@ def test_masked_squared_error_averages_over_tissue_only():
     assert masked_squared_error(image, target).item() == pytest.approx(3.09 / 0.02 / 6)
 
 
-def test_ssim_loss_is_zero_for_equal_images_and_blind_under_the_tool():
+def test_ssim_loss_zero_for_equal_images_and_ignores_masked_pixels():
     image, _, mask = images()
     assert masked_ssim_loss(image, image.detach(), mask).item() == pytest.approx(0, abs=1e-12)
     changed = torch.where(mask[..., None] != 0, image, torch.ones_like(image))
@@ -57,7 +57,7 @@ def test_depth_losses_pass_gradcheck(loss):
 
 
 @pytest.mark.parametrize("loss", [masked_l1, masked_ssim_loss])
-def test_an_empty_mask_gives_zero_loss_and_zero_gradient(loss):
+def test_image_losses_with_empty_mask_are_zero(loss):
     image, target, mask = images()
     value = loss(image, target, torch.zeros_like(mask))
     value.backward()
@@ -66,7 +66,7 @@ def test_an_empty_mask_gives_zero_loss_and_zero_gradient(loss):
 
 
 @pytest.mark.parametrize("loss", [masked_l1, masked_ssim_loss])
-def test_a_nan_under_the_tool_reaches_neither_value_nor_gradient(loss):
+def test_image_losses_ignore_masked_nan(loss):
     image, target, mask = images()
     with torch.no_grad():
         image[mask == 0] = torch.nan
@@ -77,7 +77,7 @@ def test_a_nan_under_the_tool_reaches_neither_value_nor_gradient(loss):
 
 
 @pytest.mark.parametrize("loss", [inverse_depth_l1])
-def test_unknown_depth_gives_zero_loss_and_zero_gradient(loss):
+def test_depth_loss_of_unknown_depth_is_zero(loss):
     depth, target = depths()
     value = loss(depth, torch.zeros_like(target))
     value.backward()
@@ -85,7 +85,7 @@ def test_unknown_depth_gives_zero_loss_and_zero_gradient(loss):
     assert torch.equal(depth.grad, torch.zeros_like(depth))
 
 
-def test_inverse_depth_l1_by_hand():
+def test_inverse_depth_l1_closed_form():
     depth = torch.tensor([[50.0, 20.0, 0.0]], requires_grad=True)
     target = torch.tensor([[100.0, 0.0, 40.0]])
     value = inverse_depth_l1(depth, target)
@@ -94,7 +94,7 @@ def test_inverse_depth_l1_by_hand():
     assert torch.allclose(depth.grad, torch.tensor([[-1 / 2500, 0, 0]]))
 
 
-def test_shapes_that_do_not_match_are_refused():
+def test_image_losses_reject_mismatched_shapes():
     image, target, mask = images()
     with pytest.raises(InvalidInput, match="image and target"):
         masked_l1(image, target[:-1], mask)

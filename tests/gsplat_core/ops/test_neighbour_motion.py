@@ -24,7 +24,7 @@ def states(count: int, dtype: torch.dtype, each: int = 12) -> tuple[Gaussians, G
 
 @pytest.mark.parametrize("count", [0, 1, 7, 1000])
 @pytest.mark.parametrize("each", [0, 1, 12])
-def test_values_and_gradients_equal_the_reference(assert_near, count, each):
+def test_neighbour_motion_values_and_gradients_equal_reference(assert_near, count, each):
     results = []
     for dtype in (torch.float32, torch.float64):
         first, second, neighbours = states(count, dtype, each)
@@ -37,7 +37,7 @@ def test_values_and_gradients_equal_the_reference(assert_near, count, each):
         assert_near(ours, exact, of_largest=1e-3)
 
 
-def test_the_same_bits_with_any_number_of_threads():
+def test_neighbour_motion_independent_of_thread_count():
     first, second, neighbours = states(5000, torch.float32)
     turned = torch.eye(3).expand(5000, 3, 3).contiguous()
     seen = []
@@ -54,7 +54,7 @@ def test_the_same_bits_with_any_number_of_threads():
 
 # opcheck itself reads .grad of tensors that are not leaves.
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
-def test_opcheck():
+def test_neighbour_motion_ops_pass_opcheck():
     first, second, neighbours = states(20, torch.float32)
     turned = torch.eye(3).expand(20, 3, 3).contiguous().requires_grad_()
     ops = torch.ops.gsplat_core
@@ -64,7 +64,7 @@ def test_opcheck():
     torch.library.opcheck(ops.neighbour_motion_backward.default, backward)
 
 
-def test_wrong_arguments_are_refused():
+def test_neighbour_motion_rejects_invalid_arguments():
     first, second, neighbours = states(5, torch.float32)
     turned = torch.eye(3).expand(5, 3, 3).contiguous()
     near = neighbours.int()

@@ -51,7 +51,7 @@ def backward(values):
 @pytest.mark.parametrize("model", ["pinhole", "ortho", "fisheye"])
 @pytest.mark.parametrize("covars", [False, True])
 @pytest.mark.parametrize(("count", "batch", "cameras"), [(1500, (2,), 3), (60, (), 1), (0, (), 2), (5, (), 0)])
-def test_rows_and_gradients_are_those_of_the_dense_op(make_scene, assert_near, model, covars, count, batch, cameras):
+def test_packed_projection_equals_dense(make_scene, assert_near, model, covars, count, batch, cameras):
     scene = make_scene(count, batch, cameras, model).to(torch.float32)
     dense, wanted = project(scene, covars, camera_model=model)
     packed, leaves = project(scene, covars, camera_model=model, packed=True)
@@ -70,7 +70,7 @@ def test_rows_and_gradients_are_those_of_the_dense_op(make_scene, assert_near, m
 
 
 @pytest.mark.parametrize("cameras", [1, 3])
-def test_sparse_gradients_hold_the_visible_rows_only(make_scene, assert_near, cameras):
+def test_packed_projection_sparse_gradients_cover_visible_rows_only(make_scene, assert_near, cameras):
     scene = make_scene(300, (), cameras).to(torch.float32)
     rows, leaves = project(scene, packed=True)
     backward([getattr(rows, name) for name in OUTPUTS])
@@ -85,7 +85,7 @@ def test_sparse_gradients_hold_the_visible_rows_only(make_scene, assert_near, ca
     assert torch.equal(sparse["viewmats"].grad, leaves["viewmats"].grad)
 
 
-def test_gradients_do_not_depend_on_the_number_of_threads(make_scene):
+def test_packed_projection_gradients_independent_of_thread_count(make_scene):
     scene = make_scene(5000, cameras=2).to(torch.float32)
     found = []
     before = torch.get_num_threads()
@@ -100,7 +100,7 @@ def test_gradients_do_not_depend_on_the_number_of_threads(make_scene):
     assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
 
 
-def test_sparse_adam_moves_visible_gaussians_only(make_scene):
+def test_packed_projection_sparse_adam_moves_visible_gaussians_only(make_scene):
     scene = make_scene(200).to(torch.float32)
     rows, leaves = project(scene, packed=True, sparse_grad=True)
     backward([getattr(rows, name) for name in OUTPUTS])
@@ -109,7 +109,7 @@ def test_sparse_adam_moves_visible_gaussians_only(make_scene):
     assert torch.equal(moved, rows.gaussian_ids)
 
 
-def test_sparse_gradients_need_packed_rows_and_no_batches(make_scene):
+def test_sparse_gradients_require_packed_rows_without_batches(make_scene):
     scene = make_scene(5).to(torch.float32)
     with pytest.raises(InvalidInput, match="needs packed=True"):
         project(scene, sparse_grad=True)
@@ -119,7 +119,7 @@ def test_sparse_gradients_need_packed_rows_and_no_batches(make_scene):
 
 @pytest.mark.parametrize("bases", [9, 16])
 @pytest.mark.parametrize("sparse", [False, True])
-def test_colours_of_rows_are_those_of_the_dense_op(assert_near, monkeypatch, bases, sparse):
+def test_visible_harmonics_equal_dense(assert_near, monkeypatch, bases, sparse):
     monkeypatch.setitem(packed_projection.ROWS_AT_ONCE, "cpu", 7)
     generator = torch.Generator().manual_seed(0)
     pairs = Pairs(1, 2, 20)
@@ -141,7 +141,7 @@ def test_colours_of_rows_are_those_of_the_dense_op(assert_near, monkeypatch, bas
     assert_near(gradient, dense[1].grad.double())
 
 
-def test_values_of_rows_are_those_of_their_gaussians(assert_near):
+def test_values_of_rows_selects_values_of_gaussians(assert_near):
     generator = torch.Generator().manual_seed(0)
     values = torch.randn(2, 5, 4, generator=generator, requires_grad=True)
     ids = torch.tensor([0, 3, 6, 14, 19, 29])  # of 2 batches, 3 cameras and 5 Gaussians
@@ -156,13 +156,13 @@ def test_values_of_rows_are_those_of_their_gaussians(assert_near):
     assert torch.equal(values.grad, expected)
 
 
-def test_wrong_rows_are_refused():
+def test_add_packed_rows_rejects_invalid_row_ids():
     for ids in ([0, 0], [3, 1], [-1, 2], [1, 6]):
         with pytest.raises(RuntimeError, match=r"row ids must ascend from 0 to 5, got"):
             torch.ops.gsplat_core.add_packed_rows_(torch.zeros(1, 3, 2), torch.ones(2, 2), torch.tensor(ids), 2)
 
 
-def test_opcheck(make_scene):
+def test_packed_projection_ops_pass_opcheck(make_scene):
     scene = make_scene(20, (2,), 2).to(torch.float32)
     inputs = (scene.means, None, scene.quats, scene.scales)
     options = (scene.width, scene.height, 0.3)

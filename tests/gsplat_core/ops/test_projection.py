@@ -47,7 +47,7 @@ def project(function, scene, weights_seed=None, covars=False, **options):
 @pytest.mark.parametrize("model", MODELS)
 @pytest.mark.parametrize("options", [{}, {"calc_compensations": True}, {"covars": True, "eps2d": 0.1}])
 @pytest.mark.parametrize(("count", "batch", "cameras"), [(60, (), 1), (37, (2,), 3), (1, (), 2), (0, (), 1)])
-def test_matches_reference(make_scene, assert_near, model, options, count, batch, cameras):
+def test_projection_matches_reference(make_scene, assert_near, model, options, count, batch, cameras):
     scene = make_scene(count, batch, cameras, model)
     ours, gradients = project(fully_fused_projection, scene.to(torch.float32), 5, camera_model=model, **options)
     exact, expected = project(
@@ -63,7 +63,7 @@ def test_matches_reference(make_scene, assert_near, model, options, count, batch
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_the_gradient_of_the_intrinsics_in_double_precision(make_scene, model):
+def test_projection_intrinsics_gradient_in_double_precision(make_scene, model):
     scene = make_scene(6, model=model, seed=3).to(torch.float64)
     covariances = reference.quat_scale_to_covar_preci(scene.quats, scene.scales, compute_preci=False)[0]
 
@@ -89,7 +89,7 @@ def test_the_gradient_of_the_intrinsics_in_double_precision(make_scene, model):
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_covariance_is_the_jacobian_of_the_mean_applied_to_the_covariance(make_scene, model):
+def test_projected_covariance_equals_jacobian_applied_to_covariance(make_scene, model):
     scene = make_scene(20, model=model, seed=3).to(torch.float64)
     out = reference.fully_fused_projection(
         scene.means, None, scene.quats, scene.scales, scene.viewmats, scene.Ks, scene.width, scene.height,
@@ -118,7 +118,7 @@ def test_covariance_is_the_jacobian_of_the_mean_applied_to_the_covariance(make_s
     assert checked >= 3
 
 
-def test_pinhole_jacobian_is_taken_within_1_3_fields_of_view():
+def test_pinhole_jacobian_clamped_to_1_3_fields_of_view():
     K = torch.tensor([[[50.0, 0, 50], [0, 50, 50], [0, 0, 1]]], dtype=torch.float64)
 
     def conic(x):
@@ -132,7 +132,7 @@ def test_pinhole_jacobian_is_taken_within_1_3_fields_of_view():
     assert (conic(1.2) - conic(1.4)).abs().max() > 1e-5
 
 
-def test_radii_follow_opacity_and_blur():
+def test_projection_radii_follow_opacity_and_blur():
     def radii(sigma, opacity):
         return fully_fused_projection(
             torch.tensor([[0.0, 0, 10]]), None, torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), sigma / 10),
@@ -167,7 +167,7 @@ def test_radii_follow_opacity_and_blur():
     ],
 )
 @pytest.mark.parametrize("model", MODELS)
-def test_a_bad_gaussian_is_culled_and_leaves_the_others_alone(make_scene, model, what, where, value):
+def test_projection_culls_invalid_gaussian_without_affecting_others(make_scene, model, what, where, value):
     scene = make_scene(20, model=model).to(torch.float32)
     scene.means[7] = torch.tensor([0.1, 0.2, 5.0])
     clean, clean_gradients = project(fully_fused_projection, scene.to(torch.float32), 3, camera_model=model)
@@ -191,7 +191,7 @@ def test_a_bad_gaussian_is_culled_and_leaves_the_others_alone(make_scene, model,
         assert exact.radii[0, 7].tolist() == [0, 0]
 
 
-def test_tiny_gaussians_become_the_blur(make_scene):
+def test_projection_of_tiny_gaussians_equals_blur(make_scene):
     scene = make_scene(20).to(torch.float32)
     scene.scales.fill_(1e-12)
     out, gradients = project(fully_fused_projection, scene, 1)
@@ -200,7 +200,7 @@ def test_tiny_gaussians_become_the_blur(make_scene):
     assert all(gradient.isfinite().all() for gradient in gradients)
 
 
-def test_near_far_and_radius_clip(make_scene):
+def test_projection_clips_near_far_and_radius(make_scene):
     scene = make_scene(60).to(torch.float32)
     everything, _ = project(fully_fused_projection, scene)
     clipped, _ = project(fully_fused_projection, scene, near_plane=5.0, far_plane=7.0, radius_clip=6.0)
@@ -210,7 +210,7 @@ def test_near_far_and_radius_clip(make_scene):
     assert 0 < kept.sum() < (everything.radii[..., 0] > 0).sum()
 
 
-def test_inputs_need_not_be_contiguous(make_scene):
+def test_projection_accepts_non_contiguous_inputs(make_scene):
     scene = make_scene(30, cameras=2).to(torch.float32)
     plain, _ = project(fully_fused_projection, scene)
     strided = scene.to(torch.float32)
@@ -224,7 +224,7 @@ def test_inputs_need_not_be_contiguous(make_scene):
 
 
 @pytest.mark.parametrize("function", [fully_fused_projection, reference.fully_fused_projection])
-def test_packed_has_the_visible_rows(make_scene, function):
+def test_packed_projection_has_visible_rows(make_scene, function):
     scene = make_scene(30, (2,), 3)
     scene = scene.to(torch.float32)
     dense, _ = project(function, scene, calc_compensations=True)
@@ -236,7 +236,7 @@ def test_packed_has_the_visible_rows(make_scene, function):
     assert (packed.radii > 0).all()
 
 
-def test_gradients_do_not_depend_on_the_number_of_threads(make_scene):
+def test_projection_gradients_independent_of_thread_count(make_scene):
     scene = make_scene(5000, cameras=2)
     threads = torch.get_num_threads()
     try:
@@ -252,7 +252,7 @@ def test_gradients_do_not_depend_on_the_number_of_threads(make_scene):
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_reference_gradcheck(make_scene, model):
+def test_projection_reference_passes_gradcheck(make_scene, model):
     scene = make_scene(12, cameras=2, model=model, seed=4).to(torch.float64)
     # A point near the axis takes the fisheye's series.
     scene.means[0] = torch.tensor([1e-4, 2e-4, 5.0])
@@ -279,7 +279,7 @@ def test_reference_gradcheck(make_scene, model):
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
 @pytest.mark.parametrize("covars", [False, True])
 @pytest.mark.parametrize("floor", [(), (0.0,)])
-def test_opcheck(make_scene, covars, floor):
+def test_projection_ops_pass_opcheck(make_scene, covars, floor):
     scene = make_scene(9, cameras=2).to(torch.float32)
     triu = reference.quat_scale_to_covar_preci(scene.quats, scene.scales, triu=True)[0]
     means, quats, scales, viewmats = (

@@ -8,7 +8,7 @@ import torch
 from gsplat_core import InvalidInput, fully_fused_projection
 
 
-def test_wrong_arguments_are_refused(make_scene):
+def test_projection_rejects_invalid_arguments(make_scene):
     scene = make_scene(5).to(torch.float32)
 
     def call(**changes):

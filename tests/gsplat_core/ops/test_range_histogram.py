@@ -16,18 +16,18 @@ from tests.gsplat_core.ops.ray_scenes import ray_scene, with_bad_values
 
 @pytest.mark.parametrize("factors", [False, True])
 @pytest.mark.parametrize("bins", [BINS, Bins(30.0, 0.1, 120), Bins(0.0, 200.0, 1)])
-def test_random_scene(bins, factors):
+def test_range_histogram_of_random_scene(bins, factors):
     s = ray_scene(60)
     assert_close(s, bins=bins, factors=pixel_factors(s.width, s.height) if factors else None)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (33, 50), (7, 100)])
 @pytest.mark.parametrize("count", [0, 1, 60])
-def test_any_image_size_and_few_splats(size, count):
+def test_range_histogram_of_any_image_size_and_few_splats(size, count):
     assert_close(ray_scene(count, *size))
 
 
-def test_opaque_and_thin_splats():
+def test_range_histogram_of_opaque_and_thin_splats():
     s = ray_scene(120)
     s.opacities[::2] = 1.0
     s.rays[1::3, 9] = 1e-10
@@ -35,7 +35,7 @@ def test_opaque_and_thin_splats():
     assert seen["histogram"].max() > 0
 
 
-def test_values_that_are_not_finite_are_skipped_and_get_no_gradient():
+def test_range_histogram_skips_non_finite_splats_without_gradient():
     s, bad = with_bad_values(ray_scene(100))
     s = replace(s, values=torch.zeros_like(s.values))
     bad = torch.stack([~getattr(s, name).reshape(100, -1).isfinite().all(1) for name in TENSORS]).any(0)
@@ -47,7 +47,7 @@ def test_values_that_are_not_finite_are_skipped_and_get_no_gradient():
         torch.testing.assert_close(seen[f"v_{name}"][~bad], wanted[f"v_{name}"], rtol=0, atol=0)
 
 
-def test_one_splat_fills_the_bins_of_its_depth_by_its_weight():
+def test_range_histogram_of_single_splat_fills_bins_by_weight():
     s = ray_scene(1, 16, 16)
     s.means2d[:] = 8.0
     s.conics[:] = torch.tensor([1e-6, 0.0, 1e-6])
@@ -60,7 +60,7 @@ def test_one_splat_fills_the_bins_of_its_depth_by_its_weight():
     assert float(out[:, 2].max()) < 1e-4
 
 
-def test_results_do_not_depend_on_the_number_of_threads():
+def test_range_histogram_independent_of_thread_count():
     found, before = [], torch.get_num_threads()
     for threads in (1, 2, 3):
         torch.set_num_threads(threads)
@@ -71,7 +71,7 @@ def test_results_do_not_depend_on_the_number_of_threads():
     assert all(torch.equal(found[0][name], other[name]) for other in found[1:] for name in found[0])
 
 
-def test_reference_gradcheck():
+def test_range_histogram_reference_passes_gradcheck():
     s = ray_scene(3, 6, 6)
     inputs = [getattr(s, name).double().requires_grad_() for name in TENSORS]
     inputs[0].data[:] = torch.tensor([[3.0, 3], [2, 4], [4, 1]])
@@ -81,7 +81,7 @@ def test_reference_gradcheck():
 
 
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
-def test_opcheck():
+def test_range_histogram_ops_pass_opcheck():
     s = ray_scene(8, 20, 10)
     inputs = [getattr(s, name).requires_grad_() for name in TENSORS]
     offsets, ids = s.lists()
@@ -92,7 +92,7 @@ def test_opcheck():
     torch.library.opcheck(ops.range_histogram_backward, (*plain, offsets, ids, None, torch.ones(20, 40), *rest))
 
 
-def test_wrong_arguments_are_refused():
+def test_range_histogram_rejects_invalid_arguments():
     s = ray_scene(5, 20, 20)
     inputs = [getattr(s, name) for name in TENSORS]
     lists = s.lists()

@@ -15,17 +15,17 @@ from tests.gsplat_core.ops.ray_scenes import INPUTS, assert_close, exact_contrib
 
 
 @pytest.mark.parametrize("channels", [0, 1, 3, 4, 8, 9, MAX_CHANNELS])
-def test_random_scene_for_any_number_of_channels(channels: int) -> None:
+def test_blend_rays_with_any_number_of_channels(channels: int) -> None:
     assert_close(ray_scene(300, channels=channels))
 
 
 @pytest.mark.parametrize("size", [(1, 1), (33, 50), (16, 16), (7, 100)])
 @pytest.mark.parametrize("count", [0, 1, 90])
-def test_any_image_size_and_few_splats(size: tuple[int, int], count: int) -> None:
+def test_blend_rays_of_any_image_size_and_few_splats(size: tuple[int, int], count: int) -> None:
     assert_close(ray_scene(count, *size))
 
 
-def test_opaque_and_thin_splats() -> None:
+def test_blend_rays_of_opaque_and_thin_splats() -> None:
     s = ray_scene(300)
     s.opacities[::2] = 1.0
     s.conics[1::5] = torch.tensor([1e-8, 0.0, 1e-8])
@@ -34,7 +34,7 @@ def test_opaque_and_thin_splats() -> None:
     assert_close(s)
 
 
-def test_values_that_are_not_finite_are_skipped_and_get_no_gradient() -> None:
+def test_blend_rays_skips_non_finite_splats_without_gradient() -> None:
     s, bad = with_bad_values(ray_scene(200))
     seen = assert_close(s)
     good = replace(s, **{name: getattr(s, name)[~bad] for name in INPUTS})
@@ -47,7 +47,7 @@ def test_values_that_are_not_finite_are_skipped_and_get_no_gradient() -> None:
             assert torch.equal(seen[name], value)
 
 
-def test_two_veils_before_a_wall() -> None:
+def test_blend_rays_of_two_translucent_layers_and_wall_in_closed_form() -> None:
     depths = [30.0, 40.0, 50.0]
     flat = [torch.tensor([z, 0, 0, 0, 0, 0, 0, 0, 1, 0.25]) for z in depths]
     one = torch.ones(3, 1)
@@ -65,7 +65,7 @@ def test_two_veils_before_a_wall() -> None:
 
 
 @pytest.mark.parametrize("name", ["values", "alphas", "depths", "medians"])
-def test_the_gradient_of_one_output_is_that_without_the_others(name: str) -> None:
+def test_blend_rays_gradients_of_outputs_are_independent(name: str) -> None:
     s, gradients = ray_scene(120), []
     for others in (0.0, None):
         inputs = [getattr(s, each).clone().requires_grad_() for each in INPUTS]
@@ -80,7 +80,7 @@ def test_the_gradient_of_one_output_is_that_without_the_others(name: str) -> Non
     assert any(each.any() for each in gradients[0])
 
 
-def test_the_same_bits_for_any_number_of_threads() -> None:
+def test_blend_rays_independent_of_thread_count() -> None:
     s = ray_scene(3000, 300, 200)
     threads = torch.get_num_threads()
     try:
@@ -95,7 +95,7 @@ def test_the_same_bits_for_any_number_of_threads() -> None:
 
 
 @pytest.mark.slow
-def test_the_reference_gradient_is_the_derivative() -> None:
+def test_blend_rays_reference_passes_gradcheck() -> None:
     s = ray_scene(6, 5, 4, channels=2)
     s.conics[:] = torch.tensor([0.1, 0.02, 0.15])  # no alpha crosses a cut-off within the differences
     s.means2d[:] = torch.rand(6, 2, generator=torch.Generator().manual_seed(1)) * 4
@@ -104,7 +104,7 @@ def test_the_reference_gradient_is_the_derivative() -> None:
     assert torch.autograd.gradcheck(lambda *t: reference.blend_rays(*t, 5, 4, *lists)[:4], inputs, atol=1e-4)
 
 
-def test_wrong_arguments_are_named() -> None:
+def test_blend_rays_names_invalid_arguments() -> None:
     s = ray_scene(5)
     rest = (s.width, s.height, *s.lists())
     tensors = [getattr(s, name) for name in INPUTS]
@@ -125,7 +125,7 @@ def test_wrong_arguments_are_named() -> None:
 
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor:UserWarning")  # raised by opcheck itself
 @pytest.mark.parametrize("limit", [(), (0.999,)])
-def test_ops_pass_opcheck(limit: tuple[float, ...]) -> None:
+def test_blend_rays_ops_pass_opcheck(limit: tuple[float, ...]) -> None:
     s = ray_scene(30, 20, 18)
     lists = s.lists()
     splats = [getattr(s, name).requires_grad_() for name in INPUTS]
@@ -153,13 +153,13 @@ def test_ops_pass_opcheck(limit: tuple[float, ...]) -> None:
 
 
 @pytest.mark.parametrize("count", [0, 1, 200])
-def test_contributions_are_the_largest_weights(count: int) -> None:
+def test_splat_contributions_are_largest_weights(count: int) -> None:
     s = ray_scene(count)
     seen = splat_contributions(s.means2d, s.conics, s.opacities, s.width, s.height, *s.lists())
     torch.testing.assert_close(seen.double(), exact_contributions(s), rtol=1e-4, atol=1e-4, check_dtype=False)
 
 
-def test_contribution_op_passes_opcheck() -> None:
+def test_splat_contributions_op_passes_opcheck() -> None:
     s = ray_scene(30, 20, 18)
     arguments = (*(getattr(s, name) for name in INPUTS), *s.lists(), s.width, s.height)
     torch.library.opcheck(torch.ops.gsplat_core.splat_contributions.default, arguments)

@@ -15,7 +15,7 @@ SIZES = [(37, 45), (3, 3), (5, 2), (1, 1), (2, 9), (0, 7), (70, 130)]
 
 @pytest.mark.parametrize("model", ["pinhole", "ortho", "fisheye"])
 @pytest.mark.parametrize("size", SIZES)
-def test_values_and_gradients_equal_the_reference(size, model):
+def test_ray_losses_values_and_gradients_equal_reference(size, model):
     seen, wanted = compared(size, model, "cpu", torch.float32), compared(size, model, "cpu", torch.float64)
     for name, value in wanted.items():
         scale = float(value.abs().max()) if value.numel() else 0.0
@@ -25,7 +25,7 @@ def test_values_and_gradients_equal_the_reference(size, model):
 
 
 @pytest.mark.parametrize("model", ["pinhole", "ortho"])
-def test_the_reference_is_differentiated_correctly(model):
+def test_ray_losses_reference_passes_gradcheck(model):
     depths, alphas, normals, known, tissue, K = planes((9, 11), torch.float64)
     depths = torch.where(depths > 0, depths, 0)
     leaves = [each.requires_grad_() for each in (depths, alphas, normals)]
@@ -33,7 +33,7 @@ def test_the_reference_is_differentiated_correctly(model):
     assert torch.autograd.gradcheck(lambda *each: reference.ray_normal_loss(*each, tissue, K, model), leaves)
 
 
-def test_nothing_is_compared_outside_of_tissue_and_known_depth():
+def test_ray_losses_zero_outside_tissue_and_known_depth():
     depths, alphas, normals, known, tissue, K = planes((20, 30))
     depths.requires_grad_()
     none = torch.zeros_like(tissue)
@@ -48,7 +48,7 @@ def test_nothing_is_compared_outside_of_tissue_and_known_depth():
     assert not gradient.any()
 
 
-def test_values_that_are_not_finite_are_not_compared_unless_they_belong_to_tissue():
+def test_ray_losses_ignore_non_finite_values_outside_tissue():
     depths, alphas, normals, known, tissue, K = planes((20, 30))
     clean = ray_normal_loss(depths, alphas, normals, tissue, K, "pinhole"), ray_depth_loss(depths, known, tissue)
     hidden = [torch.where(tissue, each, torch.nan) for each in (alphas, known)]
@@ -59,7 +59,7 @@ def test_values_that_are_not_finite_are_not_compared_unless_they_belong_to_tissu
     assert ray_normal_loss(unknown, alphas, torch.nan_to_num(normals), tissue, K, "pinhole").isfinite()
 
 
-def test_results_do_not_depend_on_the_number_of_threads():
+def test_ray_losses_independent_of_thread_count():
     results, threads = [], torch.get_num_threads()
     try:
         for count in (1, 3):
@@ -72,7 +72,7 @@ def test_results_do_not_depend_on_the_number_of_threads():
 
 
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor:UserWarning")  # raised by opcheck itself
-def test_opcheck():
+def test_ray_losses_pass_opcheck():
     depths, alphas, normals, known, tissue, K = planes((6, 8))
     leaves = [each.requires_grad_() for each in (depths, alphas, normals)]
     tissue = tissue.view(torch.uint8)
@@ -80,7 +80,7 @@ def test_opcheck():
     torch.library.opcheck(torch.ops.gsplat_core.ray_normal_loss.default, (*leaves, tissue, K, 0))
 
 
-def test_wrong_arguments_are_refused():
+def test_ray_losses_reject_invalid_arguments():
     depths, alphas, normals, known, tissue, K = planes((6, 8))
     with pytest.raises(InvalidInput, match="known must be"):
         ray_depth_loss(depths, known.T, tissue)

@@ -30,7 +30,7 @@ def scene(batch: tuple[int, ...] = (2,)):
 
 
 @pytest.mark.parametrize("model", ["pinhole", "ortho", "fisheye"])
-def test_the_steps_give_the_splats_of_the_fused_projection(model: str):
+def test_separate_projection_steps_equal_fused_projection(model: str):
     means, quats, scales, _, _, viewmats, K = scene()
     covars, _ = quat_scale_to_covar_preci(quats, scales)
     found, spread = proj(*world_to_cam(means, covars, viewmats), K, WIDTH, HEIGHT, model)
@@ -46,7 +46,7 @@ def test_the_steps_give_the_splats_of_the_fused_projection(model: str):
 
 
 @pytest.mark.parametrize("model", ["pinhole", "ortho", "fisheye"])
-def test_gradients_of_the_steps(model: str):
+def test_separate_projection_steps_pass_gradcheck(model: str):
     means, quats, scales, _, _, viewmats, K = (
         each[..., :3, :] if each.shape[-2:-1] == (N,) else each for each in scene(())
     )
@@ -57,7 +57,7 @@ def test_gradients_of_the_steps(model: str):
 
 
 @pytest.mark.parametrize("ranges", [[(0, 10**10)], [(0, 1), (1, 10**10)]])
-def test_the_listed_pairs_blend_to_the_picture(ranges: list[tuple[int, int]]):
+def test_accumulated_pairs_equal_rasterization(ranges: list[tuple[int, int]]):
     means, quats, scales, opacities, colors, viewmats, K = scene()
     tile = 4  # so that a tile's list has several batches
     expected, covered, meta = rasterization(
@@ -78,7 +78,7 @@ def test_the_listed_pairs_blend_to_the_picture(ranges: list[tuple[int, int]]):
     torch.testing.assert_close(alphas, covered, rtol=1e-4, atol=1e-5)
 
 
-def test_gradients_of_the_accumulated_picture_are_those_of_the_compositing():
+def test_accumulated_gradients_equal_compositing():
     means, quats, scales, opacities, colors, viewmats, K = scene(())
     leaves = [each.requires_grad_() for each in (means, quats, scales, opacities, colors)]
     weights = torch.rand(2, HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(1))
@@ -96,7 +96,7 @@ def test_gradients_of_the_accumulated_picture_are_those_of_the_compositing():
         torch.testing.assert_close(found, wanted, rtol=1e-3, atol=1e-3 * float(wanted.abs().max()))
 
 
-def test_no_pairs_make_a_black_picture():
+def test_accumulate_without_pairs_gives_black_image():
     nothing = torch.zeros(1, 0, 2), torch.zeros(1, 0, 3), torch.zeros(1, 0)
     starts, ids = torch.zeros(1, 1, 1, dtype=torch.int32), torch.zeros(0, dtype=torch.int32)
     pairs = rasterize_to_indices_in_range(0, 1, torch.ones(1, 8, 8), *nothing, 8, 8, 16, starts, ids)
@@ -104,7 +104,7 @@ def test_no_pairs_make_a_black_picture():
     assert image.shape == (1, 8, 8, 3) and not image.any() and not alphas.any()
 
 
-def test_shapes_are_checked():
+def test_separate_steps_reject_invalid_shapes():
     means, _, _, _, _, viewmats, K = scene(())
     covars = torch.eye(3).expand(N, 3, 3)
     with pytest.raises(InvalidInput, match=r"covars must be \[..., N, 3, 3\]"):

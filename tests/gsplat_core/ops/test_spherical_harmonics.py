@@ -33,7 +33,7 @@ def evaluate(function, degree, dirs, coeffs, masks, weights, dtype):
     ("shape", "coefficients"),
     [((37,), None), ((2, 3, 21), None), ((4, 19), (19,)), ((2, 3, 5), (2, 1, 5)), ((0,), None), ((0, 7), (7,))],
 )
-def test_matches_reference(assert_near, degree, masked, shape, coefficients):
+def test_spherical_harmonics_match_reference(assert_near, degree, masked, shape, coefficients):
     # One basis function more than the degree uses: its gradient is zero.
     dirs, coeffs, masks, weights = inputs(shape, (degree + 1) ** 2 + 1, degree, coefficients)
     masks = masks if masked else None
@@ -43,7 +43,7 @@ def test_matches_reference(assert_near, degree, masked, shape, coefficients):
         assert_near(actual, wanted, of_largest=1e-5)
 
 
-def test_bases_are_orthonormal():
+def test_spherical_harmonics_bases_are_orthonormal():
     nodes, weights = np.polynomial.legendre.leggauss(12)
     phi = np.arange(24) * math.pi / 12
     z, azimuth = np.meshgrid(nodes, phi, indexing="ij")
@@ -56,7 +56,7 @@ def test_bases_are_orthonormal():
     )
 
 
-def test_order_and_signs_are_the_fields():
+def test_spherical_harmonics_order_and_signs_match_published_files():
     """Each function's largest monomial where the published files (INRIA's, gsplat's) have it, with their sign."""
     x, y, z = 0.48, 0.6, 0.64
     bases = spherical_harmonics_bases(4, torch.tensor([x, y, z], dtype=torch.float64)).tolist()
@@ -80,7 +80,7 @@ def test_order_and_signs_are_the_fields():
 
 
 @pytest.mark.parametrize("function", [spherical_harmonics, reference.spherical_harmonics])
-def test_nothing_leaks_from_behind_a_mask(function):
+def test_spherical_harmonics_ignore_masked_values(function):
     dirs, coeffs, _, weights = inputs((20,), 16)
     masks = torch.ones(20, dtype=torch.bool)
     masks[[3, 8]] = False
@@ -92,7 +92,7 @@ def test_nothing_leaks_from_behind_a_mask(function):
         assert (result[masks] != 0).any()
 
 
-def test_degree_zero_takes_any_direction():
+def test_spherical_harmonics_of_degree_zero_accept_zero_direction():
     coeffs = torch.ones(2, 1, 3, requires_grad=True)
     dirs = torch.zeros(2, 3, requires_grad=True)
     out = spherical_harmonics(0, dirs, coeffs)
@@ -102,7 +102,7 @@ def test_degree_zero_takes_any_direction():
 
 
 @pytest.mark.parametrize("degree", range(5))
-def test_reference_gradcheck(degree):
+def test_spherical_harmonics_reference_passes_gradcheck(degree):
     dirs, coeffs, masks, _ = inputs((6,), 25)
     dirs, coeffs = dirs.double().requires_grad_(), coeffs.double().requires_grad_()
     assert torch.autograd.gradcheck(
@@ -112,7 +112,7 @@ def test_reference_gradcheck(degree):
 
 # opcheck itself reads .grad of tensors that are not leaves.
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
-def test_opcheck():
+def test_spherical_harmonics_ops_pass_opcheck():
     dirs, coeffs, masks, weights = inputs((2, 7), 16, coefficients=(7,))
     arguments = (3, dirs.requires_grad_(), coeffs.requires_grad_(), masks)
     torch.library.opcheck(torch.ops.gsplat_core.spherical_harmonics, arguments)
@@ -120,7 +120,7 @@ def test_opcheck():
     torch.library.opcheck(torch.ops.gsplat_core.spherical_harmonics_backward, arguments)
 
 
-def test_shared_coefficients_get_the_same_gradient_on_any_number_of_threads():
+def test_spherical_harmonics_shared_gradient_independent_of_thread_count():
     dirs, coeffs, masks, weights = inputs((3, 4000), 16, coefficients=(4000,))
     threads = torch.get_num_threads()
     try:
@@ -134,7 +134,7 @@ def test_shared_coefficients_get_the_same_gradient_on_any_number_of_threads():
         assert torch.equal(one, three)
 
 
-def test_the_arguments_of_gsplat_1_6_are_refused_with_those_that_give_its_result():
+def test_spherical_harmonics_reject_gsplat_1_6_arguments_with_equivalent():
     random = torch.Generator().manual_seed(0)
     means, coeffs = (torch.randn(*shape, generator=random) for shape in ((5, 3), (5, 9, 3)))
     viewmats = torch.eye(4).repeat(2, 1, 1)
@@ -145,7 +145,7 @@ def test_the_arguments_of_gsplat_1_6_are_refused_with_those_that_give_its_result
     assert spherical_harmonics(2, directions, coeffs).shape == (2, 5, 3)
 
 
-def test_wrong_arguments_are_refused():
+def test_spherical_harmonics_reject_invalid_arguments():
     dirs, coeffs, masks, _ = inputs((5,), 16)
     for arguments, message in [
         ((3, dirs[:, :2], coeffs), r"dirs must be \[..., 3\], got \[5, 2\]"),

@@ -26,7 +26,7 @@ def depths_by_coefficients(means, quats, scales, viewmat, K, pixels, by=referenc
 
 
 @pytest.mark.parametrize("flatness", [1.0, 1e-3])
-def test_coefficients_give_the_midpoint_of_the_chord_and_its_gradient(flatness: float) -> None:
+def test_splat_rays_coefficients_give_chord_midpoint_and_gradient(flatness: float) -> None:
     means, quats, scales = gaussians(40)
     scales[:, 0] *= flatness
     K, viewmat = intrinsics(70, 45), view()
@@ -48,7 +48,7 @@ def test_coefficients_give_the_midpoint_of_the_chord_and_its_gradient(flatness: 
     assert bool(((depth - centre).abs() > 2.999 * scales.amax(1)).any())  # the limit is reached
 
 
-def test_single_precision_is_accurate_for_flat_splats() -> None:
+def test_splat_rays_single_precision_accurate_for_flat_splats() -> None:
     means, quats, scales = gaussians(200)
     scales[:, 1] = 1e-3 * scales[:, 0]
     K = intrinsics(640, 512)
@@ -62,7 +62,7 @@ def test_single_precision_is_accurate_for_flat_splats() -> None:
     assert float(((seen - wanted) / wanted).abs().max()) < 1e-3
 
 
-def test_other_projections() -> None:
+def test_splat_rays_of_fisheye_and_ortho_in_closed_form() -> None:
     means, quats, scales = gaussians(30)
     K, eye = intrinsics(70, 45), torch.eye(4, dtype=torch.float64)
     single = [tensor.float() for tensor in (means, quats, scales, eye, K)]
@@ -82,7 +82,7 @@ def test_other_projections() -> None:
     torch.testing.assert_close(variance[0], 1 / precision[:, 2, 2], rtol=1e-4, atol=1e-5)
 
 
-def test_splats_behind_the_camera_have_no_gradient() -> None:
+def test_splat_rays_without_gradient_behind_camera() -> None:
     means, quats, scales = (tensor.float() for tensor in gaussians(5))
     means[0, 2], means[1, 2], quats[2], scales[3, 1] = -3, 0, 0, math.nan
     inputs = [tensor.requires_grad_() for tensor in (means, quats, scales)]
@@ -94,7 +94,7 @@ def test_splats_behind_the_camera_have_no_gradient() -> None:
 
 
 @pytest.mark.parametrize("count", [0, 1, 7, 500])
-def test_values_and_gradients_equal_the_reference(count: int) -> None:
+def test_splat_rays_values_and_gradients_equal_reference(count: int) -> None:
     seen, wanted = splat_results(count, "cpu"), splat_results(count, None)
     for name, value in wanted.items():
         error = (seen[name].double() - value).abs().max(0).values if count else torch.zeros(1)
@@ -102,7 +102,7 @@ def test_values_and_gradients_equal_the_reference(count: int) -> None:
         assert bool((error <= 2e-4 * scale + 1e-6).all()), (name, error / scale)
 
 
-def test_the_reference_gradient_is_the_derivative() -> None:
+def test_splat_rays_reference_passes_gradcheck() -> None:
     inputs = [tensor.requires_grad_() for tensor in gaussians(4)]
     camera = view(), intrinsics(70, 45)
     function = lambda *tensors: (
@@ -112,7 +112,7 @@ def test_the_reference_gradient_is_the_derivative() -> None:
     assert torch.autograd.gradcheck(function, inputs)
 
 
-def test_equal_scales_share_the_gradient_of_the_reach() -> None:
+def test_splat_rays_equal_scales_share_reach_gradient() -> None:
     scales = torch.full((1, 3), 2.0, requires_grad=True)
     tensors = torch.tensor([[0.0, 0, 10]]), torch.tensor([[1.0, 0, 0, 0]]), scales
     rays = splat_rays(*tensors, torch.eye(4), intrinsics(70, 45).float(), "pinhole").rays
@@ -120,7 +120,7 @@ def test_equal_scales_share_the_gradient_of_the_reach() -> None:
     torch.testing.assert_close(gradient, torch.ones(1, 3))
 
 
-def test_wrong_arguments_are_named() -> None:
+def test_splat_rays_names_invalid_arguments() -> None:
     means, quats, scales = (tensor.float() for tensor in gaussians(3))
     camera = torch.eye(4), intrinsics(70, 45).float(), "pinhole"
     with pytest.raises(InvalidInput, match="quats"):
@@ -130,7 +130,7 @@ def test_wrong_arguments_are_named() -> None:
 
 
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor:UserWarning")  # raised by opcheck itself
-def test_ops_pass_opcheck() -> None:
+def test_splat_rays_ops_pass_opcheck() -> None:
     inputs = [tensor.float().requires_grad_() for tensor in gaussians(9)]
     camera = torch.eye(4), intrinsics(70, 45).float()
     torch.library.opcheck(torch.ops.gsplat_core.splat_rays.default, (*inputs, *camera))

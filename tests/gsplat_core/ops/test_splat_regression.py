@@ -26,7 +26,7 @@ def evaluate(function, points, *splats):
 @pytest.mark.parametrize("dims", [1, 2, 3, 4])
 @pytest.mark.parametrize("channels", [1, 3, 6])
 @pytest.mark.parametrize("points", [1, 17, 2500])
-def test_values_and_gradients_equal_the_reference(assert_near, dims, channels, points):
+def test_splat_regression_values_and_gradients_equal_reference(assert_near, dims, channels, points):
     ours = evaluate(splat_regression, *scene(points, 7, dims, channels))
     exact = evaluate(reference.splat_regression, *(t.double() for t in scene(points, 7, dims, channels)))
     for actual, expected in zip(ours, exact, strict=True):
@@ -34,7 +34,7 @@ def test_values_and_gradients_equal_the_reference(assert_near, dims, channels, p
 
 
 @pytest.mark.parametrize("dims", [1, 2, 3, 4])
-def test_closed_forms_equal_autograd(dims):
+def test_splat_regression_closed_form_gradients_equal_autograd(dims):
     points, *splats = scene(40, 5, dims, 2, torch.float64)
     splats = [t.requires_grad_() for t in splats]
     target = torch.randn(40, 2, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
@@ -45,20 +45,20 @@ def test_closed_forms_equal_autograd(dims):
         torch.testing.assert_close(actual, expected, rtol=1e-10, atol=1e-10)
 
 
-def test_the_integral_of_a_splat_is_its_value():
+def test_splat_regression_integral_of_splat_equals_value():
     x = torch.linspace(-4, 5, 4001, dtype=torch.float32)[:, None]
     found = splat_regression(x, torch.tensor([[0.5]]), torch.tensor([[[-0.3]]]), torch.tensor([[2.0, -1.0]]))
     torch.testing.assert_close(found.sum(0) * 9 / 4000, torch.tensor([2.0, -1.0]), rtol=1e-4, atol=0)
 
 
 @pytest.mark.parametrize(("points", "splats", "channels"), [(0, 3, 2), (5, 0, 2), (5, 3, 0)])
-def test_empty_inputs(points, splats, channels):
+def test_splat_regression_with_empty_inputs(points, splats, channels):
     out = evaluate(splat_regression, *scene(points, splats, 2, channels))
     assert [tuple(t.shape) for t in out] == [(points, channels), (splats, 2), (splats, 2, 2), (splats, channels)]
     assert all(not t.any() for t in out)
 
 
-def test_unusable_splats_and_points_have_no_effect():
+def test_splat_regression_ignores_unusable_splats_and_points():
     points, centres, factors, values = scene()
     wanted = evaluate(splat_regression, points, centres[3:], factors[3:], values[3:])
     factors[0] = torch.tensor([[1.0, 2], [2, 4]])
@@ -75,7 +75,7 @@ def test_unusable_splats_and_points_have_no_effect():
     assert all(t.isfinite().all() for t in found)
 
 
-def test_results_do_not_depend_on_the_number_of_threads():
+def test_splat_regression_independent_of_thread_count():
     found = []
     for threads in (1, 2, 3):
         before = torch.get_num_threads()
@@ -88,7 +88,7 @@ def test_results_do_not_depend_on_the_number_of_threads():
         assert all(torch.equal(a, b) for a, b in zip(found[0], other, strict=True))
 
 
-def test_reference_gradcheck():
+def test_splat_regression_reference_passes_gradcheck():
     points, *splats = scene(6, 3, 2, 2, torch.float64)
     leaves = [t.requires_grad_() for t in splats]
     assert torch.autograd.gradcheck(lambda *s: reference.splat_regression(points, *s), leaves)
@@ -96,7 +96,7 @@ def test_reference_gradcheck():
 
 # opcheck itself reads .grad of tensors that are not leaves.
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
-def test_opcheck():
+def test_splat_regression_ops_pass_opcheck():
     points, *splats = scene()
     leaves = [t.requires_grad_() for t in splats]
     torch.library.opcheck(torch.ops.gsplat_core.splat_regression, (points, *leaves))
@@ -104,7 +104,7 @@ def test_opcheck():
     torch.library.opcheck(torch.ops.gsplat_core.splat_regression_backward, (points, *plain, torch.ones(60, 3)))
 
 
-def test_wrong_arguments_are_refused():
+def test_splat_regression_rejects_invalid_arguments():
     points, centres, factors, values = scene()
     for arguments, message in [
         ((torch.rand(5, 5), centres, factors, values), r"points must be \[n, d\] with d = 1 to 4, got \[5, 5\]"),

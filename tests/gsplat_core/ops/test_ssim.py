@@ -36,13 +36,13 @@ def images(shape, seed=0):
     return (target + 0.2 * torch.randn(shape, generator=generator)), target
 
 
-def test_the_window_is_a_normalised_gaussian():
+def test_ssim_window_is_normalised_gaussian():
     window = gaussian_window()
     assert window.sum().item() == pytest.approx(1)
     assert (window[5] / window[6]).log().item() == pytest.approx(0.5 / 1.5**2)
 
 
-def test_the_reference_by_hand_on_one_pixel():
+def test_ssim_reference_on_one_pixel_in_closed_form():
     # One pixel in zeros: each moment is the centre weight times the pixel's.
     weight = gaussian_window()[5].item() ** 2
     x, y = 0.5, 0.8
@@ -53,13 +53,13 @@ def test_the_reference_by_hand_on_one_pixel():
     assert reference_ssim_map(x * one, y * one).item() == pytest.approx(expected)
 
 
-def test_gradcheck_of_the_reference():
+def test_ssim_reference_passes_gradcheck():
     image, target = (t.double().requires_grad_() for t in images((6, 7, 2)))
     assert torch.autograd.gradcheck(reference_ssim_map, (image, target), fast_mode=True)
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_values_and_gradients_equal_the_reference(shape):
+def test_ssim_map_values_and_gradients_equal_reference(shape):
     image, target = images(shape)
     weights = torch.randn(shape, generator=torch.Generator().manual_seed(5))
     results = []
@@ -73,7 +73,7 @@ def test_values_and_gradients_equal_the_reference(shape):
         torch.testing.assert_close(ours.double() / scale, expected / scale, rtol=0, atol=1e-4)
 
 
-def test_smooth_dark_images_where_variances_cancel():
+def test_ssim_map_of_smooth_dark_images_equals_reference():
     ramp = torch.linspace(0.02, 0.05, 40 * 60).reshape(40, 60, 1).expand(-1, -1, 3).contiguous()
     other = ramp + 0.001
     torch.testing.assert_close(
@@ -81,13 +81,13 @@ def test_smooth_dark_images_where_variances_cancel():
     )
 
 
-def test_inputs_need_not_be_contiguous():
+def test_ssim_map_accepts_non_contiguous_inputs():
     image, target = images((3, 40, 52))
     x, y = image.permute(1, 2, 0), target.permute(1, 2, 0)
     assert torch.equal(ssim_map(x, y), ssim_map(x.contiguous(), y.contiguous()))
 
 
-def test_the_number_of_threads_does_not_change_a_bit(two_threads):
+def test_ssim_independent_of_thread_count(two_threads):
     image, target = images((200, 90, 3))
 
     def run():
@@ -107,7 +107,7 @@ def test_the_number_of_threads_does_not_change_a_bit(two_threads):
 # opcheck itself reads .grad of tensors that are not leaves.
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
 @pytest.mark.parametrize("differentiable", [False, True])
-def test_opcheck(differentiable):
+def test_ssim_ops_pass_opcheck(differentiable):
     image, target = images((12, 9, 3))
     torch.library.opcheck(torch.ops.gsplat_core.ssim_map, (image.requires_grad_(differentiable), target))
     torch.library.opcheck(torch.ops.gsplat_core.ssim_map_backward, (target, image.detach(), target))
@@ -115,7 +115,7 @@ def test_opcheck(differentiable):
     torch.library.opcheck(torch.ops.gsplat_core.ssim_mean_backward, (torch.ones(()), image.detach(), target, 2))
 
 
-def test_what_it_cannot_take_is_refused():
+def test_ssim_map_rejects_invalid_inputs():
     image, target = images((4, 5, 3))
     with pytest.raises(InvalidInput, match=r"gsplat_core\.reference"):
         ssim_map(image.double(), target.double())
@@ -140,7 +140,7 @@ PICTURES = [
 @pytest.mark.parametrize("padding", ["same", "valid"])
 @pytest.mark.parametrize("layout", ["planes", "pixels"])
 @pytest.mark.parametrize("shape", PICTURES)
-def test_fused_ssim_is_the_mean_of_the_map_of_every_picture(shape, layout, padding):
+def test_fused_ssim_equals_mean_of_ssim_maps(shape, layout, padding):
     pair = [t.movedim(-1, 0).reshape(shape) for t in images((*shape[2:], shape[0] * shape[1]), seed=2)]
     if layout == "pixels":
         pair = [t.movedim(1, -1).contiguous().movedim(-1, 1) for t in pair]
@@ -158,7 +158,7 @@ def test_fused_ssim_is_the_mean_of_the_map_of_every_picture(shape, layout, paddi
 
 
 @pytest.mark.parametrize("border", [0, 1, 5, 8, 15])
-def test_the_border_counts_neither_in_the_mean_nor_in_the_gradient(border):
+def test_ssim_mean_excludes_border_from_value_and_gradient(border):
     image, target = (t.requires_grad_() for t in images((31, 720, 3)))
     inner = ssim_map(image, target)[border : 31 - border, border : 720 - border]
     mean = torch.ops.gsplat_core.ssim_mean(image.detach(), target.detach(), border)
@@ -170,7 +170,7 @@ def test_the_border_counts_neither_in_the_mean_nor_in_the_gradient(border):
         torch.testing.assert_close(found / wanted.abs().max(), wanted / wanted.abs().max(), rtol=0, atol=2e-6)
 
 
-def test_fused_ssim_takes_the_gradients_that_are_wanted():
+def test_fused_ssim_computes_requested_gradients_only():
     first, second = (torch.rand(2, 3, 14, 17, generator=torch.Generator().manual_seed(seed)) for seed in (0, 1))
     both = [t.clone().requires_grad_() for t in (first, second)]
     gradients = torch.autograd.grad(fused_ssim(*both), both)
@@ -185,7 +185,7 @@ def test_fused_ssim_takes_the_gradients_that_are_wanted():
         differentiable.sum().backward()
 
 
-def test_fused_ssim_refuses_what_it_cannot_take():
+def test_fused_ssim_rejects_invalid_inputs():
     picture = torch.zeros(2, 3, 14, 17)
     with pytest.raises(InvalidInput, match="'same' or 'valid'"):
         fused_ssim(picture, picture, "full")

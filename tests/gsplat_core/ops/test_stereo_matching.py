@@ -10,7 +10,7 @@ from tests.gsplat_core.ops.stereo_cases import SHIFT_PX, every_case, pair
 
 
 @every_case
-def test_all_is_that_of_the_reference(case):
+def test_stereo_matching_equals_reference(case):
     kind, height, width, lowest, count = case
     left, right = pair(kind, height, width)
     found = match_disparities(left, right, lowest, count)
@@ -19,7 +19,7 @@ def test_all_is_that_of_the_reference(case):
     assert torch.equal(found.one_surface, one_surface)
 
 
-def test_a_shift_is_found_and_what_only_one_eye_sees_is_not():
+def test_stereo_matching_finds_shift_except_in_occluded_columns():
     left, right = pair("texture", 64, 101)
     found = match_disparities(left, right, 0, 16)
     known = found.sixteenths != UNKNOWN
@@ -29,7 +29,7 @@ def test_a_shift_is_found_and_what_only_one_eye_sees_is_not():
     assert found.one_surface[10:-10, 30:-10].all()
 
 
-def test_a_jump_is_near_no_one_surface():
+def test_stereo_matching_marks_disparity_jump_as_not_one_surface():
     left, right = pair("steps", 90, 160)
     found = match_disparities(left, right, 0, 32)
     middle = found.one_surface[60, 70:]
@@ -39,25 +39,25 @@ def test_a_jump_is_near_no_one_surface():
         assert ((found.sixteenths[known].float() / 16 - disparity).abs() < 0.5).float().mean() > 0.1
 
 
-def test_of_noise_hardly_anything_is_known():
+def test_stereo_matching_of_noise_is_mostly_unknown():
     assert (match_disparities(*pair("noise", 60, 80), -8, 32).sixteenths == UNKNOWN).float().mean() > 0.8
 
 
 @pytest.mark.parametrize("shape", [(0, 5), (5, 0), (0, 0)])
-def test_no_pixels(shape):
+def test_stereo_matching_without_pixels(shape):
     nothing = torch.zeros(shape, dtype=torch.uint8)
     found = match_disparities(nothing, nothing, 0, 16)
     assert found.sixteenths.shape == found.one_surface.shape == shape
 
 
-def test_inputs_need_not_be_contiguous():
+def test_stereo_matching_accepts_non_contiguous_inputs():
     left, right = pair("texture", 40, 52)
     strided = [torch.stack([each, 255 - each], dim=2)[..., 0] for each in (left, right)]
     assert not strided[0].is_contiguous()
     assert torch.equal(match_disparities(*strided, 0, 16).sixteenths, match_disparities(left, right, 0, 16).sixteenths)
 
 
-def test_the_number_of_threads_changes_nothing():
+def test_stereo_matching_independent_of_thread_count():
     left, right = pair("steps", 150, 140)
     before = torch.get_num_threads()
     try:
@@ -72,11 +72,11 @@ def test_the_number_of_threads_changes_nothing():
         assert torch.equal(found[0].one_surface, other.one_surface)
 
 
-def test_opcheck():
+def test_stereo_matching_passes_opcheck():
     torch.library.opcheck(torch.ops.gsplat_core.match_disparities, (*pair("texture", 12, 20), 0, 16))
 
 
-def test_what_it_cannot_take_is_refused():
+def test_stereo_matching_rejects_invalid_inputs():
     left, right = pair("texture", 12, 20)
     with pytest.raises(InvalidInput, match="multiple of 16 up to 256"):
         match_disparities(left, right, 0, 272)

@@ -31,7 +31,7 @@ METHODS = pytest.mark.parametrize("method", ["fragments", "points"])
 
 @METHODS
 @pytest.mark.parametrize("supersampling", [1, 2])
-def test_samples_have_the_expected_mean_and_variance(method, supersampling):
+def test_stochastic_samples_have_expected_mean_and_variance(method, supersampling):
     samples = 512 if method == "points" else 2048
     gaussians = random_scene(largest=0.15)
     sums = sampled(raw(gaussians), method=method, samples=samples, supersampling=supersampling)
@@ -45,7 +45,7 @@ def test_samples_have_the_expected_mean_and_variance(method, supersampling):
     assert z.abs().max() < 5.5
 
 
-def test_expected_points_follow_tiny_and_huge_splats():
+def test_stochastic_points_of_tiny_and_huge_splats_have_expected_mean():
     # The huge splats are drawn fragment by fragment, because most of their points are outside the picture.
     gaussians = random_scene(12, smallest=0.001, largest=0.003).append(random_scene(3, smallest=30, largest=60, seed=1))
     gaussians = dataclasses.replace(gaussians, logit_opacities=gaussians.logit_opacities.clamp_max(0) - 1)
@@ -54,7 +54,7 @@ def test_expected_points_follow_tiny_and_huge_splats():
     assert len(z) > 1000 and abs(z.mean()) < 4 * math.sqrt(5 / len(z)) and z.abs().max() < 5.5
 
 
-def test_the_expectation_of_fragments_is_alpha_blending():
+def test_expected_fragments_equal_alpha_blending():
     gaussians = random_scene(30)
     gaussians = dataclasses.replace(gaussians, logit_opacities=gaussians.logit_opacities - 3).to(dtype=torch.float64)
     viewmat, K = CAMERA.matrices(gaussians.device, torch.float64)
@@ -67,7 +67,7 @@ def test_the_expectation_of_fragments_is_alpha_blending():
     torch.testing.assert_close(moments.mean[..., 3], alphas[0, ..., 0], atol=1e-12, rtol=0)
 
 
-def test_dilogarithm_has_its_known_values():
+def test_dilogarithm_known_values():
     x = torch.tensor([0.0, 0.5, 1.0], dtype=torch.float64)
     known = [0, torch.pi**2 / 12 - math.log(2) ** 2 / 2, torch.pi**2 / 6]
     torch.testing.assert_close(dilogarithm(x), torch.tensor(known, dtype=torch.float64), atol=1e-9, rtol=0)
@@ -81,7 +81,7 @@ def test_poisson_draws_are_exact():
 
 
 @METHODS
-def test_psnr_grows_by_3_db_per_doubling(method):
+def test_stochastic_psnr_grows_3_db_per_doubling_of_samples(method):
     gaussians = random_scene(largest=0.1)
     wanted = MOMENTS[method](gaussians.to(dtype=torch.float64), CAMERA).mean[..., :3]
     psnr = []
@@ -93,7 +93,7 @@ def test_psnr_grows_by_3_db_per_doubling(method):
 
 
 @METHODS
-def test_permuted_and_culled_splats_give_the_same_bytes(method):
+def test_stochastic_samples_independent_of_order_and_culling(method):
     gaussians = random_scene(200)
     everything = sampled(raw(gaussians), method=method, samples=6)
     assert torch.equal(everything, sampled(raw(gaussians), method=method, samples=6))
@@ -111,7 +111,7 @@ def test_permuted_and_culled_splats_give_the_same_bytes(method):
 
 @METHODS
 @pytest.mark.parametrize("threads", [1, 2])
-def test_neither_queue_nor_threads_nor_calls_change_the_bytes(method, threads):
+def test_stochastic_samples_independent_of_queue_threads_and_calls(method, threads):
     scene = raw(random_scene(3000, largest=0.1))
     wanted = sampled(scene, method=method, samples=7)
     before = torch.get_num_threads()
@@ -127,7 +127,7 @@ def test_neither_queue_nor_threads_nor_calls_change_the_bytes(method, threads):
 
 
 @METHODS
-def test_covariances_draw_the_same_picture_as_rotations_and_scales(method):
+def test_stochastic_covariances_equal_rotations_and_scales(method):
     gaussians = random_scene()
     covars, _ = quat_scale_to_covar_preci(gaussians.quats, gaussians.scales, compute_preci=False, triu=True)
     scene = SplatScene(means=gaussians.means, covars=covars, opacities=gaussians.opacities, sh=gaussians.sh)
@@ -138,7 +138,7 @@ def test_covariances_draw_the_same_picture_as_rotations_and_scales(method):
 
 @pytest.mark.parametrize("model", ["pinhole", "ortho", "fisheye"])
 @METHODS
-def test_every_camera_model(method, model):
+def test_stochastic_samples_of_every_camera_model(method, model):
     camera = dataclasses.replace(CAMERA, model=model)
     if model == "ortho":
         camera = dataclasses.replace(camera, K=camera.K * torch.tensor([[0.25, 1, 1], [1, 0.25, 1], [1, 1, 1]]).numpy())
@@ -149,7 +149,7 @@ def test_every_camera_model(method, model):
 
 
 @pytest.mark.parametrize("covariances", [False, True])
-def test_order_by_pixel_gives_the_depth_of_a_slanted_plane(covariances):
+def test_stochastic_pixel_order_gives_depth_of_slanted_plane(covariances):
     # One flat, opaque splat at 4 units, turned by 40 degrees about y.
     angle = math.radians(40)
     gaussians = Gaussians(
@@ -175,7 +175,7 @@ def test_order_by_pixel_gives_the_depth_of_a_slanted_plane(covariances):
 
 
 @METHODS
-def test_hostile_values_are_skipped(method):
+def test_stochastic_sampling_skips_non_finite_splats(method):
     gaussians = random_scene(40)
     wanted = sampled(raw(gaussians), method=method, samples=4)
     bad = random_scene(12, seed=2)
@@ -193,13 +193,13 @@ def test_hostile_values_are_skipped(method):
 
 
 @METHODS
-def test_an_empty_scene_is_empty(method):
+def test_stochastic_sampling_of_empty_scene(method):
     assert not sampled(raw(random_scene(0)), method=method, samples=4).any()
     picture = picture_of(new_sums(CAMERA, "cpu"), 4, torch.tensor([0.1, 0.2, 0.3]))
     assert torch.allclose(picture.image, torch.tensor([0.1, 0.2, 0.3])) and not picture.depth.any()
 
 
-def test_opcheck():
+def test_stochastic_ops_pass_opcheck():
     options = [CAMERA.width_px, CAMERA.height_px, 0, 0, 0, 0, 2, 1, 0, 1 << 20]
     viewmat, K = CAMERA.matrices(torch.device("cpu"))
     arguments = (list(raw(random_scene(5))), viewmat, K, new_sums(CAMERA, "cpu"), options)
@@ -207,7 +207,7 @@ def test_opcheck():
     torch.library.opcheck(torch.ops.gsplat_core.poisson_draws.default, (RATES, 3, 0))
 
 
-def test_wrong_arguments_are_refused():
+def test_stochastic_sampling_rejects_invalid_arguments():
     scene = raw(random_scene(5))
     sums = new_sums(CAMERA, "cpu")
     fisheye = dataclasses.replace(CAMERA, model="fisheye")

@@ -41,7 +41,7 @@ def exact(points: Tensor, flow: Tensor, before: Camera, after: Camera, arrived: 
 @pytest.mark.parametrize("arrived", [False, True])
 @pytest.mark.parametrize("count", [0, 1, 15, 17, 5000])
 @pytest.mark.parametrize("cells", [(1, 1), (1, 7), (12, 16), (48, 64)])
-def test_it_is_what_plain_torch_computes(count: int, cells: tuple[int, int], arrived: bool) -> None:
+def test_surface_motion_equals_reference(count: int, cells: tuple[int, int], arrived: bool) -> None:
     points, flow = scene(count, cells, torch.float32)
     seen = surface_motion(points, flow, BEFORE, AFTER, arrived=arrived)
     wanted = exact(points, flow, BEFORE, AFTER, arrived)
@@ -52,7 +52,7 @@ def test_it_is_what_plain_torch_computes(count: int, cells: tuple[int, int], arr
 
 
 @pytest.mark.parametrize("arrived", [False, True])
-def test_points_that_no_picture_shows_stay(arrived: bool) -> None:
+def test_surface_motion_zero_for_points_outside_view(arrived: bool) -> None:
     points = torch.tensor(
         [[0, 0, -50], [0, 0, 0], [1e30, 0, 1], [math.nan, 0, 50], [math.inf, 0, 50], [0, 0, math.nan], [900, 0, 50]],
         dtype=torch.float32,
@@ -61,7 +61,7 @@ def test_points_that_no_picture_shows_stay(arrived: bool) -> None:
     assert not surface_motion(points, flow, BEFORE, BEFORE, arrived=arrived).any()
 
 
-def test_flow_that_is_no_number_stays_where_it_is() -> None:
+def test_surface_motion_nan_flow_affects_nearby_points_only() -> None:
     points = torch.tensor([[-10.0, -5.0, 50.0], [10.0, 5.0, 50.0]])
     flow = torch.ones(12, 16, 2)
     flow[:, 8:] = math.nan
@@ -70,7 +70,7 @@ def test_flow_that_is_no_number_stays_where_it_is() -> None:
     assert motion[1].isnan().any()
 
 
-def test_float32_on_the_cpu_takes_the_op_and_the_rest_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_surface_motion_uses_op_for_cpu_float32_without_gradient_only(monkeypatch: pytest.MonkeyPatch) -> None:
     points, flow = scene(9, dtype=torch.float32)
     calls: list[bool] = []
 
@@ -87,14 +87,14 @@ def test_float32_on_the_cpu_takes_the_op_and_the_rest_does_not(monkeypatch: pyte
     assert calls == [False, True]
 
 
-def test_the_op_passes_opcheck() -> None:
+def test_surface_motion_op_passes_opcheck() -> None:
     points, flow = scene(20, dtype=torch.float32)
     view = [*BEFORE.world_to_camera[:3].ravel().tolist(), 70.0, 70.0, 32.0, 24.0, 64.0, 48.0]
     for arrived in (False, True):
         torch.library.opcheck(torch.ops.gsplat_core.surface_motion.default, (points, flow, view, view, arrived))
 
 
-def test_what_it_cannot_take_is_refused() -> None:
+def test_surface_motion_rejects_invalid_inputs() -> None:
     points, flow = scene(3, dtype=torch.float32)
     ortho = Camera(BEFORE.K, 64, 48, model="ortho")
     with pytest.raises(InvalidInput, match="pinhole"):
@@ -122,7 +122,7 @@ def exact_path(points: Tensor, flows: Tensor, cameras: list[Camera]) -> Tensor:
 
 @pytest.mark.parametrize(("steps", "count"), [(0, 5), (1, 0), (1, 1), (3, 17), (20, 3000)])
 @pytest.mark.parametrize("cells", [(1, 1), (12, 16)])
-def test_a_path_is_the_motion_through_each_picture(steps: int, count: int, cells: tuple[int, int]) -> None:
+def test_surface_path_equals_motion_through_each_image(steps: int, count: int, cells: tuple[int, int]) -> None:
     points, flows, cameras = path_scene(steps, count, cells)
     found, wanted = surface_path(points, flows, cameras), exact_path(points, flows, cameras)
     assert found.shape == (count, steps, 3)
@@ -132,14 +132,14 @@ def test_a_path_is_the_motion_through_each_picture(steps: int, count: int, cells
     assert steps < 20 or (found - points[:, None]).abs().amax(dim=(1, 2)).median() > 0.1
 
 
-def test_points_that_no_picture_shows_stay_on_their_path() -> None:
+def test_surface_path_keeps_points_outside_view() -> None:
     _, flows, cameras = path_scene(3, 1)
     points = torch.tensor([[0, 0, -50], [math.nan, 0, 50], [900, 0, 50]], dtype=torch.float32)
     found = surface_path(points, flows, cameras)
     torch.testing.assert_close(found, points[:, None].expand(-1, 3, -1), equal_nan=True)
 
 
-def test_the_path_passes_opcheck_and_refuses_other_input() -> None:
+def test_surface_path_passes_opcheck_and_rejects_invalid_inputs() -> None:
     points, flows, cameras = path_scene(2, 20)
     views = torch.rand(3, 18) + 1
     torch.library.opcheck(torch.ops.gsplat_core.surface_path.default, (points, flows, views))

@@ -21,50 +21,50 @@ def assert_close(scene: BlendScene, *, absgrad: bool = False, max_alpha: float =
 
 
 @pytest.mark.parametrize("channels", [1, 2, 3, 5, 9, 16, 35])
-def test_any_number_of_channels(channels: int) -> None:
+def test_surfel_blending_with_any_number_of_channels(channels: int) -> None:
     s = surfel_scene(25, 18, 10, channels=channels)
     assert_close(blend_scene(s, backgrounds=torch.rand(1, channels, dtype=torch.float64)), absgrad=channels <= 16)
 
 
 @pytest.mark.parametrize(("tile_size", "size"), [(4, (9, 7)), (16, (1, 1)), (20, (33, 20)), (33, (20, 40))])
-def test_any_tile_and_image_size(tile_size: int, size: tuple[int, int]) -> None:
+def test_surfel_blending_with_any_tile_and_image_size(tile_size: int, size: tuple[int, int]) -> None:
     s = surfel_scene(25, *size)
     assert_close(blend_scene(s, tile_size=tile_size, backgrounds=torch.rand(1, 4, dtype=torch.float64)))
 
 
 @pytest.mark.parametrize(("batch", "cameras"), [((), 3), ((2,), 2), ((0,), 1)])
-def test_leading_dimensions(batch: tuple[int, ...], cameras: int) -> None:
+def test_surfel_blending_with_leading_dimensions(batch: tuple[int, ...], cameras: int) -> None:
     s = blend_scene(surfel_scene(20, 17, 10, batch=batch, cameras=cameras))
     seen = assert_close(s) if 0 not in batch else s.run()
     for name, size in zip(BLENDED, (4, 1, 3, 1, 1), strict=True):
         assert seen[name].shape == (*batch, cameras, 10, 17, size)
 
 
-def test_no_surfels() -> None:
+def test_surfel_blending_without_surfels() -> None:
     assert_close(blend_scene(surfel_scene(0)))
 
 
-def test_opaque_surfels_stop_the_pixel_and_pass_no_gradient_at_the_ceiling() -> None:
+def test_surfel_blending_of_opaque_surfels_stops_pixel() -> None:
     s = surfel_scene(100, 16, 16, scale=0.5)
     s.opacities[::2] = 1.0
     for max_alpha in (0.99, 0.999):
         assert assert_close(blend_scene(s), max_alpha=max_alpha)["alphas"].max() > 0.999
 
 
-def test_masked_tiles_show_only_the_background() -> None:
+def test_surfel_blending_masked_tiles_show_background_only() -> None:
     s = surfel_scene(40, 40, 20)
     masks = torch.tensor([[[True, False, True], [False, True, True]]])
     seen = assert_close(blend_scene(s, masks=masks, backgrounds=torch.rand(1, 4, dtype=torch.float64)))
     assert not seen["alphas"][0, :16, 16:32].any()
 
 
-def test_distant_depths_keep_their_distortion() -> None:
+def test_surfel_blending_distortion_of_distant_depths() -> None:
     s = blend_scene(surfel_scene(60))
     s.colors[..., -1] = (1000 + s.colors[..., -1]).float().double()
     assert_close(s)
 
 
-def test_two_surfels_in_closed_form() -> None:
+def test_surfel_blending_of_two_surfels_in_closed_form() -> None:
     # Surfels that face the camera, hit in their centres: weights 0.6 and 0.4 * 0.5, depths 2 and 3.
     alphas, depths = torch.tensor([0.6, 0.5]), torch.tensor([2.0, 3.0])
     transforms = torch.zeros(1, 2, 3, 3)
@@ -83,7 +83,7 @@ def test_two_surfels_in_closed_form() -> None:
     assert median.item() == 2.0  # in front of the second the transmittance is 0.4
 
 
-def test_thin_tiny_and_very_large_surfels() -> None:
+def test_surfel_blending_of_thin_tiny_and_very_large_surfels() -> None:
     s = surfel_scene(60, 40, 33, scale=0.2)
     s.scales[::3, 0] = 0.002
     s.scales[1::6] = 0.001
@@ -91,7 +91,7 @@ def test_thin_tiny_and_very_large_surfels() -> None:
     assert_close(blend_scene(s))
 
 
-def test_edge_on_surfels_keep_the_size_of_a_pixel() -> None:
+def test_surfel_blending_of_edge_on_surfels_keeps_pixel_size() -> None:
     s = surfel_scene(40)
     s.quats[:] = torch.tensor([math.cos(math.pi / 4), 0.0, math.sin(math.pi / 4), 2e-3])
     seen = blend_scene(s).run()
@@ -105,7 +105,7 @@ def test_edge_on_surfels_keep_the_size_of_a_pixel() -> None:
     assert not seen["alphas"].any()
 
 
-def test_values_that_are_not_finite_are_skipped_and_get_no_gradient() -> None:
+def test_surfel_blending_skips_non_finite_surfels_without_gradient() -> None:
     s = blend_scene(surfel_scene(60))
     bad = torch.zeros(60, dtype=torch.bool)
     for row, value in enumerate((math.nan, math.inf, -math.inf)):
@@ -124,7 +124,7 @@ def test_values_that_are_not_finite_are_skipped_and_get_no_gradient() -> None:
         assert seen[f"v_{name}"].isfinite().all(), name
 
 
-def test_results_do_not_depend_on_the_number_of_threads() -> None:
+def test_surfel_blending_independent_of_thread_count() -> None:
     s = blend_scene(surfel_scene(150, 70, 50))
     first = s.run(absgrad=True)
     torch.set_num_threads(1)
@@ -136,7 +136,7 @@ def test_results_do_not_depend_on_the_number_of_threads() -> None:
         assert torch.equal(value, second[name]), name
 
 
-def test_gradients_of_the_reference() -> None:
+def test_surfel_blending_reference_passes_gradcheck() -> None:
     s = blend_scene(surfel_scene(3, 3, 2, scale=0.4, channels=2))
     offsets, ids = s.lists()
 
@@ -148,7 +148,7 @@ def test_gradients_of_the_reference() -> None:
 
 
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor:UserWarning")  # read by opcheck itself
-def test_opcheck() -> None:
+def test_surfel_blending_ops_pass_opcheck() -> None:
     s = blend_scene(surfel_scene(20, 20, 18))
     offsets, ids = s.lists()
     flat = {name: value.detach()[0] for name, value in s.to(torch.float32).items()}
@@ -166,7 +166,7 @@ def test_opcheck() -> None:
     )
 
 
-def test_wrong_arguments_are_refused() -> None:
+def test_surfel_blending_rejects_invalid_arguments() -> None:
     s = blend_scene(surfel_scene(6, 20, 18))
     inputs, lists = {name: value.detach() for name, value in s.to(torch.float32).items()}, s.lists()
     rest = (s.width, s.height, s.tile_size, *lists)

@@ -23,17 +23,17 @@ def assert_close(scene: SurfelScene, **options: float) -> dict[str, torch.Tensor
 
 
 @pytest.mark.parametrize(("batch", "cameras"), [((), 1), ((2,), 3), ((1, 2), 2), ((0,), 2)])
-def test_batches_and_cameras(batch: tuple[int, ...], cameras: int) -> None:
+def test_surfel_projection_of_batches_and_cameras_equals_reference(batch: tuple[int, ...], cameras: int) -> None:
     seen = assert_close(surfel_scene(70, batch=batch, cameras=cameras))
     assert seen["ray_transforms"].shape == (*batch, cameras, 70, 3, 3)
 
 
-def test_no_surfels_and_no_cameras() -> None:
+def test_surfel_projection_without_surfels_or_cameras() -> None:
     assert_close(surfel_scene(0))
     assert_close(surfel_scene(5, cameras=0))
 
 
-def test_the_ray_transform_maps_points_of_the_surfel_to_their_pixels() -> None:
+def test_surfel_ray_transform_maps_surfel_points_to_pixels() -> None:
     s = surfel_scene(20)
     out = fully_fused_projection_2dgs(
         *(t.float() for t in (s.means, s.quats, s.scales, s.viewmats, s.Ks)), s.width, s.height
@@ -46,7 +46,7 @@ def test_the_ray_transform_maps_points_of_the_surfel_to_their_pixels() -> None:
     torch.testing.assert_close(seen, expected, rtol=1e-5, atol=1e-4)
 
 
-def test_a_surfel_that_faces_the_camera_has_the_box_of_its_disc() -> None:
+def test_surfel_projection_of_facing_surfel_has_bounding_box_of_disc() -> None:
     # At z = 2 and a focal length of 100 px, a standard deviation of 0.1 is 5 px, and its outline is that of a circle.
     one = torch.tensor([[0.0, 0.0, 2.0]])
     K = torch.tensor([[[100.0, 0, 50], [0, 100, 40], [0, 0, 1]]])
@@ -59,7 +59,7 @@ def test_a_surfel_that_faces_the_camera_has_the_box_of_its_disc() -> None:
 
 
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
-def test_surfels_that_cannot_be_seen_are_culled_without_gradient() -> None:
+def test_surfel_projection_culls_invisible_surfels_without_gradient() -> None:
     s = surfel_scene(24)
     for i, bad in enumerate((math.nan, math.inf, -math.inf, 1e38)):
         s.means[i, 2] = bad
@@ -80,7 +80,7 @@ def test_surfels_that_cannot_be_seen_are_culled_without_gradient() -> None:
     assert seen["v_viewmats"].isfinite().all()
 
 
-def test_near_edge_on_surfels_and_surfels_that_reach_behind_the_camera() -> None:
+def test_surfel_projection_of_edge_on_surfels_and_surfels_behind_camera() -> None:
     s = surfel_scene(40)
     s.quats[::2] = torch.tensor([math.cos(math.pi / 4), 0.0, math.sin(math.pi / 4), 1e-3])  # normal along x
     s.scales[1::2] = 5.0
@@ -89,12 +89,12 @@ def test_near_edge_on_surfels_and_surfels_that_reach_behind_the_camera() -> None
     assert_close(replace(s, means=s.means[1::2], quats=s.quats[1::2], scales=s.scales[1::2]))
 
 
-def test_planes_and_clip() -> None:
+def test_surfel_projection_clips_near_far_and_radius() -> None:
     assert_close(surfel_scene(60), near_plane=2.4, far_plane=2.8)
     assert_close(surfel_scene(60), radius_clip=12.0)
 
 
-def test_packed_rows_are_the_visible_ones() -> None:
+def test_surfel_projection_packed_rows_are_visible_surfels() -> None:
     s = surfel_scene(80, batch=(2,), cameras=2, scale=0.05)
     s.means[..., :40, 2] -= 3
     tensors = [t.float() for t in (s.means, s.quats, s.scales, s.viewmats, s.Ks)]
@@ -106,7 +106,7 @@ def test_packed_rows_are_the_visible_ones() -> None:
         assert torch.equal(getattr(packed, name), getattr(dense, name)[at]), name
 
 
-def test_gradients_of_the_reference() -> None:
+def test_surfel_projection_reference_passes_gradcheck() -> None:
     s = surfel_scene(3)
 
     def function(means: torch.Tensor, quats: torch.Tensor, scales: torch.Tensor, viewmats: torch.Tensor) -> tuple:
@@ -118,7 +118,7 @@ def test_gradients_of_the_reference() -> None:
 
 
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")  # read by opcheck itself
-def test_opcheck() -> None:
+def test_surfel_projection_ops_pass_opcheck() -> None:
     s = surfel_scene(5, batch=(2,))
     tensors = [t.float() for t in (s.means, s.quats, s.scales, s.viewmats, s.Ks)]
     leaves = [t.requires_grad_() for t in tensors[:4]]
@@ -131,7 +131,7 @@ def test_opcheck() -> None:
         torch.library.opcheck(ops.project_surfels_backward, (*plain, radii, *gradients, needs_viewmats))
 
 
-def test_wrong_arguments_are_refused() -> None:
+def test_surfel_projection_rejects_invalid_arguments() -> None:
     s = surfel_scene(5)
     tensors = [t.float() for t in (s.means, s.quats, s.scales, s.viewmats, s.Ks)]
     for position, value, message in (

@@ -57,7 +57,7 @@ def pairs(found: tuple[Tensor, Tensor, Tensor]) -> set[tuple[int, int]]:
 @pytest.mark.parametrize("tile_size", [16, 8, 7, 40])
 @pytest.mark.parametrize("image_dims", [(1,), (), (2, 3)])
 @pytest.mark.parametrize("sort", [True, False])
-def test_boxes_equal_the_reference(tile_size: int, image_dims: tuple[int, ...], sort: bool) -> None:
+def test_isect_tiles_of_boxes_equals_reference(tile_size: int, image_dims: tuple[int, ...], sort: bool) -> None:
     means2d, radii, depths, _, _ = splats(500, image_dims)
     args = (means2d, radii, depths, *grid(tile_size), sort)
     assert_equal(isect_tiles(*args), reference.isect_tiles(*args))
@@ -66,7 +66,7 @@ def test_boxes_equal_the_reference(tile_size: int, image_dims: tuple[int, ...], 
 @pytest.mark.slow
 @pytest.mark.parametrize("median_px", [0.5, 3.0, 40.0])
 @pytest.mark.parametrize("tile_size", [16, 5])
-def test_exact_test_lists_what_the_ellipse_touches_and_no_more(tile_size: int, median_px: float) -> None:
+def test_isect_tiles_exact_test_lists_touched_tiles_only(tile_size: int, median_px: float) -> None:
     means2d, radii, depths, conics, opacities = splats(800, median_px=median_px, seed=3)
     where = (radii, depths, *grid(tile_size))
     seen = pairs(isect_tiles(means2d, *where, conics=conics, opacities=opacities))
@@ -78,7 +78,7 @@ def test_exact_test_lists_what_the_ellipse_touches_and_no_more(tile_size: int, m
     assert len(seen) < 0.95 * len(isect_tiles(means2d, *where)[1])
 
 
-def test_exact_lists_render_the_same_bits_as_boxes() -> None:
+def test_isect_tiles_exact_lists_render_same_image_as_boxes() -> None:
     means2d, radii, depths, conics, opacities = splats(2000, (2,), seed=5)
     radii = torch.where(radii > 0, radii + 1, 0)
     size, across, down = grid(16)
@@ -92,7 +92,7 @@ def test_exact_lists_render_the_same_bits_as_boxes() -> None:
 
 
 @pytest.mark.parametrize("exact", [True, False])
-def test_bin_splats_is_isect_tiles_and_offsets_in_one(exact: bool) -> None:
+def test_bin_splats_equals_isect_tiles_with_offsets(exact: bool) -> None:
     means2d, radii, depths, conics, opacities = splats(700, (2, 2))
     options = {"conics": conics, "opacities": opacities} if exact else {}
     size, across, down = grid(16)
@@ -104,7 +104,7 @@ def test_bin_splats_is_isect_tiles_and_offsets_in_one(exact: bool) -> None:
     assert (ids.diff() >= 0).all()
 
 
-def test_packed_splats_give_the_lists_of_their_images() -> None:
+def test_isect_tiles_packed_equals_dense_lists() -> None:
     means2d, radii, depths, conics, opacities = splats(300, (3,))
     visible = (radii > 0).all(-1)
     image_ids, gaussian_ids = torch.where(visible)
@@ -118,7 +118,7 @@ def test_packed_splats_give_the_lists_of_their_images() -> None:
 
 
 @pytest.mark.parametrize("count", [0, 1, 64])
-def test_nothing_visible_gives_empty_lists(count: int) -> None:
+def test_bin_splats_without_visible_splats_gives_empty_lists(count: int) -> None:
     means2d, radii, depths, conics, opacities = splats(count)
     for hidden in (radii * 0, radii * torch.tensor([1, 0], dtype=torch.int32)):
         counts, order, offsets = bin_splats(means2d, hidden, depths, grid(16), conics=conics, opacities=opacities)
@@ -127,7 +127,7 @@ def test_nothing_visible_gives_empty_lists(count: int) -> None:
         assert not offsets.any()
 
 
-def test_splats_that_are_not_finite_or_far_away_are_in_no_list() -> None:
+def test_bin_splats_omits_non_finite_and_far_splats() -> None:
     means2d, radii, depths, conics, opacities = splats(14)
     means2d[:] = 50.0
     radii[:] = 20
@@ -151,7 +151,7 @@ def test_splats_that_are_not_finite_or_far_away_are_in_no_list() -> None:
     assert isect_tiles(means2d, radii, depths, *grid(16))[0][0, :6].tolist() == [0] * 6
 
 
-def test_a_splat_over_everything_is_in_every_tile() -> None:
+def test_bin_splats_lists_huge_splat_in_every_tile() -> None:
     _, across, down = grid(8)
     means2d = torch.tensor([[[1e4, -1e4]]])
     radii = torch.tensor([[[2**31 - 1, 2**31 - 1]]], dtype=torch.int32)
@@ -163,7 +163,7 @@ def test_a_splat_over_everything_is_in_every_tile() -> None:
     assert torch.equal(offsets.flatten(), torch.arange(across * down, dtype=torch.int32))
 
 
-def test_a_thin_long_ellipse_is_listed_only_along_its_axis() -> None:
+def test_isect_tiles_lists_thin_ellipse_along_axis_only() -> None:
     # 45 degrees, 400 px by 0.6 px: about two of the tiles of each row.
     direction = torch.tensor([[1.0, 1.0], [-1.0, 1.0]]) / math.sqrt(2)
     covar = direction.T @ torch.diag(torch.tensor([400.0**2, 0.6**2])) @ direction
@@ -173,7 +173,7 @@ def test_a_thin_long_ellipse_is_listed_only_along_its_axis() -> None:
     assert 13 <= counts.item() <= 3 * 13
 
 
-def test_lists_do_not_depend_on_the_number_of_threads() -> None:
+def test_isect_tiles_independent_of_thread_count() -> None:
     means2d, radii, depths, conics, opacities = splats(30_000, median_px=1.0)
     threads = torch.get_num_threads()
     try:
@@ -193,7 +193,7 @@ def test_lists_do_not_depend_on_the_number_of_threads() -> None:
 
 @pytest.mark.parametrize("image_dims", [(1,), (), (2, 3)])
 @pytest.mark.parametrize("share", [1.3, 1.0, 0.6, 0.001, 0.0])
-def test_lists_of_a_capacity_equal_the_reference(image_dims: tuple[int, ...], share: float) -> None:
+def test_bin_splats_with_capacity_equals_reference(image_dims: tuple[int, ...], share: float) -> None:
     """Unused entries in front; what does not fit is what is farthest, whole splats at a time."""
     here = splats(400, image_dims, median_px=8.0)[:3]
     exact = bin_splats(*here, grid(16))
@@ -209,7 +209,7 @@ def test_lists_of_a_capacity_equal_the_reference(image_dims: tuple[int, ...], sh
         assert_equal((counts, order[unused:], offsets - unused), exact)
 
 
-def test_lists_of_a_capacity_blend_to_the_same_image_and_gradients() -> None:
+def test_bin_splats_with_capacity_gives_same_image_and_gradients() -> None:
     means2d, radii, depths, conics, opacities = splats(200, (2,))
     colors = torch.rand(2, 200, 3, generator=torch.Generator().manual_seed(1))
     results = []
@@ -222,7 +222,7 @@ def test_lists_of_a_capacity_blend_to_the_same_image_and_gradients() -> None:
     assert_equal(*results)
 
 
-def test_wrong_arguments_are_named() -> None:
+def test_tile_ops_name_invalid_arguments() -> None:
     means2d, radii, depths, conics, _ = splats(5)
     with pytest.raises(InvalidInput, match=r"float64; gsplat_core\.reference"):
         isect_tiles(means2d.double(), radii, depths, *grid(16))
@@ -244,7 +244,7 @@ def test_wrong_arguments_are_named() -> None:
 
 
 @pytest.mark.slow
-def test_ops_pass_opcheck() -> None:
+def test_tile_ops_pass_opcheck() -> None:
     means2d, radii, depths, conics, opacities = (t[0] for t in splats(40))
     ops = torch.ops.gsplat_core
     for exact in ((conics, opacities), (None, None)):

@@ -75,7 +75,7 @@ KINDS = [kind for kind in RollingShutterType if kind is not RollingShutterType.G
         ("ortho", KINDS[1]),
     ],
 )
-def test_values_and_gradients_are_those_of_plain_torch(name, rolls):
+def test_unscented_projection_values_and_gradients_equal_reference(name, rolls):
     given, options = wide_scene(70), dict(CAMERAS[name])
     if rolls is not None:
         end = exp(torch.tensor([[0.04, 0.02, 0.0, 0.03, -0.05, 0.2]], dtype=torch.float64)) @ given["viewmats"]
@@ -86,7 +86,7 @@ def test_values_and_gradients_are_those_of_plain_torch(name, rolls):
 @pytest.mark.parametrize(
     "options", [{"require_all_sigma_points_valid": False}, {"alpha": 0.8, "kappa": 0.5, "in_image_margin_factor": 0.4}]
 )
-def test_other_sigma_points_batches_and_cameras(options):
+def test_unscented_projection_with_other_sigma_points_batches_and_cameras(options):
     given = wide_scene(40)
     batched = {
         name: torch.stack([given[name], given[name].flip(0)]) for name in ("means", "quats", "scales", "opacities")
@@ -101,7 +101,7 @@ def test_other_sigma_points_batches_and_cameras(options):
     assert_equal(*(project(batched, dtype, radial_coeffs=radial) for dtype in (torch.float32, torch.float64)))
 
 
-def test_hostile_values_are_culled_and_have_no_gradient():
+def test_unscented_projection_culls_non_finite_values_without_gradient():
     given = wide_scene(16)
     given["means"][0, 1] = math.nan
     given["means"][1, 0] = math.inf
@@ -119,7 +119,7 @@ def test_hostile_values_are_culled_and_have_no_gradient():
 
 
 @pytest.mark.parametrize(("count", "cameras"), [(0, 1), (3, 0), (0, 0)])
-def test_nothing_to_project(count, cameras):
+def test_unscented_projection_without_gaussians_or_cameras(count, cameras):
     given = {
         name: value[:count] if name not in ("viewmats", "Ks") else value[:cameras] for name, value in scene(3).items()
     }
@@ -129,7 +129,7 @@ def test_nothing_to_project(count, cameras):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")  # raised by opcheck itself
-def test_opcheck():
+def test_unscented_projection_ops_pass_opcheck():
     given = {name: value.float() for name, value in scene(5).items()}
     shutter = Shutter.of(given["viewmats"], None, None)
     rows = camera_rows(shutter, given["Ks"], Lens(radial=RADIAL.float()))[None]
@@ -164,7 +164,7 @@ def test_opcheck():
     )
 
 
-def test_wrong_sizes_are_refused_by_the_op():
+def test_unscented_projection_op_rejects_mismatched_sizes():
     given = {name: value.float() for name, value in scene(2).items()}
     rows = torch.zeros(1, 1, CAMERA_COLUMNS - 1)
     with pytest.raises(RuntimeError, match="do not fit together"):

@@ -37,7 +37,7 @@ def scene(count: int = 12, size: float = 0.02, dtype: torch.dtype = torch.float6
 
 
 @pytest.mark.parametrize("model", ["pinhole", "ortho", "fisheye"])
-def test_small_gaussians_are_projected_as_by_the_linear_projection(model):
+def test_unscented_projection_of_small_gaussians_equals_linear(model):
     given = scene(size=1e-3)
     options = {"camera_model": model, "eps2d": 0.0}
     ours = fully_fused_projection_with_ut(**given, width=W, height=H, **options)
@@ -50,7 +50,7 @@ def test_small_gaussians_are_projected_as_by_the_linear_projection(model):
         torch.testing.assert_close(getattr(ours, name), getattr(linear, name), atol=1e-4, rtol=1e-3)
 
 
-def test_blur_and_compensation_are_those_of_the_linear_projection():
+def test_unscented_blur_and_compensation_equal_linear_projection():
     given = scene()
     ours = fully_fused_projection_with_ut(**given, width=W, height=H, calc_compensations=True)
     linear = fully_fused_projection(
@@ -63,7 +63,7 @@ def test_blur_and_compensation_are_those_of_the_linear_projection():
 
 
 @pytest.mark.parametrize("coefficients", [DISTORTED, {"camera_model": "fisheye", "radial_coeffs": RADIAL[:, :4] / 5}])
-def test_moments_are_those_of_projected_samples(coefficients):
+def test_unscented_moments_equal_moments_of_projected_samples(coefficients):
     given = scene(count=2)
     ours = fully_fused_projection_with_ut(**given, width=W, height=H, eps2d=0.0, **coefficients)
     lens = Lens(
@@ -86,7 +86,7 @@ def test_moments_are_those_of_projected_samples(coefficients):
 
 
 @pytest.mark.slow
-def test_gradients_of_all_tensors_in_double_precision():
+def test_unscented_projection_passes_gradcheck_for_all_tensors():
     given = scene(count=3)
     more = {
         **DISTORTED,
@@ -109,7 +109,7 @@ def test_gradients_of_all_tensors_in_double_precision():
 
 
 @pytest.mark.parametrize("kind", [kind for kind in RollingShutterType if kind.name != "GLOBAL"])
-def test_a_point_has_the_pixel_at_which_its_row_is_read_out(kind):
+def test_rolling_shutter_projects_point_at_readout_time_of_row(kind):
     given = scene(count=6, size=1e-4)
     end = exp(torch.tensor([[0.04, 0.02, 0.0, 0.02, -0.03, 0.1]], dtype=torch.float64)) @ given["viewmats"]
     ours = fully_fused_projection_with_ut(**given, width=W, height=H, rolling_shutter=kind, viewmats_rs=end)
@@ -130,7 +130,7 @@ def test_a_point_has_the_pixel_at_which_its_row_is_read_out(kind):
     torch.testing.assert_close(ours.depths[0], (given["means"] @ middle[0, 2, :3]) + middle[0, 2, 3])
 
 
-def test_equal_poses_of_a_rolling_shutter_are_a_global_one_in_float32_too():
+def test_rolling_shutter_with_equal_poses_equals_global_in_float32():
     given = scene(dtype=torch.float32)
     pose = given["viewmats"].clone().requires_grad_()
     still = fully_fused_projection_with_ut(**given, width=W, height=H)
@@ -143,7 +143,7 @@ def test_equal_poses_of_a_rolling_shutter_are_a_global_one_in_float32_too():
     assert pose.grad is not None and pose.grad.isfinite().all() and pose.grad.abs().sum() > 0
 
 
-def test_culled_gaussians_have_no_values_and_no_gradient():
+def test_unscented_projection_culled_gaussians_have_no_gradient():
     given = scene(count=6)
     given["means"][0, 0] = math.nan
     given["means"][1] = torch.tensor([0, 0, -3.0])
@@ -160,7 +160,7 @@ def test_culled_gaussians_have_no_values_and_no_gradient():
         assert (given[name].grad[:5] == 0).all() and given[name].grad[5].abs().sum() > 0, name
 
 
-def test_the_margin_culls_gaussians_with_sigma_points_outside():
+def test_unscented_margin_culls_gaussians_with_sigma_points_outside():
     given = scene(count=1, size=0.2)
     given["means"][0] = torch.tensor([0.82, 0, 1.0])  # about 8 px beyond the right border
     project = lambda **options: fully_fused_projection_with_ut(
@@ -171,7 +171,7 @@ def test_the_margin_culls_gaussians_with_sigma_points_outside():
     assert project(require_all_sigma_points_valid=False, in_image_margin_factor=0.12).radii.sum() > 0
 
 
-def test_batches_of_cameras():
+def test_unscented_projection_of_camera_batches():
     given = scene()
     many = {
         name: value.expand(2, *value.shape)
@@ -200,12 +200,12 @@ def test_batches_of_cameras():
         ({"width": 0}, "at least 1x1 px"),
     ],
 )
-def test_wrong_options_are_refused(options, words):
+def test_unscented_projection_rejects_invalid_options(options, words):
     with pytest.raises(InvalidInput, match=words):
         fully_fused_projection_with_ut(**{**scene(), "width": W, "height": H, **options})
 
 
 @pytest.mark.parametrize("options", [{"alpha": 0.0}, {"kappa": -3.0}, {"in_image_margin_factor": -0.1}])
-def test_impossible_sigma_points_are_refused(options):
+def test_unscented_parameters_reject_impossible_sigma_points(options):
     with pytest.raises(InvalidInput, match="ut_params"):
         UnscentedTransformParameters(**options)

@@ -55,7 +55,7 @@ def evaluate(function, inputs, width, height):
 
 @pytest.mark.parametrize("size", [(40, 33), (1, 1), (16, 16), (70, 5)])
 @pytest.mark.parametrize(("count", "channels"), [(60, 4), (60, 3), (30, 1), (30, 7), (1, 4), (0, 4)])
-def test_matches_reference(assert_near, count, channels, size):
+def test_weighted_sums_match_reference(assert_near, count, channels, size):
     inputs = splats(count, *size, channels)
     ours = evaluate(compiled, inputs, *size)
     exact = evaluate(lambda leaves, *size: reference.weighted_sums(*leaves, *size), [t.double() for t in inputs], *size)
@@ -63,7 +63,7 @@ def test_matches_reference(assert_near, count, channels, size):
         assert_near(actual, expected, of_largest=2e-5)
 
 
-def test_one_splat_is_its_gaussian():
+def test_weighted_sums_reference_of_one_splat_in_closed_form():
     inputs = [torch.tensor([v]) for v in ([5.5, 4.5], [0.25, 0.0, 1.0], [2.0, -1.0])]
     sums = reference.weighted_sums(*inputs, torch.tensor([3.0]), torch.tensor([-0.5]), 12, 9)
     term = -0.5 * 3.0 * torch.exp(torch.tensor(-0.5 * 0.25 * 4))
@@ -73,7 +73,7 @@ def test_one_splat_is_its_gaussian():
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_any_order_gives_the_same_bytes(seed):
+def test_weighted_sums_independent_of_order(seed):
     width, height = 64, 48
     inputs = splats(500, width, height, seed=seed)
     wanted = compiled(inputs, width, height)
@@ -81,7 +81,7 @@ def test_any_order_gives_the_same_bytes(seed):
     assert torch.equal(compiled([t[order] for t in inputs], width, height), wanted)
 
 
-def test_sums_do_not_lose_small_terms():
+def test_weighted_sums_keep_small_terms():
     # In float32, 1 + 2^-26 is 1.
     count, width, height = 1025, 16, 16
     means2d, conics = torch.full((count, 2), 8.5), torch.tensor([[0.01, 0.0, 0.01]]).expand(count, 3).contiguous()
@@ -93,7 +93,7 @@ def test_sums_do_not_lose_small_terms():
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), 3e38])
-def test_a_splat_with_a_hostile_value_affects_no_other(assert_near, name, value):
+def test_weighted_sums_invalid_splat_does_not_affect_others(assert_near, name, value):
     width, height = 40, 33
     inputs = dict(zip(NAMES, splats(60, width, height), strict=True))
     others = {key: t[1:] for key, t in inputs.items()}
@@ -110,14 +110,14 @@ def test_a_splat_with_a_hostile_value_affects_no_other(assert_near, name, value)
         assert_near(sums.detach(), compiled(tuple(others.values()), width, height), of_largest=1e-6)
 
 
-def test_conics_that_are_no_ellipses_contribute_nothing():
+def test_weighted_sums_ignore_invalid_conics():
     inputs = list(splats(3, 32, 32))
     lists = lists_of(inputs[0], inputs[1], inputs[3], 32, 32)
     inputs[1] = torch.tensor([[0.0, 0.0, 0.0], [-1.0, 0.0, 1.0], [1.0, 2.0, 1.0]])
     assert not weighted_sums(*inputs, 32, 32, *lists).any()
 
 
-def test_large_terms_and_channels_are_limited():
+def test_weighted_sums_limit_large_terms_and_channels():
     inputs = [torch.tensor([v]) for v in ([8.5, 8.5], [0.02, 0.0, 0.02], [1e6])]
     leaves = [*inputs, torch.tensor([1000.0]), torch.tensor([5.0])]
     leaves = [t.requires_grad_() for t in leaves]
@@ -129,14 +129,14 @@ def test_large_terms_and_channels_are_limited():
     assert all(leaf.grad.abs().max() == 0 for leaf in leaves)
 
 
-def test_reference_gradcheck():
+def test_weighted_sums_reference_passes_gradcheck():
     inputs = [t.double().requires_grad_() for t in splats(6, 8, 7, channels=2, seed=3)]
     assert torch.autograd.gradcheck(lambda *leaves: reference.weighted_sums(*leaves, 8, 7), inputs, eps=1e-7)
 
 
 # opcheck itself reads .grad of tensors that are not leaves.
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
-def test_opcheck():
+def test_weighted_sums_ops_pass_opcheck():
     inputs = splats(20, 40, 33)
     lists = lists_of(inputs[0], inputs[1], inputs[3], 40, 33)
     leaves = [t.requires_grad_() for t in inputs]
@@ -145,7 +145,7 @@ def test_opcheck():
     torch.library.opcheck(torch.ops.gsplat_core.weighted_sums_backward, (*plain, *lists, 40, 33, torch.rand(5, 33, 40)))
 
 
-def test_wrong_arguments_are_refused():
+def test_weighted_sums_reject_invalid_arguments():
     inputs = list(splats(5, 32, 32))
     offsets, ids = lists_of(inputs[0], inputs[1], inputs[3], 32, 32)
     for at, wrong, message in [

@@ -48,7 +48,7 @@ def blend(given, colors, offsets, ids, **more):
     )
 
 
-def test_one_gaussian_by_hand():
+def test_world_blending_of_one_gaussian_in_closed_form():
     given, colors = small_scene(1)
     given |= {
         "means": torch.tensor([[0.1, 0.05, 1.5]], dtype=torch.float64),
@@ -67,7 +67,7 @@ def test_one_gaussian_by_hand():
     )
 
 
-def test_distant_gaussians_look_as_in_the_picture_plane():
+def test_world_blending_of_distant_gaussians_equals_image_plane_blending():
     given, colors = small_scene(30)
     given |= {
         "means": given["means"] * 40,
@@ -84,7 +84,7 @@ def test_distant_gaussians_look_as_in_the_picture_plane():
 
 
 @pytest.mark.parametrize("kind", ["distorted", "rolling"])
-def test_gradients_of_all_tensors_in_double_precision(kind):
+def test_world_blending_passes_gradcheck_for_all_tensors(kind):
     given, colors = small_scene(3)
     camera = dict(DISTORTED)
     if kind == "rolling":
@@ -115,7 +115,7 @@ def test_gradients_of_all_tensors_in_double_precision(kind):
     )
 
 
-def test_long_lists_end_at_low_transmittance_and_masked_tiles_show_the_background(monkeypatch):
+def test_world_blending_stops_at_low_transmittance_and_masks_tiles(monkeypatch):
     from gsplat_core.ops import world_blending
 
     given, colors = small_scene(40, size=0.4)
@@ -134,7 +134,7 @@ def test_long_lists_end_at_low_transmittance_and_masked_tiles_show_the_backgroun
     torch.testing.assert_close(seen[0, :8], alphas[0, :8])
 
 
-def test_pixels_that_the_lens_does_not_see_show_the_background():
+def test_world_blending_pixels_without_ray_show_background():
     given, colors = small_scene(8, size=0.3)
     _, offsets, ids = lists(given)
     radial = RADIAL * 0
@@ -163,7 +163,7 @@ def cast(values, dtype):
 
 @pytest.mark.parametrize("channels", [1, 3, 11])
 @pytest.mark.parametrize("masked", [False, True])
-def test_compiled_blending_is_that_of_plain_torch(channels, masked):
+def test_world_blending_equals_reference(channels, masked):
     given, colors, offsets, ids, more = two_pictures(channels, masked)
     colors[0, 5, 0], given["means"][7, 1] = math.nan, math.inf
     given["quats"][9] = math.nan
@@ -192,7 +192,7 @@ def gradients(given, colors, offsets, ids, more, dtype, device="cpu"):
 
 
 @pytest.mark.parametrize(("channels", "masked"), [(1, False), (3, True), (19, False)])
-def test_compiled_gradients_are_those_of_plain_torch(channels, masked):
+def test_world_blending_gradients_equal_reference(channels, masked):
     inputs = two_pictures(channels, masked)
     expected, found = gradients(*inputs, torch.float64), gradients(*inputs, torch.float32)
     for name, wanted in expected.items():
@@ -202,7 +202,7 @@ def test_compiled_gradients_are_those_of_plain_torch(channels, masked):
         assert (found[name] - wanted).abs().max() < 0.05 * scale, name
 
 
-def test_gaussians_without_a_finite_value_have_no_gradient_and_leave_that_of_others():
+def test_world_blending_non_finite_gaussians_have_no_gradient():
     given, colors, offsets, ids, more = two_pictures(3, False)
     hidden = {**given, "opacities": given["opacities"].clone()}
     hidden["opacities"][3] = 0
@@ -214,7 +214,7 @@ def test_gaussians_without_a_finite_value_have_no_gradient_and_leave_that_of_oth
 
 
 @pytest.mark.parametrize("threads", [1, 3])
-def test_gradients_do_not_depend_on_the_number_of_threads(threads):
+def test_world_blending_gradients_independent_of_thread_count(threads):
     inputs = two_pictures(3, False)
     before = torch.get_num_threads()
     expected = gradients(*inputs, torch.float32)
@@ -226,7 +226,7 @@ def test_gradients_do_not_depend_on_the_number_of_threads(threads):
     assert all(torch.equal(found[name], expected[name]) for name in ("means", "quats", "scales", "colors", "opacities"))
 
 
-def test_the_compiled_op_refuses_lists_out_of_range():
+def test_world_blending_op_rejects_lists_out_of_range():
     given, colors = small_scene(3)
     _, offsets, ids = lists(given)
     single = {name: value.float() for name, value in given.items()}
@@ -238,7 +238,7 @@ def test_the_compiled_op_refuses_lists_out_of_range():
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor:UserWarning")  # read by opcheck itself
-def test_opcheck():
+def test_world_blending_ops_pass_opcheck():
 
     given, colors = small_scene(5)
     _, offsets, ids = lists(given)
@@ -251,7 +251,7 @@ def test_opcheck():
     torch.library.opcheck(op.blend_world_backward.default, (*floats, *rest, *results))
 
 
-def test_nothing_to_blend():
+def test_world_blending_without_gaussians():
     given, colors = small_scene(1)
     none = {name: value[:0] if name not in ("viewmats", "Ks") else value for name, value in given.items()}
     empty = torch.zeros(0, dtype=torch.int32)
@@ -268,7 +268,7 @@ def test_nothing_to_blend():
         ({"camera_model": "fisheye", "radial_coeffs": RADIAL}, "radial_coeffs"),
     ],
 )
-def test_wrong_arguments_are_refused(options, words):
+def test_world_blending_rejects_invalid_arguments(options, words):
     given, colors = small_scene(2)
     _, offsets, ids = lists(given)
     with pytest.raises(InvalidInput, match=words):
