@@ -18,171 +18,66 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
 
 import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from gsplat_core.depth.maps import UNCONFIRMED, DepthMap, Estimator, Look, RecordingDepth, agree, doubted
 from gsplat_core.geometry.tracks import followed
 from gsplat_core.machine import usable_cores
+from gsplat_core.ops.plane_sweep import WINDOW_PX, MatchingCosts, select_planes, sweep_planes
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import BELIEVED, PARALLAX, Frame
-
-WINDOW_PX = 7
-"""Side in pixels of the square window in which two pictures are correlated."""
-NOISE_GREY = 2.0
-"""Standard deviation of image noise in grey levels, added to variances so that patches without
-contrast do not correlate.
-"""
-DISAGREES = 0.5
-"""Cost of uncorrelated patches and upper bound of any cost, so that an occluded view cannot outvote the other views."""
-AGREES = 0.2
-"""Matching cost below which a view counts as agreeing with a distance, corresponding to a correlation of 0.6."""
 
 
 @dataclass(frozen=True)
 class View:
     """Grey picture with its tissue mask and its camera, including the pose."""
 
-    grey: NDArray[np.float32]
-    """Grey levels 0 to 255, float32 [H, W]."""
+    grey: NDArray[np.uint8]
+    """Grey levels, uint8 [H, W]."""
     tissue: NDArray[np.uint8]
     """Mask uint8 [H, W]: 1 on tissue that can be tracked, 0 elsewhere."""
     camera: Camera
 
 
-def sweep(
-    reference: View, others: Sequence[View], inverse_depths: NDArray[np.float64]
-) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Compute matching costs by zero-mean normalised cross-correlation, which is invariant to the brightness changes of
-    a moving light.
+def matching_costs(reference: View, others: Sequence[View], inverse_depths: NDArray[np.float64]) -> MatchingCosts:
+    """Compute the matching costs of inverse depths by a plane sweep.
 
     Args:
         reference: picture whose depth is wanted.
-        others: views to compare with.
-        inverse_depths: float64 [D].
+        others: views to compare with, of the size of the reference.
+        inverse_depths: float64 [D], one per label.
 
     Returns:
-        Mean costs float32 [H, W, D] from 0 to `DISAGREES`, and numbers of agreeing views uint8 [H, W, D].
+        Costs, and numbers of agreeing views.
     """
-    height, width = reference.grey.shape
-    cost = np.empty((len(inverse_depths), height, width), np.float32)
-    votes = np.empty((len(inverse_depths), height, width), np.uint8)
-    mean, variance = _moments(reference.grey)
-    whole = _whole_patches(reference.tissue)
-    stacks = [np.dstack([view.grey, _whole_patches(view.tissue)]) for view in others]
-    for index, inverse in enumerate(inverse_depths):
-        total = np.zeros((height, width), np.float32)
-        seen, agree = np.zeros((height, width), np.uint8), np.zeros((height, width), np.uint8)
-        for view, stack in zip(others, stacks, strict=True):
-            moved: Any = cv2.warpPerspective(
-                stack, _plane_homography(reference.camera, view.camera, inverse), (width, height),
-                flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-            )  # fmt: skip
-            grey, usable = moved[..., 0], (moved[..., 1] > 0.99) & (whole > 0)
-            each = np.minimum(_cost(reference.grey, mean, variance, grey), np.float32(DISAGREES))
-            total += np.where(usable, each, 0)
-            seen += usable
-            agree += usable & (each < AGREES)
-        cost[index] = np.where(seen > 0, total / np.maximum(seen, 1), DISAGREES)
-        votes[index] = agree
-    return np.ascontiguousarray(cost.transpose(1, 2, 0)), np.ascontiguousarray(votes.transpose(1, 2, 0))
+    homographies = np.stack([_plane_homographies(reference.camera, view.camera, inverse_depths) for view in others], 1)
+    return sweep_planes(
+        torch.from_numpy(np.ascontiguousarray(reference.grey)),
+        torch.from_numpy(_whole_patches(reference.tissue)),
+        torch.from_numpy(np.stack([view.grey for view in others])),
+        torch.from_numpy(np.stack([_whole_patches(view.tissue) for view in others])),
+        torch.from_numpy(homographies),
+    )
 
 
-def _plane_homography(reference: Camera, view: Camera, inverse_depth: float) -> NDArray[np.float64]:
-    """Return the homography from `reference` to `view` for a fronto-parallel plane, in OpenCV pixel
+def _plane_homographies(reference: Camera, view: Camera, inverse_depths: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the homographies [D, 3, 3] from `reference` to `view` for fronto-parallel planes, in OpenCV pixel
     coordinates (pixel centres at integers).
     """
     between = view.world_to_camera @ np.linalg.inv(reference.world_to_camera)
     centre = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
-    plane = between[:3, :3] + np.outer(between[:3, 3], [0, 0, inverse_depth])
-    return np.asarray(np.linalg.inv(centre) @ view.K @ plane @ np.linalg.inv(reference.K) @ centre)
+    to_view, to_rays = np.linalg.inv(centre) @ view.K, np.linalg.inv(reference.K) @ centre
+    shift = np.outer(to_view @ between[:3, 3], [0, 0, 1] @ to_rays)
+    return np.asarray(to_view @ between[:3, :3] @ to_rays + np.multiply.outer(inverse_depths, shift))
 
 
-def _mean(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    return np.asarray(cv2.boxFilter(values, -1, (WINDOW_PX, WINDOW_PX)), np.float32)
-
-
-def _moments(grey: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    mean = _mean(grey)
-    return mean, np.maximum(_mean(grey * grey) - mean * mean, 0) + np.float32(NOISE_GREY**2)
-
-
-def _whole_patches(tissue: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Return float32 [H, W], 1 where the whole correlation window around a pixel is tissue, else 0."""
-    return np.asarray(cv2.erode((tissue != 0).astype(np.uint8), np.ones((WINDOW_PX, WINDOW_PX), np.uint8)), np.float32)
-
-
-def _cost(
-    grey: NDArray[np.float32], mean: NDArray[np.float32], variance: NDArray[np.float32], other: NDArray[np.float32]
-) -> NDArray[np.float32]:
-    """Return the matching cost (1 - ZNCC) / 2 of each pixel, [H, W]."""
-    sums = _mean(np.dstack([other, other * other, grey * other]))
-    other_mean = sums[..., 0]
-    other_variance = np.maximum(sums[..., 1] - other_mean * other_mean, 0) + np.float32(NOISE_GREY**2)
-    correlation = (sums[..., 2] - mean * other_mean) / np.sqrt(variance * other_variance)
-    return np.asarray(0.5 - 0.5 * correlation, np.float32)
-
-
-SMALL_STEP = 0.02
-"""Penalty P1 of semi-global matching for a difference of one label between neighbours; a pixel's cost is 0 to 1."""
-LARGE_STEP = 0.1
-"""Penalty P2 of semi-global matching for a difference of several labels between neighbours."""
-
-
-def aggregated(cost: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the sum of the path costs of semi-global matching from four directions, for matching costs [H, W, D]."""
-    total = np.zeros_like(cost)
-    _add_paths(cost, total)
-    sideways, across = (
-        np.ascontiguousarray(cost.transpose(1, 0, 2)),
-        np.zeros((cost.shape[1], cost.shape[0], cost.shape[2]), np.float32),
-    )
-    _add_paths(sideways, across)
-    return total + across.transpose(1, 0, 2)
-
-
-def _add_paths(cost: NDArray[np.float32], total: NDArray[np.float32]) -> None:
-    """Add the path costs along the first axis, in both directions, to `total`."""
-    for rows in (range(len(cost)), range(len(cost) - 1, -1, -1)):
-        before: NDArray[np.float32] | None = None
-        for row in rows:
-            path = cost[row]
-            if before is not None:
-                least = before.min(axis=1, keepdims=True)
-                best = np.minimum(before, least + np.float32(LARGE_STEP))
-                np.minimum(best[:, 1:], before[:, :-1] + np.float32(SMALL_STEP), out=best[:, 1:])
-                np.minimum(best[:, :-1], before[:, 1:] + np.float32(SMALL_STEP), out=best[:, :-1])
-                path = path + (best - least)
-            total[row] += path
-            before = path
-
-
-def best_labels(total: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Select the distance label with the lowest cost for each pixel, and measure how unique it is.
-
-    Args:
-        total: aggregated costs float32 [H, W, D].
-
-    Returns:
-        Labels [H, W] with sub-label precision by a parabola fit, and their uniqueness [H, W]: the
-            relative cost increase of the best label more than two steps away.
-    """
-    labels = total.shape[2]
-    best = total.argmin(axis=2)
-    inner = np.clip(best, 1, labels - 2)[..., None]
-    below, here, above = (np.take_along_axis(total, inner + step, 2)[..., 0] for step in (-1, 0, 1))
-    bend = below - 2 * here + above
-    shift = np.where(bend > 1e-6, 0.5 * (below - above) / np.maximum(bend, 1e-6), 0.0)
-    # The parabola's minimum is at most half a label away from the best label, whose cost is the least.
-    shift = np.where(best == inner[..., 0], shift, 0.0)
-    least = total.min(axis=2)
-    near = np.abs(np.arange(labels) - best[..., None]) <= 2
-    second = np.where(near, np.inf, total).min(axis=2)
-    unique = (second - least) / np.maximum(least, 1e-6)
-    return np.asarray(best + shift, np.float32), np.asarray(unique, np.float32)
+def _whole_patches(tissue: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return uint8 [H, W], 1 where the whole correlation window around a pixel is tissue, else 0."""
+    return np.asarray(cv2.erode((tissue != 0).astype(np.uint8), np.ones((WINDOW_PX, WINDOW_PX), np.uint8)), np.uint8)
 
 
 POINTS = 400
@@ -274,7 +169,7 @@ def explained_by_poses(reference: View, others: Sequence[View]) -> Parallax | st
 def _corners(view: View) -> NDArray[np.float32]:
     """Return trackable corners of the tissue in OpenCV pixel coordinates [n, 2]."""
     found = cv2.goodFeaturesToTrack(
-        view.grey.astype(np.uint8), POINTS, 0.005, APART_PX, mask=cv2.erode(view.tissue, np.ones((9, 9), np.uint8))
+        view.grey, POINTS, 0.005, APART_PX, mask=cv2.erode(view.tissue, np.ones((9, 9), np.uint8))
     )
     return np.zeros((0, 2), np.float32) if found is None else np.asarray(found[:, 0], np.float32)
 
@@ -283,8 +178,7 @@ def _followed(
     reference: View, view: View, corners: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Return the position of each corner of `reference` in `view` [n, 2], and a bool mask [n], True where it was found on tissue."""
-    first, second = (each.grey.astype(np.uint8) for each in (reference, view))
-    there, misses_px = followed(first, second, corners, window_px=15, levels=4)
+    there, misses_px = followed(reference.grey, view.grey, corners, window_px=15, levels=4)
     height, width = view.tissue.shape
     column, row = (
         np.clip(np.nan_to_num(there[:, axis]), 0, size - 1).astype(int) for axis, size in ((0, width), (1, height))
@@ -393,7 +287,7 @@ def view_of(frame: Frame, camera: Camera, longest_px: int = WORKING_PX) -> View:
         if mask is not None:
             tissue &= (mask != 0).astype(np.uint8)
     return View(
-        np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.float32),
+        np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8),
         np.asarray(cv2.resize(tissue, size, interpolation=cv2.INTER_NEAREST), np.uint8),
         small,
     )
@@ -436,15 +330,13 @@ def depth_of_view(reference: View, candidates: Sequence[View], size: tuple[int, 
     if isinstance(found, str):
         return doubted(size, PARALLAX, found)
     inverse_depths = _distances(found)
-    cost, votes = sweep(reference, [others[number] for number in found.views], inverse_depths)
-    labels, unique = best_labels(aggregated(cost))
+    planes = select_planes(matching_costs(reference, [others[number] for number in found.views], inverse_depths))
+    labels, unique, costs, agreeing = (each.numpy() for each in planes)
     inverse = np.interp(labels, np.arange(len(inverse_depths)), inverse_depths).astype(np.float32)
-    nearest = np.rint(labels).astype(np.intp)[..., None]
-    costs = np.take_along_axis(cost, nearest, 2)[..., 0]
-    agreeing = np.take_along_axis(votes, nearest, 2)[..., 0]
     confidence = np.minimum((WORST_COST - costs) / (WORST_COST - BEST_COST), unique / UNIQUE)
     # Exclude the first and last distances, which also collect all pixels beyond the swept range.
-    inside = (nearest[..., 0] > 0) & (nearest[..., 0] < len(inverse_depths) - 1)
+    nearest = np.rint(labels)
+    inside = (nearest > 0) & (nearest < len(inverse_depths) - 1)
     confidence = np.clip(confidence, 0, 1) * float(np.clip(2 - 2 * found.own_motion / MOST_OWN_MOTION, 0, 1))
     confidence = confidence * inside * (reference.tissue != 0) * (agreeing >= min(2, len(found.views)))
     confidence = _without_speckles(labels, confidence.astype(np.float32))

@@ -266,6 +266,15 @@ STABLE_TORCH_LIBRARY(gsplat_core, m) {
       "spread_px, float flat_px, float damping) -> (Tensor S, Tensor right, Tensor inverse, Tensor h, Tensor coupling)");
   m.def("place_camera(Tensor pose, Tensor points, Tensor rays, float focal_px, float spread_px, int rounds) -> Tensor");
 
+  // Plane sweep over D fronto-parallel planes for the CPU (plane_sweep.h). Pictures and masks are uint8: reference and usable
+  // [H, W], views and views_usable [V, H, W]. homographies: float64 [D, V, 3, 3], from pixels of the reference to pixels
+  // of a view. sweep_planes: costs int16 [H, W, D] in units of 1/20000, and numbers of agreeing views uint8 [H, W, D].
+  // select_planes: per pixel the label, its uniqueness, cost and agreeing views, by semi-global matching.
+  m.def(
+      "sweep_planes(Tensor reference, Tensor usable, Tensor views, Tensor views_usable, Tensor homographies) -> (Tensor costs, "
+      "Tensor votes)");
+  m.def("select_planes(Tensor costs, Tensor votes) -> (Tensor labels, Tensor unique, Tensor cost, Tensor agreeing)");
+
   // Blended optical flow of splats that carry the surface of the first picture to the second camera: [height, width, 4],
   // the sums of weight times flow x, flow y and depth in the second camera, and of the weights. intrinsics: fx, fy,
   // cx, cy of both cameras. Tiles have 16x16 pixels.

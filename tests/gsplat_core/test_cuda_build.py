@@ -34,10 +34,10 @@ ROOT = Path(native.__file__).resolve().parent
 SCHEMAS = re.findall(r"\bm\.def\(\s*\"(\w+)\(", (ROOT.parent / "native" / "schemas.cpp").read_text())
 WITHOUT_CUDA = {
     "active_isa", "surface_motion", "neighbour_motion", "neighbour_motion_backward", "correct_colours", "bundle_cost", "bundle_equations",
-    "place_camera",
+    "place_camera", "sweep_planes", "select_planes",
 }  # fmt: skip
 """`active_isa` has nothing to do with a device, colours are corrected in advance on the CPU only (`correct_colours`), and camera poses are
-estimated there (`bundle_adjustment`). On a GPU plain torch computes
+estimated there (`bundle_adjustment`), as is depth by parallax (`plane_sweep`). On a GPU plain torch computes
 the other ones: `surface_motion` for the start from motion, and `neighbour_motion` for optical flow. Another op without a CUDA kernel was forgotten."""
 
 

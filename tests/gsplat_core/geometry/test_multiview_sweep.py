@@ -1,4 +1,4 @@
-"""Costs of a plane sweep, their aggregation, and depth of corners against given poses, in closed form and by loops."""
+"""Costs of a plane sweep, and depth of corners against given poses, in closed form and by loops."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ import pytest
 
 from gsplat_core.depth import multiview
 from gsplat_core.depth.maps import DepthMap, doubted
-from gsplat_core.depth.multiview import ParallaxDepth, View, aggregated, best_labels, explained_by_poses, sweep
+from gsplat_core.depth.multiview import ParallaxDepth, View, explained_by_poses, matching_costs
+from gsplat_core.ops.plane_sweep import COST_STEPS
 from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import PARALLAX, Frame
 
@@ -24,14 +25,20 @@ def camera(x: float = 0.0, turn: float = 0.0) -> Camera:
 
 
 def noise(seed: int = 0) -> np.ndarray:
-    return np.random.default_rng(seed).uniform(20, 230, (HEIGHT, WIDTH)).astype(np.float32)
+    return np.random.default_rng(seed).integers(20, 200, (HEIGHT, WIDTH), np.uint8)
+
+
+def sweep(reference: View, others: list[View], inverse_depths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Costs from 0 to 0.5, and votes."""
+    costs, votes = matching_costs(reference, others, inverse_depths)
+    return costs.numpy() / COST_STEPS, votes.numpy()
 
 
 def test_costs_are_least_at_the_distance_by_which_a_view_is_shifted():
     """A wall 20 away shifts by 6 pixels for a baseline of 2, and in brighter light."""
     grey = noise()
     reference = View(grey, TISSUE, camera())
-    other = View(1.2 * np.roll(grey, -6, 1) + 10, TISSUE, camera(2.0))
+    other = View((1.2 * np.roll(grey, -6, 1) + 10).astype(np.uint8), TISSUE, camera(2.0))
     cost, votes = sweep(reference, [other, other], np.array([1 / 30, 1 / 20, 1 / 15]))
     inner = np.s_[4:-4, 11:-4]
     assert cost[inner][..., 1].max() < 0.01 and (votes[inner][..., 1] == 2).all()
@@ -45,7 +52,7 @@ def test_costs_are_least_at_the_distance_by_which_a_view_is_shifted():
 def test_contrast_of_two_grey_levels_correlates_by_half(deviation, cost):
     """Two equal pictures of variance v have the correlation v / (v + 4)."""
     checks = np.float32(100) + np.float32(deviation) * (2 * (np.indices((HEIGHT, WIDTH)).sum(0) % 2) - 1)
-    view = View(checks.astype(np.float32), TISSUE, camera())
+    view = View(checks.astype(np.uint8), TISSUE, camera())
     found, votes = sweep(view, [view], np.array([0.05]))
     assert found[8:-8, 8:-8, 0].mean() == pytest.approx(cost, abs=0.003)
     assert (votes[8:-8, 8:-8, 0] == (cost < 0.2)).all()
@@ -64,48 +71,6 @@ def test_views_do_not_count_where_three_pixels_around_are_not_all_tissue():
         "the mean of the views, of which none costs more than 0.5"
     )
     assert cost[5:-5, 5:18, 0].mean() > 0.4 and votes.max() == 1
-
-
-def test_costs_are_aggregated_over_paths_from_four_sides():
-    """Against loops over pixels and labels, with a penalty of 0.02 for one label and 0.1 for several."""
-    cost = np.random.default_rng(3).uniform(0, 0.5, (4, 5, 6)).astype(np.float32)
-
-    def path(costs: np.ndarray) -> list[np.ndarray]:
-        kept = [costs[0].astype(np.float64)]
-        for each in costs[1:]:
-            before = kept[-1]
-            kept.append(
-                np.array(
-                    [
-                        each[k]
-                        + min(before[j] + {0: 0.0, 1: 0.02}.get(abs(j - k), 0.1) for j in range(6))
-                        - before.min()
-                        for k in range(6)
-                    ]
-                )
-            )
-        return kept
-
-    expected = np.zeros(cost.shape)
-    for column in range(5):
-        expected[:, column] += np.array(path(cost[:, column])) + np.array(path(cost[::-1, column]))[::-1]
-    for row in range(4):
-        expected[row] += np.array(path(cost[row])) + np.array(path(cost[row, ::-1]))[::-1]
-    np.testing.assert_allclose(aggregated(cost), expected, atol=1e-5)
-
-
-def test_labels_are_at_the_vertex_of_a_parabola_and_as_unique_as_the_next_best_is_dear():
-    label = np.arange(12)
-    vertices = np.array([3.3, 6.0, 0.2, 10.9])
-    total = 0.5 + 0.1 * (label - vertices[:, None]) ** 2
-    total[0, 9] = 0.75
-    found, unique = best_labels(total[None].astype(np.float32))
-    np.testing.assert_allclose(found[0], [3.3, 6.0, 0.0, 11.0], atol=1e-3)
-    least = [total[k, round(at)] for k, at in enumerate(vertices)]
-    next_best = [0.75, total[1, 3], total[2, 3], total[3, 8]]
-    np.testing.assert_allclose(unique[0], [b / a - 1 for a, b in zip(least, next_best, strict=True)], rtol=1e-3)
-    flat, same = best_labels(np.full((1, 1, 5), 0.3, np.float32))
-    assert flat[0, 0] == 0 and same[0, 0] == 0
 
 
 CORNERS = np.random.default_rng(1).uniform([6, 6], [WIDTH - 6, HEIGHT - 6], (40, 2)).astype(np.float32)
