@@ -50,7 +50,7 @@ def expected_features(field, xyzt):
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 2e-6), (torch.float64, 1e-12)])
-def test_features_and_gradients_are_those_of_sampled_planes(dtype, tolerance):
+def test_hexplane_features_and_gradients_equal_sampled_planes(dtype, tolerance):
     field = small_field(dtype)
     xyzt = (torch.rand(40, 4, dtype=dtype) * 3 - 1.5).requires_grad_()  # some are outside
     inputs = [xyzt, *field.spatial_planes(), *field.temporal_planes()]
@@ -65,7 +65,7 @@ def test_features_and_gradients_are_those_of_sampled_planes(dtype, tolerance):
         assert (own - other).abs().max() < 10 * tolerance * max(1, float(other.abs().max()))
 
 
-def test_the_parameters_have_gsplats_names_and_shapes():
+def test_hexplane_parameters_have_names_and_shapes_of_gsplat():
     field = small_field()
     shapes = {name: tuple(tensor.shape) for name, tensor in field.state_dict().items()}
     assert shapes["aabb"] == (2, 3) and field.aabb[0].tolist() == pytest.approx([1.3] * 3)
@@ -80,14 +80,14 @@ def test_the_parameters_have_gsplats_names_and_shapes():
     assert HexPlaneField().feat_dim == 64
 
 
-def test_inputs_that_are_no_positions_and_times_are_refused():
+def test_hexplane_rejects_invalid_inputs():
     with pytest.raises(ValueError, match="last dim"):
         small_field()(torch.rand(3, 3))
     with pytest.raises(ValueError, match="grid_dimensions 2"):
         HexPlaneField(planes_config={**SMALL, "grid_dimensions": 3})
 
 
-def test_an_untrained_network_is_the_identity_and_learns():
+def test_untrained_deform_network_is_identity_and_trainable():
     network = DeformNetwork(10, 8, 2)
     means, quats, opacities, features = torch.rand(4, 3), torch.rand(4, 4), torch.rand(4, 1), torch.rand(4, 10)
     found = network(means, quats, opacities, torch.zeros(4, 1), features)
@@ -105,7 +105,7 @@ def test_an_untrained_network_is_the_identity_and_learns():
         ({"quats": torch.rand(4, 4, dtype=torch.float64)}, "dtype mismatch"),
     ],
 )
-def test_tensors_that_do_not_fit_together_are_refused(change, reason):
+def test_deform_network_rejects_mismatched_tensors(change, reason):
     given = {
         "means": torch.rand(4, 3), "quats": torch.rand(4, 4), "opacities": torch.rand(4, 1), "t": torch.zeros(4, 1),
         "plane_features": torch.rand(4, 10),
@@ -115,7 +115,7 @@ def test_tensors_that_do_not_fit_together_are_refused(change, reason):
 
 
 @pytest.mark.slow
-def test_the_mask_of_the_strategy_follows_the_rows():
+def test_dynamic_strategy_mask_follows_rows():
     generator = torch.Generator().manual_seed(0)
     n = 12
     values = {
@@ -148,7 +148,7 @@ def test_the_mask_of_the_strategy_follows_the_rows():
         strategy.step_post_backward(params, optimizers, {"grad2d": None, "count": None}, 1, info)
 
 
-def test_regularisers_are_second_differences_and_deviations_from_one():
+def test_hexplane_regularisers_closed_form():
     rows = torch.arange(8.0)
     ramp, square = (values.view(1, 1, 8, 1).expand(1, 4, 8, 6) for values in (rows, rows**2))
     assert plane_smoothness([ramp]) < 1e-10

@@ -14,7 +14,7 @@ from gsplat_core.reference.training import ssim_map
 K = torch.tensor([[20.0, 0, 8], [0, 20, 6], [0, 0, 1]])
 
 
-def test_pixels_with_depth_become_points_of_the_world():
+def test_depth_unprojection_converts_pixels_to_world_points():
     images = torch.zeros(2, 12, 16, 3, dtype=torch.uint8)
     images[1, 3, 5] = torch.tensor([255, 51, 0], dtype=torch.uint8)
     depths, masks = torch.zeros(2, 12, 16), torch.ones(2, 12, 16)
@@ -32,7 +32,7 @@ def test_pixels_with_depth_become_points_of_the_world():
         contrib.multi_frame_depth_unprojection(images, depths, masks[:1], poses, K.repeat(2, 1, 1))
 
 
-def test_scales_are_distances_of_neighbours():
+def test_knn_scale_init_equals_neighbour_distances():
     points = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 2], [50, 0, 0]])
     assert contrib.knn_scale_init(points)[0].item() == pytest.approx(math.log(math.sqrt((1 + 4 + 4) / 3)))
     assert contrib.knn_scale_init(torch.zeros(4, 3)).tolist() == pytest.approx([math.log(1e-7)] * 4)
@@ -40,7 +40,7 @@ def test_scales_are_distances_of_neighbours():
         contrib.knn_scale_init(points[:3])
 
 
-def test_losses_leave_out_masked_pixels():
+def test_masked_losses_ignore_masked_pixels():
     own, other = torch.rand(1, 3, 16, 16), torch.rand(1, 3, 16, 16)
     mask = (torch.rand(1, 1, 16, 16) > 0.5).float()
     difference = ((own - other).abs() * mask).sum() / (3 * mask.sum())
@@ -53,7 +53,7 @@ def test_losses_leave_out_masked_pixels():
         contrib.masked_ssim(own, other[:, :1], mask)
 
 
-def test_depth_losses_count_known_pairs():
+def test_depth_losses_count_known_pairs_only():
     own, other = torch.tensor([[2.0, 0, 4, 5]], requires_grad=True), torch.tensor([[4.0, 3, 0, 2]])
     assert contrib.binocular_disparity_l1(own, other).item() == pytest.approx((0.25 + 0.3) / 2)
     kept = torch.tensor([[1, 1, 1, 0]])
@@ -67,7 +67,7 @@ def test_depth_losses_count_known_pairs():
     assert contrib.pearson_depth_loss(0 * line, line).isfinite()
 
 
-def test_total_variation_is_the_sum_of_steps():
+def test_targeted_total_variation_closed_form():
     image = torch.zeros(1, 2, 4, 5)
     image[..., 3:] = 0.5  # one step in each of 4 rows of both channels
     assert contrib.compute_tv_loss_targeted(image).item() == pytest.approx(4 * 2 * 0.5 / 40)
@@ -79,7 +79,7 @@ def test_total_variation_is_the_sum_of_steps():
         contrib.compute_tv_loss_targeted(image[0])
 
 
-def test_the_schedule_stays_on_one_frame_first():
+def test_two_stage_scheduler_starts_with_single_frame():
     schedule = contrib.TwoStageScheduler(coarse_steps=2, fine_steps=10, coarse_frame_index=1)
     steps = [schedule.step(k, 3) for k in range(6)]
     assert [each.frame_index for each in steps] == [1, 1, 0, 1, 2, 0]
@@ -92,7 +92,7 @@ def test_the_schedule_stays_on_one_frame_first():
         contrib.TwoStageScheduler(1, -1)
 
 
-def test_a_training_with_all_parts_lowers_its_loss():
+def test_surgical_training_steps_lower_loss():
     """The steps of gsplat's surgical trainer on one frame."""
     torch.manual_seed(0)
     image, depth, mask = torch.rand(1, 12, 16, 3) * 0.2 + 0.4, torch.full((1, 12, 16), 3.0), torch.ones(1, 12, 16)

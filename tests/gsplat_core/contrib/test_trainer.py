@@ -14,13 +14,13 @@ def draw(*shape, seed=0):
     return torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-def test_l1_and_mse_loss_return_the_difference_of_each_value():
+def test_l1_and_mse_loss_return_elementwise_differences():
     own, other = draw(2, 5, 3), draw(2, 5, 3, seed=1)
     assert torch.equal(contrib.l1_loss(own, other), (own - other).abs())
     assert torch.equal(contrib.mse_loss(own, other), (own - other) ** 2)
 
 
-def test_similarity_is_that_of_fused_ssim_with_a_window_of_11_pixels():
+def test_ssim_loss_equals_fused_ssim_with_window_of_11_pixels():
     own, other = draw(1, 3, 20, 24).float().requires_grad_(), draw(1, 3, 20, 24, seed=1).float()
     loss = contrib.ssim_loss(own, other)
     assert loss.item() == pytest.approx(1 - fused_ssim(own, other).item())
@@ -30,7 +30,7 @@ def test_similarity_is_that_of_fused_ssim_with_a_window_of_11_pixels():
         contrib.ssim_loss(own, other, 7)
 
 
-def test_depths_are_compared_by_their_inverses_and_unknown_ones_have_none():
+def test_depth_l1_loss_compares_inverse_depths():
     own = torch.tensor([2.0, 0.0, 4.0, -1.0], requires_grad=True)
     loss = contrib.depth_l1_loss(own, torch.tensor([4.0, 2.0, 0.0, 0.0]), scene_scale=3.0)
     assert loss.item() == pytest.approx(3 * (0.25 + 0.5 + 0.25 + 0) / 4)
@@ -38,13 +38,13 @@ def test_depths_are_compared_by_their_inverses_and_unknown_ones_have_none():
     assert own.grad.tolist() == pytest.approx([-3 / 4 / 4, 0, -3 / 4 / 16, 0])
 
 
-def test_regularisers_are_means_of_activated_values():
+def test_opacity_and_scale_regularisers_are_means_of_activated_values():
     assert contrib.opacity_reg_loss(torch.tensor([0.0, 100.0])).item() == pytest.approx(0.75)
     assert contrib.scale_reg_loss(torch.tensor([[0.0, 0, 0], [1, 1, 1]])).item() == pytest.approx((1 + torch.e) / 2)
 
 
 @pytest.mark.parametrize("shape", [(2, 3, 4, 5), (2, 3, 4, 1), (5, 7, 2, 3, 4)])
-def test_the_total_variation_is_the_sum_of_mean_squares(shape):
+def test_total_variation_loss_is_sum_of_mean_squares(shape):
     values = draw(*shape)
     expected = 0.0
     for i in range(2, len(shape)):
@@ -54,7 +54,7 @@ def test_the_total_variation_is_the_sum_of_mean_squares(shape):
     assert contrib.total_variation_loss(draw(2, 3, 1, 1)).item() == 0
 
 
-def test_an_affine_change_of_colours_is_undone():
+def test_color_correct_affine_reverts_affine_change():
     ref = 0.2 + 0.5 * draw(1, 12, 9, 3)
     gain, shift = (
         torch.tensor([0.8, 1.2, 0.5], dtype=torch.float64),
@@ -67,7 +67,7 @@ def test_an_affine_change_of_colours_is_undone():
         contrib.color_correct_affine(ref, ref[..., :2])
 
 
-def test_a_quadratic_change_of_colours_is_undone_without_saturated_pixels():
+def test_color_correct_quadratic_reverts_change_ignoring_saturated_pixels():
     img = 0.1 + 0.6 * draw(40, 30, 3)
     ref = 0.05 + 0.6 * img + 0.3 * img * img.roll(1, -1)
     saturated = ref.clone()
@@ -77,7 +77,7 @@ def test_a_quadratic_change_of_colours_is_undone_without_saturated_pixels():
     torch.testing.assert_close(found.double(), ref, rtol=0, atol=1e-5)
 
 
-def test_one_quadratic_round_is_the_least_squares_fit():
+def test_color_correct_quadratic_single_round_equals_least_squares_fit():
     img, ref = 0.1 + 0.8 * draw(50, 3), 0.1 + 0.8 * draw(50, 3, seed=1)
     squares = torch.stack([img[:, i] * img[:, j] for i in range(3) for j in range(i, 3)], 1)
     terms = torch.cat([squares, img, torch.ones(50, 1, dtype=img.dtype)], 1)

@@ -20,7 +20,7 @@ def random_field(count, window=(0.0, 4.0), **layout):
     return field
 
 
-def test_bumps_cover_the_window_and_one_spacing_more():
+def test_basis_field_bumps_cover_window_and_one_spacing():
     field = BasisField(3, (10.0, 15.0), bumps=13)
     assert field.spacing_s == 0.5
     assert field.frame_time(10.0) == pytest.approx(1.0)
@@ -31,7 +31,7 @@ def test_bumps_cover_the_window_and_one_spacing_more():
     assert by_spacing.config() == field.config()
 
 
-def test_equal_weights_make_an_even_motion_inside_the_window():
+def test_basis_field_equal_weights_give_constant_motion():
     field = BasisField(1, (0.0, 4.0), bumps=16)
     with torch.no_grad():
         field.weights[:] = 1.0
@@ -39,7 +39,7 @@ def test_equal_weights_make_an_even_motion_inside_the_window():
     assert float(values.detach().max() / values.detach().min()) < 1.001
 
 
-def test_each_group_of_channels_moves_its_own_part(make_gaussians):
+def test_displaced_applies_channels_to_matching_parameters(make_gaussians):
     gaussians = make_gaussians(2, sh_degree=1)
     deltas = torch.zeros(2, 13)
     deltas[:, :3], deltas[:, 3:7], deltas[:, 7:10], deltas[:, 10:] = 1.0, 2.0, 3.0, 4.0
@@ -52,7 +52,7 @@ def test_each_group_of_channels_moves_its_own_part(make_gaussians):
     assert torch.equal(moved.logit_opacities, gaussians.logit_opacities)
 
 
-def test_extending_keeps_the_motion_that_was_there():
+def test_basis_field_extend_keeps_existing_motion():
     field = random_field(20)
     times = [0.0, 0.7, 2.0, 3.1]
     before = [field.deltas(t).detach() for t in times]
@@ -64,7 +64,7 @@ def test_extending_keeps_the_motion_that_was_there():
         torch.testing.assert_close(field.deltas(t).detach(), wanted, rtol=0, atol=0)
 
 
-def test_trimming_keeps_the_motion_of_the_new_window():
+def test_basis_field_trimming_keeps_motion_of_new_window():
     field = BasisField(20, (0.0, 4.0), bumps=30)
     with torch.no_grad():
         field.weights.normal_(generator=torch.Generator().manual_seed(0))
@@ -76,7 +76,7 @@ def test_trimming_keeps_the_motion_of_the_new_window():
 
 
 @pytest.mark.slow
-def test_a_long_stream_keeps_its_size_and_precision():
+def test_basis_field_size_and_precision_constant_in_long_stream():
     field = BasisField(5, (0.0, 2.0), spacing_s=0.2)
     sizes = set()
     for second in range(1, 4000):
@@ -88,7 +88,7 @@ def test_a_long_stream_keeps_its_size_and_precision():
     assert 0 <= field.frame_time(3999.0) <= 8
 
 
-def test_new_bumps_hold_the_last_motion_when_asked():
+def test_basis_field_new_bumps_hold_last_motion_on_request():
     held, still = random_field(10), random_field(10)
     with torch.no_grad():
         for field in (held, still):
@@ -102,14 +102,14 @@ def test_new_bumps_hold_the_last_motion_when_asked():
     assert float(still.deltas(7.0).detach().abs().max()) == 0.0
 
 
-def test_a_window_never_moves_back():
+def test_basis_field_rejects_window_moving_backwards():
     field = BasisField(1, (1.0, 2.0))
     for window in ((0.5, 2.0), (1.0, 1.5)):
         with pytest.raises(InvalidInput, match="forward"):
             field.extend(window)
 
 
-def test_adam_step_lowers_the_loss_and_its_state_follows_every_change():
+def test_basis_field_adam_step_lowers_loss_after_structural_changes():
     field = BasisField(30, (0.0, 2.0), spacing_s=0.25)
     target = torch.randn(30, 13, generator=torch.Generator().manual_seed(5)) * 0.05
 
@@ -131,7 +131,7 @@ def test_adam_step_lowers_the_loss_and_its_state_follows_every_change():
     assert field.count == 20
 
 
-def test_a_bump_added_late_starts_with_steps_of_the_learning_rate():
+def test_basis_field_late_bump_starts_with_learning_rate_steps():
     field = BasisField(1, (0.0, 1.0), spacing_s=0.25)
     for _ in range(200):
         field.adam_step(0.5, torch.ones(1, 13), RATES)
@@ -143,7 +143,7 @@ def test_a_bump_added_late_starts_with_steps_of_the_learning_rate():
         assert float(step) == pytest.approx(RATES.position, rel=1e-2)
 
 
-def test_new_gaussians_start_still_or_like_their_parents():
+def test_basis_field_appended_gaussians_start_still_or_like_parents():
     field = random_field(4)
     field.adam_step(1.0, torch.ones(4, 13), RATES)
     field.append(2)
@@ -156,7 +156,7 @@ def test_new_gaussians_start_still_or_like_their_parents():
         field.append(3, parents=torch.tensor([0]))
 
 
-def test_selecting_takes_positions_or_a_mask():
+def test_basis_field_select_accepts_indices_or_mask():
     field = random_field(5)
     before = field.deltas(1.0).detach()
     field.select(torch.tensor([True, False, True, True, False]))
@@ -165,18 +165,18 @@ def test_selecting_takes_positions_or_a_mask():
     assert torch.equal(field.deltas(1.0).detach(), before[[3, 0]])
 
 
-def test_a_field_for_other_gaussians_is_refused(make_gaussians):
+def test_basis_field_rejects_different_gaussian_count(make_gaussians):
     with pytest.raises(InvalidInput, match="5 Gaussians, got 4"):
         BasisField(5, (0.0, 1.0))(make_gaussians(4), 0.5)
 
 
 @pytest.mark.parametrize("layout", [{"bumps": 3}, {"spacing_s": 0.0}, {"spacing_s": float("nan")}])
-def test_impossible_layouts_are_refused(layout):
+def test_basis_field_rejects_invalid_layouts(layout):
     with pytest.raises(InvalidInput):
         BasisField(1, (0.0, 1.0), **layout)
 
 
-def test_nan_stays_with_its_gaussian(make_gaussians):
+def test_basis_field_nan_affects_own_gaussian_only(make_gaussians):
     gaussians = make_gaussians(6)
     field = random_field(6)
     with torch.no_grad():
@@ -186,7 +186,7 @@ def test_nan_stays_with_its_gaussian(make_gaussians):
     assert moved.means[[0, 1, 3, 4, 5]].isfinite().all()
 
 
-def test_spare_columns_become_bumps_at_the_same_addresses(device):
+def test_basis_field_spare_columns_become_bumps_without_reallocation(device):
     def grown(spare: bool) -> BasisField:
         torch.manual_seed(3)
         field = BasisField(7, (0.0, 1.0), bumps=6).to(device)

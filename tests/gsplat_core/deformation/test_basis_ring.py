@@ -51,7 +51,7 @@ def addresses(field: BasisField) -> list[tuple[int, tuple[int, ...]]]:
 
 
 @pytest.mark.slow
-def test_a_ring_is_the_field_that_keeps_everything_within_its_history():
+def test_ring_equals_full_field_within_history():
     ring, everything = exact(online(6)), exact(online(6, history_s=None))
     newest = 0.0
     for frame in range(200):
@@ -70,7 +70,7 @@ def test_a_ring_is_the_field_that_keeps_everything_within_its_history():
 
 
 @pytest.mark.slow
-def test_a_ring_goes_on_learning():
+def test_ring_continues_learning():
     field, newest, errors = online(6), 0.0, []
     for frame in range(1000):
         watch(field, frame * FRAME_S, newest, steps=4)
@@ -81,7 +81,7 @@ def test_a_ring_goes_on_learning():
 
 
 @pytest.mark.slow
-def test_the_gradient_is_that_of_the_field_that_keeps_everything():
+def test_ring_gradient_equals_full_field():
     ring, everything = exact(online(4)), exact(online(4, history_s=None))
     newest = 0.0
     for frame in range(110):
@@ -97,7 +97,7 @@ def test_the_gradient_is_that_of_the_field_that_keeps_everything():
 
 
 @pytest.mark.slow
-def test_no_tensor_moves_and_centres_stay_exact_in_a_stream_of_ten_thousand_columns():
+def test_ring_addresses_and_centres_constant_over_10000_columns():
     field = online(3, history_s=1.0)
     field.cover(0.0, 0.0)
     at, newest = addresses(field), 0.0
@@ -114,7 +114,7 @@ def test_no_tensor_moves_and_centres_stay_exact_in_a_stream_of_ten_thousand_colu
     assert field.columns.origin_s + field.frame_time(newest) * SPACING_S == pytest.approx(newest, abs=1e-9)
 
 
-def test_trained_centres_lose_no_bit_when_the_origin_moves_on():
+def test_ring_trained_centres_exact_when_origin_moves():
     field = online(2)
     newest = 0.0
     while field.columns.spare:
@@ -129,7 +129,7 @@ def test_trained_centres_lose_no_bit_when_the_origin_moves_on():
     assert torch.equal(kept, before[:, passed:] - passed)
 
 
-def test_a_gap_longer_than_the_history_holds_the_last_state():
+def test_ring_holds_last_state_over_gap_longer_than_history():
     field = online(5)
     newest = 0.0
     for frame in range(60):
@@ -147,7 +147,7 @@ def test_a_gap_longer_than_the_history_holds_the_last_state():
     assert float(error[:, :3].abs().max()) < 0.03
 
 
-def test_new_bumps_start_their_moments_afresh():
+def test_ring_new_bumps_have_zero_moments():
     field = online(2)
     newest = 0.0
     for frame in range(100):
@@ -166,7 +166,7 @@ def test_new_bumps_start_their_moments_afresh():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
-def test_any_order_of_frames_gaps_and_gaussians_agrees_with_the_field_that_keeps_everything(seed):
+def test_ring_equals_full_field_for_random_frames_gaps_and_gaussians(seed):
     chance = random.Random(seed)
     ring, everything = exact(online(5)), exact(online(5, history_s=None))
     capacity = 24
@@ -201,7 +201,7 @@ def test_any_order_of_frames_gaps_and_gaussians_agrees_with_the_field_that_keeps
         assert (tensor[used:] == 0).all()
 
 
-def test_all_reserved_rows_can_be_deformed_and_trained_at_once():
+def test_ring_reserved_rows_can_be_deformed_and_trained():
     field = online(4)
     field.reserve(9)
     watch(field, 0.1, 0.0)
@@ -221,7 +221,7 @@ def test_all_reserved_rows_can_be_deformed_and_trained_at_once():
     assert (field.weights[4:] == 0).all()
 
 
-def test_restarting_is_a_new_field_in_the_same_memory():
+def test_ring_restart_equals_new_field_in_same_memory():
     field = online(3)
     field.reserve(8)
     newest = 0.0
@@ -240,13 +240,13 @@ def test_restarting_is_a_new_field_in_the_same_memory():
     assert torch.equal(field.deltas(54.0), fresh.deltas(54.0))
 
 
-def test_more_gaussians_than_rows_are_refused_at_a_restart():
+def test_ring_restart_rejects_more_gaussians_than_rows():
     field = online(3)
     with pytest.raises(InvalidInput, match="a field with 3 rows cannot restart with 4 Gaussians"):
         field.restart(0.0, 4)
 
 
-def test_a_saved_ring_is_its_window(tmp_path, make_gaussians):
+def test_saved_ring_contains_window(tmp_path, make_gaussians):
     gaussians = make_gaussians(5)
     field = online(5)
     field.reserve(11)
@@ -266,7 +266,7 @@ def test_a_saved_ring_is_its_window(tmp_path, make_gaussians):
     torch.testing.assert_close(loaded.deltas(newest - 1.0), field.deltas(newest - 1.0).detach(), rtol=0, atol=1e-6)
 
 
-def test_snapshots_of_a_ring_stay_at_their_addresses(make_gaussians, device):
+def test_ring_snapshots_keep_addresses(make_gaussians, device):
     gaussians = make_gaussians(5).to(device)
     field = online(5).to(device)
     slots = SnapshotSlots(device, most=1, rows=40)
@@ -286,12 +286,12 @@ def test_snapshots_of_a_ring_stay_at_their_addresses(make_gaussians, device):
 
 
 @pytest.mark.parametrize("history_s", [0.0, -1.0, float("nan"), float("inf")])
-def test_an_impossible_history_is_refused(history_s):
+def test_ring_rejects_invalid_history(history_s):
     with pytest.raises(InvalidInput, match="history_s"):
         online(1).keep_last(history_s)
 
 
-def test_what_is_held_fades_where_training_goes_on_and_stays_where_nobody_looks():
+def test_ring_held_motion_fades_for_trained_gaussians_only():
     field, newest = online(2), 0.0
     field.keep_last(HISTORY_S, fading_s=1.0)
     pull = torch.zeros(2, 13)

@@ -27,7 +27,7 @@ def some_gaussians(count: int = 5) -> Gaussians:
     )  # fmt: skip
 
 
-def test_it_goes_on_linearly_from_the_newest_frame_and_then_holds() -> None:
+def test_continuation_is_linear_after_newest_frame_then_constant() -> None:
     field = moving_field()
     before, newest = field.deltas(0.3).detach(), field.deltas(0.5).detach()
     field.continue_with(torch.full((5, 16), 2.0), 0.5, 0.1)
@@ -38,7 +38,7 @@ def test_it_goes_on_linearly_from_the_newest_frame_and_then_holds() -> None:
     assert torch.equal(field.deltas(0.9), field.deltas(0.6))
 
 
-def test_it_reaches_beyond_the_fields_own_window() -> None:
+def test_continuation_reaches_beyond_window_of_field() -> None:
     field = moving_field()
     newest = field.deltas(1.0).detach()
     field.continue_with(torch.full((5, 16), 2.0), 1.0, 0.1)
@@ -47,14 +47,14 @@ def test_it_reaches_beyond_the_fields_own_window() -> None:
 
 
 @pytest.mark.parametrize("time_s", [0.2, 0.5, 0.53, 0.6, 3.0])
-def test_a_captured_frame_sees_the_same(time_s: float) -> None:
+def test_continuation_equal_in_captured_frame(time_s: float) -> None:
     field = moving_field()
     field.continue_with(torch.randn(5, 16, generator=torch.Generator().manual_seed(1)), 0.5, 0.1)
     captured = field.frame_deltas(some_gaussians())(torch.tensor([field.frame_time(time_s)]))
     torch.testing.assert_close(captured[:, :13], field.deltas(time_s).detach(), rtol=1e-4, atol=1e-5)
 
 
-def test_without_velocity_nothing_is_added() -> None:
+def test_continuation_without_velocity_adds_nothing() -> None:
     field = moving_field()
     plain = [field.deltas(t).detach() for t in (0.1, 0.5)]
     field.continue_with(torch.zeros(0, 16), 0.5, 0.1)
@@ -62,7 +62,7 @@ def test_without_velocity_nothing_is_added() -> None:
     assert torch.equal(field.deltas(0.6), field.deltas(0.5))
 
 
-def test_it_is_not_saved_and_travels_with_copies() -> None:
+def test_continuation_is_copied_but_not_saved() -> None:
     field = moving_field()
     names = set(field.state_dict())
     field.continue_with(torch.ones(5, 16), 0.5, 0.1)
@@ -71,7 +71,7 @@ def test_it_is_not_saved_and_travels_with_copies() -> None:
     assert "continuation" not in str(field.config())
 
 
-def test_a_slot_follows_and_stops() -> None:
+def test_continuation_slot_follows_start_and_stop() -> None:
     field = moving_field()
     field.continue_with(torch.ones(5, 16), 0.5, 0.1)
     slot = field.slot(8)
@@ -82,7 +82,7 @@ def test_a_slot_follows_and_stops() -> None:
     torch.testing.assert_close(slot.exact_copy().deltas(0.6), field.deltas(0.6).detach())  # type: ignore[attr-defined]
 
 
-def test_a_slot_made_without_one_has_to_be_replaced() -> None:
+def test_slot_without_continuation_cannot_be_overwritten() -> None:
     field = moving_field()
     slot = field.slot(8)
     assert slot is not None and slot.overwrite(field)
@@ -90,7 +90,7 @@ def test_a_slot_made_without_one_has_to_be_replaced() -> None:
     assert not slot.overwrite(field)
 
 
-def test_fewer_rows_later_leave_nothing_behind() -> None:
+def test_continuation_with_fewer_rows_clears_old_rows() -> None:
     continuation = Continuation(4)
     continuation.write(torch.ones(4, 16), 1.0, 0.5)
     continuation.write(torch.ones(2, 16), 1.0, 0.5)
@@ -104,12 +104,12 @@ def test_fewer_rows_later_leave_nothing_behind() -> None:
 @pytest.mark.parametrize(
     ("rows", "from_s", "horizon_s"), [(5, 0.0, 0.1), (2, math.nan, 0.1), (2, math.inf, 0.1), (2, 0.0, -1.0)]
 )
-def test_what_makes_no_continuation_is_refused(rows: int, from_s: float, horizon_s: float) -> None:
+def test_continuation_rejects_invalid_arguments(rows: int, from_s: float, horizon_s: float) -> None:
     with pytest.raises(InvalidInput):
         Continuation(4).write(torch.ones(rows, 16), from_s, horizon_s)
 
 
-def test_moving_a_field_at_a_time_changes_it_there_by_just_that() -> None:
+def test_move_to_changes_field_at_given_time_only() -> None:
     field = moving_field()
     before, far = field.deltas(0.5).detach(), field.deltas(0.0).detach()
     change = torch.randn(5, 13, generator=torch.Generator().manual_seed(2))
@@ -121,7 +121,7 @@ def test_moving_a_field_at_a_time_changes_it_there_by_just_that() -> None:
     assert (field.deltas(0.0).detach() - far).abs().max() < 0.2 * change[:3].abs().max()
 
 
-def test_moving_at_a_normalised_time_is_the_same_and_ignores_further_columns() -> None:
+def test_move_to_at_equals_move_to_and_ignores_further_columns() -> None:
     field, expected = moving_field(), moving_field()
     tau = torch.tensor([field.frame_time(0.5)])
     wanted = field.frame_deltas(some_gaussians())(tau) + 0.25
@@ -131,7 +131,7 @@ def test_moving_at_a_normalised_time_is_the_same_and_ignores_further_columns() -
     torch.testing.assert_close(field.deltas(0.5).detach(), wanted[:, :13])
 
 
-def test_scaling_positions_scales_them_at_all_times() -> None:
+def test_scale_positions_applies_at_all_times() -> None:
     field = moving_field()
     before = field.deltas(0.4).detach()
     factor = torch.tensor([1.0, 2.0, 0.5, 40.0, 1.0])

@@ -28,7 +28,7 @@ def largest_difference(a, b):
 
 @BOTH
 @pytest.mark.parametrize("count", [0, 1, 200])
-def test_an_untrained_field_is_the_identity(kind, count, make_gaussians):
+def test_untrained_field_is_identity(kind, count, make_gaussians):
     gaussians = make_gaussians(count, sh_degree=1)
     field = new_field(kind, gaussians, WINDOW)
     for time_s in (-5.0, 1.0, 3.3, 6.0, 99.0):
@@ -38,7 +38,7 @@ def test_an_untrained_field_is_the_identity(kind, count, make_gaussians):
 
 @BOTH
 @pytest.mark.parametrize("count", [0, 1, 777])
-def test_cached_inference_equals_the_plain_path(kind, count, make_gaussians):
+def test_cached_field_equals_plain_field(kind, count, make_gaussians):
     gaussians = make_gaussians(count, sh_degree=1)
     field = disturbed(kind, gaussians)
     at = field.cached(gaussians)
@@ -50,7 +50,7 @@ def test_cached_inference_equals_the_plain_path(kind, count, make_gaussians):
 
 
 @BOTH
-def test_outside_the_window_the_nearest_end_holds(kind, make_gaussians):
+def test_field_outside_window_equals_nearest_end(kind, make_gaussians):
     gaussians = make_gaussians(50)
     field = disturbed(kind, gaussians)
     assert largest_difference(field(gaussians, 0.0), field(gaussians, WINDOW[0])) == 0.0
@@ -58,7 +58,7 @@ def test_outside_the_window_the_nearest_end_holds(kind, make_gaussians):
 
 
 @BOTH
-def test_a_time_that_is_not_a_number_is_refused(kind, make_gaussians):
+def test_field_rejects_nan_time(kind, make_gaussians):
     gaussians = make_gaussians(2)
     field = new_field(kind, gaussians, WINDOW)
     with pytest.raises(InvalidInput, match="nan"):
@@ -66,7 +66,7 @@ def test_a_time_that_is_not_a_number_is_refused(kind, make_gaussians):
 
 
 @BOTH
-def test_config_rebuilds_the_architecture(kind, make_gaussians):
+def test_field_config_rebuilds_architecture(kind, make_gaussians):
     gaussians = make_gaussians(30)
     field = disturbed(kind, gaussians)
     config = json.loads(json.dumps(field.config()))
@@ -77,7 +77,7 @@ def test_config_rebuilds_the_architecture(kind, make_gaussians):
 
 
 @BOTH
-def test_gradients_reach_the_field_and_the_gaussians(kind, make_gaussians):
+def test_field_gradients_reach_parameters_and_gaussians(kind, make_gaussians):
     gaussians = make_gaussians(40).requires_grad_()
     field = disturbed(kind, gaussians)
     field(gaussians, 3.0).means.square().sum().backward()
@@ -87,7 +87,7 @@ def test_gradients_reach_the_field_and_the_gaussians(kind, make_gaussians):
 
 
 @BOTH
-def test_float64_goes_through_the_reference(kind, make_gaussians):
+def test_field_float64_uses_reference(kind, make_gaussians):
     gaussians = make_gaussians(20)
     field = disturbed(kind, gaussians)
     exact = field.detached_copy().to(torch.float64)
@@ -96,7 +96,7 @@ def test_float64_goes_through_the_reference(kind, make_gaussians):
 
 
 @BOTH
-def test_a_detached_copy_does_not_follow_training(kind, make_gaussians):
+def test_field_detached_copy_unchanged_by_training(kind, make_gaussians):
     gaussians = make_gaussians(20)
     field = disturbed(kind, gaussians)
     copied = field.detached_copy()
@@ -108,7 +108,7 @@ def test_a_detached_copy_does_not_follow_training(kind, make_gaussians):
     assert not any(p.requires_grad for p in copied.parameters())
 
 
-def test_the_choice_of_field(make_gaussians):
+def test_new_field_selects_kind(make_gaussians):
     gaussians = make_gaussians(3)
     assert isinstance(new_field("auto", gaussians, WINDOW), BasisField)
     assert isinstance(new_field("basis", gaussians, WINDOW, bumps=9), BasisField)
@@ -119,14 +119,14 @@ def test_the_choice_of_field(make_gaussians):
 
 
 @pytest.mark.parametrize("kind", ["spline", "auto", None, 3, ["basis"], "b" * 10_000])
-def test_a_configuration_has_to_name_a_field_itself(kind, make_gaussians):
+def test_field_from_config_rejects_unknown_kind(kind, make_gaussians):
     with pytest.raises(InvalidSetting, match="known are basis, hexplane") as refused:
         field_from_config({"kind": kind}, make_gaussians(3))
     assert len(str(refused.value)) < 200
 
 
 @BOTH
-def test_a_configuration_out_of_range_is_refused_before_a_field_is_made(kind, make_gaussians):
+def test_field_checked_config_rejects_values_out_of_range(kind, make_gaussians):
     config = new_field(kind, make_gaussians(2), WINDOW).config()
     for name in config.keys() - {"kind"}:
         below = [] if name == "origin_s" else [-1, 0]
@@ -137,14 +137,14 @@ def test_a_configuration_out_of_range_is_refused_before_a_field_is_made(kind, ma
 
 
 @pytest.mark.parametrize("window", [(2.0, 1.0), (0.0, float("inf")), (float("nan"), 1.0)])
-def test_a_window_must_be_two_times_in_order(window, make_gaussians):
+def test_field_rejects_invalid_window(window, make_gaussians):
     for kind in ("basis", "hexplane"):
         with pytest.raises(InvalidInput, match="time_window_s"):
             new_field(kind, make_gaussians(1), window)
 
 
 @BOTH
-def test_a_window_of_one_moment_works(kind, make_gaussians):
+def test_field_accepts_window_of_zero_length(kind, make_gaussians):
     gaussians = make_gaussians(10)
     field = disturbed(kind, gaussians, (2.0, 2.0))
     assert largest_difference(field(gaussians, 2.0), field(gaussians, 5.0)) == 0.0

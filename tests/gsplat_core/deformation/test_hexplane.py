@@ -17,7 +17,7 @@ def small_field(gaussians, window=WINDOW):
     return HexPlaneField(gaussians, window, **SMALL)
 
 
-def test_planes_have_the_stated_sizes(make_gaussians):
+def test_hexplane_planes_have_configured_sizes(make_gaussians):
     field = small_field(make_gaussians(9))
     shapes = [{name: tuple(level[name].shape) for name in PLANE_NAMES} for level in field.planes]
     assert shapes[0] == {
@@ -26,7 +26,7 @@ def test_planes_have_the_stated_sizes(make_gaussians):
     assert shapes[1]["xy"] == (14, 12, 8) and shapes[1]["zt"] == (9, 10, 8)
 
 
-def test_the_default_is_the_small_grid(make_gaussians):
+def test_hexplane_default_config(make_gaussians):
     field = HexPlaneField(make_gaussians(2), WINDOW)
     assert field.config() == {
         "kind": "hexplane", "time_window_s": [2.0, 4.0], "channels": 32, "resolution": [64, 64, 64, 25],
@@ -34,7 +34,7 @@ def test_the_default_is_the_small_grid(make_gaussians):
     }  # fmt: skip
 
 
-def test_the_box_holds_the_gaussians_and_each_axis_uses_its_whole_grid(make_gaussians):
+def test_hexplane_box_contains_gaussians_and_spans_grid(make_gaussians):
     gaussians = make_gaussians(500)
     field = small_field(gaussians)
     first = field.coordinates(gaussians.means, WINDOW[0])
@@ -48,7 +48,7 @@ def test_the_box_holds_the_gaussians_and_each_axis_uses_its_whole_grid(make_gaus
     torch.testing.assert_close(corners, torch.tensor([[-1.0] * 3, [1.0] * 3]))
 
 
-def test_positions_outside_the_box_are_clamped_to_its_surface(make_gaussians):
+def test_hexplane_clamps_positions_outside_box(make_gaussians):
     field = small_field(make_gaussians(20))
     outside = field.box.mean(dim=0) + torch.tensor([[1e4, 0.0, 0.0], [0.0, -1e4, 1e4]])
     coordinates = field.coordinates(outside, 3.0)
@@ -56,7 +56,7 @@ def test_positions_outside_the_box_are_clamped_to_its_surface(make_gaussians):
 
 
 @pytest.mark.parametrize("name", PLANE_NAMES)
-def test_every_cell_row_of_every_axis_is_read(name, make_gaussians):
+def test_hexplane_features_depend_on_every_border_cell(name, make_gaussians):
     """A change of the first or the last row or column of any plane shows in the features: no part of an axis is unused."""
     gaussians = make_gaussians(5)
     field = small_field(gaussians)
@@ -72,7 +72,7 @@ def test_every_cell_row_of_every_axis_is_read(name, make_gaussians):
             assert torch.equal(after[1], before[1])
 
 
-def test_the_field_varies_in_space_and_in_time(make_gaussians):
+def test_hexplane_field_varies_in_space_and_time(make_gaussians):
     gaussians = make_gaussians(200)
     field = small_field(gaussians)
     with torch.no_grad():
@@ -86,7 +86,7 @@ def test_the_field_varies_in_space_and_in_time(make_gaussians):
     assert float((deltas[4] - deltas[0]).abs().mean()) > 0.01
 
 
-def test_an_extended_window_keeps_what_was_learned_where_it_was(make_gaussians):
+def test_hexplane_extend_keeps_learned_motion(make_gaussians):
     gaussians = make_gaussians(50)
     field = small_field(gaussians)
     with torch.no_grad():
@@ -101,7 +101,7 @@ def test_an_extended_window_keeps_what_was_learned_where_it_was(make_gaussians):
         assert field.time_window_s == (2.0, 6.0)
 
 
-def test_nan_positions_do_not_make_the_box(make_gaussians):
+def test_hexplane_box_ignores_nan_positions(make_gaussians):
     gaussians = make_gaussians(10)
     gaussians.means[3, 1] = float("nan")
     field = small_field(gaussians)
@@ -116,13 +116,13 @@ def test_nan_positions_do_not_make_the_box(make_gaussians):
 @pytest.mark.parametrize(
     "wrong", [{"resolution": (1, 4, 4, 4)}, {"resolution": (4, 4, 4)}, {"levels": ()}, {"channels": 0}, {"depth": 0}]
 )
-def test_impossible_architectures_are_refused(wrong, make_gaussians):
+def test_hexplane_rejects_invalid_architectures(wrong, make_gaussians):
     with pytest.raises(InvalidInput):
         HexPlaneField(make_gaussians(2), WINDOW, **(SMALL | wrong))
 
 
 @pytest.mark.parametrize("count", [0, 1, 30])
-def test_frame_deltas_are_what_forward_adds(make_gaussians, count):
+def test_hexplane_frame_deltas_equal_forward_change(make_gaussians, count):
     gaussians = make_gaussians(count)
     field = small_field(gaussians)
     with torch.no_grad():
@@ -141,18 +141,18 @@ def test_frame_deltas_are_what_forward_adds(make_gaussians, count):
         torch.testing.assert_close(gaussians.tensors()[name] + added, moved.tensors()[name], rtol=1e-5, atol=1e-5)
 
 
-def test_frame_time_is_clamped_to_the_window(make_gaussians):
+def test_hexplane_frame_time_clamped_to_window(make_gaussians):
     field = small_field(make_gaussians(3))
     assert [field.frame_time(t) for t in (1.0, 2.0, 3.0, 4.0, 9.0)] == [-1.0, -1.0, 0.0, 1.0, 1.0]
 
 
 @pytest.mark.parametrize(("end_s", "rows"), [(6.0, 61), (1.0, 2), (1e6, MOST_ROWS)])
-def test_where_the_end_is_known_time_rows_are_as_fine_as_motion_has_to_be(make_gaussians, end_s, rows):
+def test_hexplane_time_rows_follow_spacing_with_known_end(make_gaussians, end_s, rows):
     field = KIND.made_for(NewField(make_gaussians(5), 1.0, end_s, spacing_s=1 / 12))
     assert field.resolution[3] == rows
     assert field.time_window_s == (1.0, end_s)
 
 
-def test_online_a_field_has_its_default_size(make_gaussians):
+def test_hexplane_online_field_has_default_size(make_gaussians):
     field = KIND.made_for(NewField(make_gaussians(5), 1.0, None, spacing_s=0.2))
     assert field.config() == HexPlaneField(make_gaussians(5), (1.0, 1.2)).config()

@@ -12,7 +12,7 @@ from gsplat_core.ops.plain_torch import basis_field
 
 
 @pytest.mark.parametrize("amount", [0.0, 0.3, 1.0])
-def test_moves_towards_the_mean_of_both_neighbours(amount):
+def test_towards_neighbours_moves_towards_mean_of_neighbours(amount):
     values = torch.randn(3, 6, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     expected = values.clone()
     expected[:, 1:-1] += amount * ((values[:, :-2] + values[:, 2:]) / 2 - values[:, 1:-1])
@@ -20,7 +20,7 @@ def test_moves_towards_the_mean_of_both_neighbours(amount):
     torch.testing.assert_close(values, expected)
 
 
-def test_what_changes_evenly_stays_and_what_is_too_short_too():
+def test_towards_neighbours_keeps_linear_and_short_sequences():
     even = torch.arange(5.0)[None, :, None] * torch.tensor([1.0, -2.0])
     towards_neighbours_(even, 0.5)
     assert torch.equal(even, torch.arange(5.0)[None, :, None] * torch.tensor([1.0, -2.0]))
@@ -31,14 +31,14 @@ def test_what_changes_evenly_stays_and_what_is_too_short_too():
     towards_neighbours_(torch.ones(0, 5, 3), 0.5)
 
 
-def test_many_rows_are_taken_in_parts():
+def test_towards_neighbours_processes_many_rows_in_parts():
     values = torch.zeros(ROWS_AT_ONCE + 3, 3, 1)
     values[:, 1] = 1
     towards_neighbours_(values, 0.25)
     assert torch.equal(values[:, 1], torch.full_like(values[:, 1], 0.75))
 
 
-def test_a_basis_field_smooths_its_weights_and_nothing_else():
+def test_basis_field_smooth_in_time_changes_weights_only():
     field = BasisField(4, (0.0, 1.0), bumps=9)
     with torch.no_grad():
         field.weights[:, 4] = 1.0
@@ -50,14 +50,14 @@ def test_a_basis_field_smooths_its_weights_and_nothing_else():
     assert field.weights.data_ptr() == address  # captured graphs stay valid
 
 
-def test_a_field_that_forgets_is_neither_smoothed_nor_fitted_to_trajectories():
+def test_field_with_history_limit_has_no_smoothing_or_follow():
     field = BasisField(2, (0.0, 0.5), bumps=5)
     assert field.capabilities.smooth_in_time is not None and field.capabilities.follow is not None
     field.keep_last(1.0)
     assert field.capabilities.smooth_in_time is None and field.capabilities.follow is None
 
 
-def test_a_hexplane_smooths_its_time_planes_along_time_alone(make_gaussians):
+def test_hexplane_smooth_in_time_changes_time_planes_only(make_gaussians):
     field = HexPlaneField(
         make_gaussians(5), (0.0, 1.0), channels=4, resolution=(6, 5, 4, 7), levels=(1, 2), width=8, depth=1
     )
@@ -76,7 +76,7 @@ def test_a_hexplane_smooths_its_time_planes_along_time_alone(make_gaussians):
             assert torch.equal(tensor, before[name])
 
 
-def test_weights_of_a_course_give_it_back():
+def test_least_squares_weights_reproduce_course():
     taus = [1 + 0.5 * k for k in range(17)]
     course = torch.tensor([math.sin(0.7 * tau) for tau in taus], dtype=torch.float64)
     weights = least_squares_weights(taus, 11) @ course
@@ -86,12 +86,12 @@ def test_weights_of_a_course_give_it_back():
 
 
 @pytest.mark.parametrize("taus", [[1.0], [1.0, 1.0], [8.0], []])
-def test_few_times_give_finite_weights(taus):
+def test_least_squares_weights_of_few_times_are_finite(taus):
     weights = least_squares_weights(taus, 10)
     assert weights.shape == (10, len(taus)) and weights.isfinite().all()
 
 
-def test_a_field_follows_a_course_in_the_rows_that_are_asked_for():
+def test_basis_field_follow_changes_selected_rows_only():
     field = BasisField(5, (0.0, 1.0), bumps=13)
     times = [k / 12 for k in range(13)]
     offsets = torch.randn(2, 1, 3, generator=torch.Generator().manual_seed(1)) * torch.tensor(times)[None, :, None]
@@ -103,7 +103,7 @@ def test_a_field_follows_a_course_in_the_rows_that_are_asked_for():
 
 
 @pytest.mark.parametrize("shape", [(1, 2, 3), (5, 1, 3), (6, 4, 3)])
-def test_others_are_taken_as_they_were_before(shape):
+def test_towards_others_uses_values_before_update(shape):
     """Smooth all rows at once and compare with whole matrices."""
     generator = torch.Generator().manual_seed(0)
     values = torch.randn(shape, generator=generator)
@@ -116,7 +116,7 @@ def test_others_are_taken_as_they_were_before(shape):
     assert torch.equal(alone, values)
 
 
-def test_a_basis_field_shares_motion_and_nothing_else():
+def test_basis_field_share_motion_changes_motion_only():
     field = BasisField(3, (0.0, 1.0), bumps=5)
     with torch.no_grad():
         field.weights[1] = 1.0

@@ -10,7 +10,7 @@ from gsplat_core.deformation.basis_bumps import least_squares_weights
 
 @pytest.mark.parametrize("bumps", [5, 11, 40, 130])
 @pytest.mark.parametrize("times", [17, 200])
-def test_the_number_of_threads_makes_no_difference(bumps, times):
+def test_least_squares_weights_independent_of_thread_count(bumps, times):
     taus = torch.linspace(0, bumps - 1, times).tolist()
     before = torch.get_num_threads()
     found = []

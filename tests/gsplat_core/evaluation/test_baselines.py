@@ -27,7 +27,7 @@ def decibels(difference):
     return -20 * np.log10(difference / 255)
 
 
-def test_baselines_of_three_grey_frames_equal_values_by_hand():
+def test_baselines_of_three_grey_frames_equal_expected_values():
     measured = measure_baselines([frame(0, 100), frame(1, 120), frame(2, 180)])
     assert measured.previous_frame_db == pytest.approx((decibels(20) + decibels(60)) / 2, abs=1e-4)
     assert measured.heldout_previous_frame_db == pytest.approx(decibels(20), abs=1e-4)
@@ -35,7 +35,7 @@ def test_baselines_of_three_grey_frames_equal_values_by_hand():
     assert measured.heldout_train_mean_db == pytest.approx(decibels(20), abs=1e-4)
 
 
-def test_frames_are_held_out_by_their_number_where_some_are_missing():
+def test_baselines_hold_out_frames_by_number_with_missing_frames():
     # Frame 1, the held-out one, was lost: nothing is held out, and frame 2 is compared with frame 0.
     measured = measure_baselines([frame(0, 100), frame(2, 180)])
     assert measured.previous_frame_db == pytest.approx(decibels(80), abs=1e-4)
@@ -46,7 +46,7 @@ def test_frames_are_held_out_by_their_number_where_some_are_missing():
     assert measured.heldout_neighbour_mean_db == pytest.approx(decibels(20), abs=1e-4)
 
 
-def test_a_damaged_frame_is_not_scored():
+def test_baselines_do_not_score_damaged_frame():
     damaged = Frame(seq=1, pts_ns=1, image=np.full((2, 3, 3), 7, np.uint8), status=FrameStatus.DAMAGED)
     measured = measure_baselines([frame(0, 100), damaged, frame(2, 27)])
     assert measured.previous_frame_db == pytest.approx(decibels(20), abs=1e-4), "shown before frame 2, as it came"
@@ -54,7 +54,7 @@ def test_a_damaged_frame_is_not_scored():
     assert measured.heldout_train_mean_db is None
 
 
-def test_a_stream_too_short_for_a_baseline_says_none():
+def test_baselines_of_too_short_stream_are_none():
     one = measure_baselines([frame(0, 7)])
     assert one.previous_frame_db is one.heldout_train_mean_db is None
     two = measure_baselines([frame(0, 7), frame(1, 9)])
@@ -62,14 +62,14 @@ def test_a_stream_too_short_for_a_baseline_says_none():
     assert two.heldout_neighbour_mean_db is None
 
 
-def test_frames_without_tissue_are_left_out():
+def test_baselines_omit_frames_without_tissue():
     nothing = np.zeros((2, 3), np.uint8)
     measured = measure_baselines([frame(0, 10), frame(1, 30, nothing), frame(2, 40)])
     assert measured.previous_frame_db == pytest.approx(decibels(10), abs=1e-4)
     assert measured.heldout_previous_frame_db is None
 
 
-def test_copies_of_several_ages_and_what_their_masks_hide():
+def test_baselines_copies_of_several_ages_with_masks():
     mask = np.array([[1, 1, 0], [1, 1, 0]], np.uint8)
     other = np.array([[0, 1, 1], [0, 1, 1]], np.uint8)
     old = frame(0, 100, mask)
@@ -87,7 +87,7 @@ def test_copies_of_several_ages_and_what_their_masks_hide():
         measure_baselines([frame(0, 1)], ages=(0,))
 
 
-def test_pixels_outside_of_a_round_view_do_not_count():
+def test_baselines_ignore_pixels_outside_round_view():
     """They equal those of other frames, so the baselines would score higher."""
     inside = np.array([[1, 1, 0], [1, 0, 0]], np.uint8)
 
@@ -111,7 +111,7 @@ def moving(seq, shift_px, size=48):
     return Frame(seq=seq, pts_ns=seq, image=np.rint(127 + 90 * np.stack(waves, -1)).astype(np.uint8))
 
 
-def test_optical_flow_continues_and_divides_a_steady_motion():
+def test_flow_baselines_extrapolate_and_halve_steady_motion():
     measured = measure_baselines([moving(k, 2.0 * k) for k in range(4)], flow=True)
     copy, half = measured.copies[1], measured.every["half_velocity_flow"]
     assert (copy.frames, half.frames) == (3, 2)
@@ -121,13 +121,13 @@ def test_optical_flow_continues_and_divides_a_steady_motion():
     assert "half_way_flow" not in plain.heldout and not plain.every
 
 
-def test_pictures_that_are_too_small_for_the_flow_have_none():
+def test_flow_baselines_absent_for_too_small_images():
     measured = measure_baselines([moving(k, k, size=11) for k in range(4)], flow=True)
     assert not measured.every and "half_way_flow" not in measured.heldout
     assert measured.copies[1].frames == 3
 
 
-def test_each_frames_figures_are_recorded_in_order():
+def test_baselines_record_figures_of_each_frame_in_order():
     log = []
     measure_baselines([moving(k, 2.0 * k) for k in range(12)], ages=(1, 2), flow=True, record=log.append)
     assert [entry["seq"] for entry in log] == list(range(1, 12))
@@ -141,7 +141,7 @@ def test_each_frames_figures_are_recorded_in_order():
     assert log[0]["psnr_tissue_db"] == log[0]["copy_1_db"] == log[0]["previous_frame_db"]
 
 
-def test_withheld_frames_are_counted_and_kept_out_of_the_mean():
+def test_baselines_count_withheld_frames_and_exclude_them_from_mean():
     withheld = Frame(seq=2, pts_ns=2, image=np.full((2, 3, 3), 250, np.uint8), withheld="blur")
     measured = measure_baselines([frame(0, 100), frame(1, 120), withheld])
     assert measured.left_out == {"withheld": 1}
@@ -149,7 +149,7 @@ def test_withheld_frames_are_counted_and_kept_out_of_the_mean():
 
 
 @pytest.mark.parametrize(("withheld", "previous", "after"), [("black", 100, 130), ("blur", 40, 130)])
-def test_a_picture_that_cannot_be_shown_is_no_neighbour(withheld, previous, after):
+def test_baselines_undisplayable_image_is_not_neighbour(withheld, previous, after):
     """The display keeps the picture before it, and so does the baseline."""
     odd = Frame(seq=8, pts_ns=8, image=np.full((2, 3, 3), 40, np.uint8), withheld=withheld)
     measured = measure_baselines([frame(7, 100), odd, frame(9, 120), frame(10, 130)])
@@ -158,14 +158,14 @@ def test_a_picture_that_cannot_be_shown_is_no_neighbour(withheld, previous, afte
     assert measured.heldout_neighbour_mean_db == pytest.approx(decibels(120 - (previous + after) / 2), abs=1e-4)
 
 
-def test_what_fails_in_a_thread_reaches_the_caller():
+def test_baselines_thread_error_reaches_caller():
     wrong = Frame(seq=1, pts_ns=1, image=np.zeros((2, 3, 3), np.uint8), mask=np.ones((2, 3), np.uint8))
     object.__setattr__(wrong, "mask", np.ones((5, 5), np.uint8))
     with pytest.raises(InvalidInput, match="mask must be"):
         measure_baselines([frame(0, 1), wrong])
 
 
-def test_an_iterator_is_refused():
+def test_baselines_reject_iterator():
     with pytest.raises(InvalidInput, match="twice"):
         measure_baselines(iter([frame(0, 1)]))
 
@@ -194,7 +194,7 @@ class CuttingRecording:
     not CuttingRecording.folder.exists() and "CI" not in os.environ, reason=f"no recording at {CuttingRecording.folder}"
 )
 @pytest.mark.slow
-def test_baselines_of_cutting_equal_the_published_figures():
+def test_baselines_of_cutting_equal_published_figures():
     assert sum(is_heldout(index) for index in range(156)) == 20
     measured = measure_baselines(CuttingRecording())
     assert measured.heldout_previous_frame_db == pytest.approx(37.24, abs=0.05)
@@ -205,7 +205,7 @@ def test_baselines_of_cutting_equal_the_published_figures():
 
 @pytest.mark.recordings
 @pytest.mark.slow
-def test_baselines_by_flow_and_older_frames_equal_the_published_figures(recordings_dir):
+def test_flow_and_older_frame_baselines_equal_published_figures(recordings_dir):
     """Baselines of the first frames only, because optical flow takes long."""
     cutting = measure_baselines(CuttingRecording(42), ages=AGES, flow=True)
     assert cutting.heldout["half_way_flow"].psnr_tissue_db == pytest.approx(41.26, abs=0.05)

@@ -37,7 +37,7 @@ def evaluate(frames, picture, learner=None, **options):
     return evaluate_causal(frames, learner or Holding(), picture_of, **options), shown
 
 
-def test_a_model_that_holds_scores_the_copy_of_the_previous_frame(frame, picture, decibels):
+def test_causal_score_of_static_model_equals_previous_frame_copy(frame, picture, decibels):
     log = []
     score, shown = evaluate([frame(0, 100), frame(1, 110), frame(2, 150)], picture, record=log.append)
     assert score.psnr_tissue_db == pytest.approx((decibels(10) + decibels(40)) / 2, abs=1e-6)
@@ -46,7 +46,7 @@ def test_a_model_that_holds_scores_the_copy_of_the_previous_frame(frame, picture
     assert [entry["seq"] for entry in log] == [1, 2] and not any(entry["trained"] for entry in log)
 
 
-def test_a_frame_is_learned_from_only_after_it_was_predicted_and_nothing_of_it_is_seen_before(frame, picture):
+def test_causal_protocol_predicts_frame_before_learning_from_content(frame, picture):
     order = []
 
     class Telling(Holding):
@@ -65,7 +65,7 @@ def test_a_frame_is_learned_from_only_after_it_was_predicted_and_nothing_of_it_i
     assert order == [("learn", 0), ("predict", 1), ("learn", 1), ("predict", 2), ("learn", 2)]
 
 
-def test_damaged_and_withheld_frames_are_neither_scored_nor_learned_from(frame, picture, decibels):
+def test_causal_protocol_skips_damaged_and_withheld_frames(frame, picture, decibels):
     learner = Holding()
     nothing = np.zeros((16, 20), np.uint8)
     frames = [
@@ -83,12 +83,12 @@ def test_damaged_and_withheld_frames_are_neither_scored_nor_learned_from(frame, 
     assert score.psnr_tissue_db == pytest.approx(decibels(10), abs=1e-6)
 
 
-def test_one_frame_has_no_prediction(frame, picture):
+def test_causal_protocol_single_frame_has_no_prediction(frame, picture):
     score, shown = evaluate([frame(0)], picture)
     assert score.psnr_tissue_db is None and shown == []
 
 
-def test_a_given_prediction_function_is_used(frame, picture):
+def test_causal_protocol_uses_given_prediction_function(frame, picture):
     always = lambda learner, unseen: 105
     score, _ = evaluate([frame(0, 100), frame(1, 105)], picture, predict=always)
     assert score.psnr_tissue_db == 100.0

@@ -45,7 +45,7 @@ def right(folder: Path) -> Geometry:
 
 
 @pytest.mark.slow
-def test_a_true_model_scores_as_one(right: Geometry) -> None:
+def test_geometry_of_true_model_has_small_errors(right: Geometry) -> None:
     assert right.frames == FRAMES
     assert right.depth is not None and right.normals is not None and right.tracking is not None
     assert right.depth.rmse_share < 0.006 and right.depth.scale == pytest.approx(1, abs=3e-3)
@@ -58,14 +58,14 @@ def test_a_true_model_scores_as_one(right: Geometry) -> None:
     assert right.scaled_views == right.views  # no scale is missing
 
 
-def test_the_depth_along_the_rays_is_measured_too(right: Geometry) -> None:
+def test_geometry_measures_ray_depth(right: Geometry) -> None:
     assert right.depth is not None and right.ray_depth is not None
     assert right.normals is not None and right.ray_normals is not None
     assert right.ray_depth.plane_rmse_share == pytest.approx(right.depth.plane_rmse_share, rel=0.02)
     assert right.ray_depth.rmse_share < 0.006 and right.ray_normals.mean_deg < 0.5 * right.ray_normals.plane_mean_deg
 
 
-def test_a_true_model_moves_each_pixel_as_its_tissue_moves(right: Geometry, folder: Path) -> None:
+def test_geometry_flow_of_true_model_matches_tissue_motion(right: Geometry, folder: Path) -> None:
     assert right.flow is not None and right.flow.frames == FRAMES - 1  # nothing comes after the last one
     model, still = right.flow.model, right.flow.still
     assert model.median_px < 0.1 < 0.5 < still.median_px
@@ -76,7 +76,7 @@ def test_a_true_model_moves_each_pixel_as_its_tissue_moves(right: Geometry, fold
 
 
 @pytest.mark.slow
-def test_the_way_of_a_scope_is_part_of_the_flow_and_not_of_the_scene_flow(tmp_path: Path) -> None:
+def test_geometry_scope_motion_in_flow_but_not_in_scene_flow(tmp_path: Path) -> None:
     size = {"width_px": 96, "height_px": 72}
     extras = Extras(flow=True)
     folder = synthesize(
@@ -90,7 +90,7 @@ def test_the_way_of_a_scope_is_part_of_the_flow_and_not_of_the_scene_flow(tmp_pa
     assert model.median_mm < 0.1 * still.median_mm
 
 
-def test_views_are_scored_beside_the_left_picture(right: Geometry) -> None:
+def test_geometry_scores_further_views_beside_left_image(right: Geometry) -> None:
     views = {view.name: view for view in right.views}
     assert set(views) == {"right", "third"}
     for view in views.values():
@@ -102,7 +102,7 @@ def test_views_are_scored_beside_the_left_picture(right: Geometry) -> None:
 
 
 @pytest.mark.slow
-def test_a_model_without_scale_is_right_after_one_factor(folder: Path, right: Geometry) -> None:
+def test_geometry_of_unscaled_model_correct_after_one_factor(folder: Path, right: Geometry) -> None:
     small = measured(folder, shrink=2.0)
     assert small.depth is not None and right.depth is not None
     assert small.tracking is not None and right.tracking is not None
@@ -121,7 +121,7 @@ def test_a_model_without_scale_is_right_after_one_factor(folder: Path, right: Ge
         assert as_it_is.model.psnr_tissue_db < scaled.model.psnr_tissue_db - 2
 
 
-def test_a_model_without_motion_tracks_as_no_motion_does(folder: Path) -> None:
+def test_geometry_of_static_model_equals_no_motion_baseline(folder: Path) -> None:
     still = measured(folder, moves=False)
     assert still.tracking is not None
     assert still.tracking.model.median_mm == pytest.approx(still.tracking.still.median_mm, rel=0.1)
@@ -130,11 +130,11 @@ def test_a_model_without_motion_tracks_as_no_motion_does(folder: Path) -> None:
     assert still.flow.model.mean_mm == pytest.approx(still.flow.still.mean_mm, abs=1e-5)
 
 
-def test_it_is_the_same_twice(folder: Path, right: Geometry) -> None:
+def test_geometry_is_deterministic(folder: Path, right: Geometry) -> None:
     assert measured(folder) == right
 
 
-def test_without_truth_nothing_is_measured(tmp_path: Path) -> None:
+def test_geometry_without_ground_truth_is_none(tmp_path: Path) -> None:
     """A recording with pictures alone has no figure, and no made-up one."""
     folder = synthesize(tmp_path / "plain", frames=2, fps=2, width_px=48, height_px=40, stereo=False)
     recording = open_recording(folder)

@@ -12,7 +12,7 @@ from gsplat_core.training.metrics import PSNR_CAP_DB
 ALWAYS = (0.0, 1e9)
 
 
-def test_an_exact_model_scores_the_cap_on_the_held_out_frames_alone(frame, picture):
+def test_heldout_exact_model_scores_cap_on_held_out_frames_only(frame, picture):
     asked = []
 
     def exact(each):
@@ -30,7 +30,7 @@ def test_an_exact_model_scores_the_cap_on_the_held_out_frames_alone(frame, pictu
 
 
 @pytest.mark.parametrize("excluded", ["mask", "loss_mask"])
-def test_psnr_over_tissue_over_the_frame_and_before_rounding(frame, picture, decibels, excluded):
+def test_heldout_psnr_of_tissue_frame_and_unrounded_image(frame, picture, decibels, excluded):
     mask = np.ones((16, 20), np.uint8)
     mask[:, :15] = 0
     shown = evaluate_heldout([frame(1, 100, **{excluded: mask})], lambda _: picture(110.4), window_s=ALWAYS)
@@ -39,7 +39,7 @@ def test_psnr_over_tissue_over_the_frame_and_before_rounding(frame, picture, dec
     assert shown.unrounded_db == pytest.approx(decibels(10.4), abs=1e-4)
 
 
-def test_frames_that_cannot_be_scored_are_counted_by_reason(frame, picture, decibels):
+def test_heldout_counts_unscored_frames_by_reason(frame, picture, decibels):
     frames = [
         frame(1, status=FrameStatus.DAMAGED),
         frame(9, withheld="blur"),
@@ -53,13 +53,13 @@ def test_frames_that_cannot_be_scored_are_counted_by_reason(frame, picture, deci
     assert found.score.worst_db == found.score.psnr_tissue_db == pytest.approx(decibels(5), abs=1e-6)
 
 
-def test_nothing_to_score_has_no_figure(frame, picture):
+def test_heldout_without_scored_frames_has_no_figure(frame, picture):
     found = evaluate_heldout([frame(0), frame(2)], lambda _: picture(0), window_s=ALWAYS)
     assert found.score.psnr_tissue_db is found.score.worst_db is found.unrounded_db is None
     assert found.score.frames == 0
 
 
-def test_depth_is_compared_where_it_is_known(frame, picture):
+def test_heldout_compares_depth_at_known_pixels(frame, picture):
     true = np.full((16, 20), 50, np.float32)
     true[0], true[1], true[2] = 0, np.nan, np.inf
     mask = np.ones((16, 20), np.uint8)
@@ -72,7 +72,7 @@ def test_depth_is_compared_where_it_is_known(frame, picture):
     assert (found.depth.covered, found.depth.frames) == (1.0, 1)
 
 
-def test_a_model_without_any_depth_covers_nothing(frame, picture):
+def test_heldout_depth_is_none_for_model_without_depth(frame, picture):
     known = np.full((16, 20), 50, np.float32)
     found = evaluate_heldout([frame(1, depth=known)], lambda _: picture(100, depth=0), window_s=ALWAYS)
     assert found.depth is None

@@ -19,7 +19,7 @@ def quality(seq, level, shown):
     return frame_quality(seq, picture, image, None)
 
 
-def test_scores_lateness_and_ages_of_pictures(decibels):
+def test_live_sums_of_scores_lateness_and_ages(decibels):
     log = []
     sums = LiveSums(log.append)
     for age_ms in (10, 11, 12, 13):
@@ -35,7 +35,7 @@ def test_scores_lateness_and_ages_of_pictures(decibels):
     assert [(entry["seq"], entry["behind"], entry["age_ms"]) for entry in log[:2]] == [(0, 0, 40), (1, 1, 80)]
 
 
-def test_frames_that_are_left_out_are_counted_by_reason():
+def test_live_sums_count_omitted_frames_by_reason():
     sums = LiveSums()
     sums.leave_out(NOTHING_SHOWN)
     found = sums.live
@@ -43,7 +43,7 @@ def test_frames_that_are_left_out_are_counted_by_reason():
     assert found.score.psnr_tissue_db is found.age_when_shown is found.age_on_screen is None
 
 
-def test_the_first_second_is_left_out_of_the_settled_figures(decibels):
+def test_live_sums_settled_figures_exclude_first_second(decibels):
     sums = LiveSums()
     for seq in range(60):
         before = (decibels(10), decibels(10)) if seq < 25 else NOTHING_BEFORE
@@ -56,7 +56,7 @@ def test_the_first_second_is_left_out_of_the_settled_figures(decibels):
     assert (found.previous.frames, found.settled_previous.psnr_tissue_db) == (25, None)
 
 
-def test_memory_does_not_grow_with_states_that_a_log_makes_up():
+def test_live_sums_limit_number_of_states():
     sums = LiveSums()
     for k in range(100):
         sums.picture(1 + k / 10, f"state {k}")

@@ -56,7 +56,7 @@ def _shares(of_world: tuple[str, ...], of_model: tuple[str, ...]) -> PartShares 
 
 
 @pytest.mark.parametrize(("name", "part"), [("means", "motion"), ("sh", "colour"), ("log_scales", "size")])
-def test_the_part_that_changes_carries_everything(name: str, part: str) -> None:
+def test_part_shares_assign_change_to_changing_part(name: str, part: str) -> None:
     shares = _shares((name,), (name,))
     assert shares is not None and shares.frames == len(TIMES)
     for other in PARTS:
@@ -64,7 +64,7 @@ def test_the_part_that_changes_carries_everything(name: str, part: str) -> None:
     assert shares.explained == pytest.approx(1, abs=0.02)
 
 
-def test_parts_that_change_together_share_what_they_explain() -> None:
+def test_part_shares_split_joint_change() -> None:
     shares = _shares(("means", "sh"), ("means", "sh"))
     assert shares is not None
     assert shares.motion > 0.1 and shares.colour > 0.1 and shares.size == pytest.approx(0, abs=1e-6)
@@ -72,13 +72,13 @@ def test_parts_that_change_together_share_what_they_explain() -> None:
     assert shares.explained == pytest.approx(1, abs=0.02)
 
 
-def test_repainting_is_not_motion() -> None:
+def test_part_shares_do_not_count_recolouring_as_motion() -> None:
     """A model that changes colours where the world moves explains little, and none of it is called motion."""
     shares = _shares(("means",), ("sh",))
     assert shares is not None and shares.motion == pytest.approx(0, abs=1e-9) and shares.explained < 0.2
 
 
-def test_where_nothing_changes_there_is_no_share() -> None:
+def test_part_shares_none_without_change() -> None:
     sums = PartSums(lambda time_s: _scene(), 0.0)
     assert sums.shares is None
     sums.add(Frame(0, 0, np.zeros((40, 48, 3), np.uint8)), lambda gaussians: np.zeros((40, 48, 3), np.float32))

@@ -29,7 +29,7 @@ def model(version=3):
     return Model(version, gaussians, None, CAMERA, (0.0, 1.0))
 
 
-def test_the_picture_is_the_models_rounded_to_bytes():
+def test_picture_maker_rounds_model_image_to_bytes():
     picture = PictureMaker(CAMERA)(model(), waves())
     wanted = model().render(0.0)
     np.testing.assert_allclose(picture.unrounded, wanted.image.clamp(0, 1).numpy(), atol=1e-6)
@@ -38,7 +38,7 @@ def test_the_picture_is_the_models_rounded_to_bytes():
     assert picture.model_version == 3
 
 
-def test_the_frames_pose_is_used():
+def test_picture_maker_uses_pose_of_frame():
     make = PictureMaker(CAMERA)
     plain = make(model(), waves())
     pose = np.eye(4)
@@ -47,7 +47,7 @@ def test_the_frames_pose_is_used():
     assert np.abs(moved.unrounded - plain.unrounded).max() > 0.05
 
 
-def test_pictures_stay_as_they_are_when_the_next_one_is_made():
+def test_picture_maker_keeps_earlier_images():
     make = PictureMaker(CAMERA)
     first = make(model(), waves())
     kept = first.image.copy(), first.unrounded.copy(), first.depth.copy()
@@ -57,7 +57,7 @@ def test_pictures_stay_as_they_are_when_the_next_one_is_made():
 
 
 @pytest.mark.cuda
-def test_a_gpu_shows_the_same_of_a_model_and_of_what_is_published(gpu):
+def test_picture_maker_on_gpu_equal_for_model_and_published_state(gpu):
     learning = Reconstructor(ReconstructorConfig(gaussians=64, max_gaussians=80), CAMERA, device=gpu)
     make = PictureMaker(CAMERA, gpu)
     for seq in range(4):

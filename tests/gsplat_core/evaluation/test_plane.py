@@ -42,7 +42,7 @@ def squared_error(found: np.ndarray, z: np.ndarray) -> float:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SURFACES)
-def test_no_tilt_fits_better_than_the_best_fit_plane(name: str) -> None:
+def test_best_fit_plane_has_least_error_of_all_tilts(name: str) -> None:
     rays, z = RAYS.reshape(-1, 3), SURFACES[name].ravel()
     flat = flat_depths(rays, z)
     assert flat is not None
@@ -55,7 +55,7 @@ def test_no_tilt_fits_better_than_the_best_fit_plane(name: str) -> None:
     assert (flat.plane > 0).all()
 
 
-def test_a_plane_is_found_exactly_in_any_unit() -> None:
+def test_best_plane_exact_in_any_unit() -> None:
     rays = RAYS.reshape(-1, 3)
     for unit in (1e-4, 1.0, 1e5):
         z = unit * SURFACES["tilted plane"].ravel()
@@ -63,7 +63,7 @@ def test_a_plane_is_found_exactly_in_any_unit() -> None:
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_few_pixels_of_any_depth_are_never_fitted_worse_than_by_a_level_plane(seed: int) -> None:
+def test_flat_depths_of_few_pixels_never_worse_than_level_plane(seed: int) -> None:
     random = np.random.default_rng(seed)
     count = int(random.integers(3, 9))
     rays = RAYS.reshape(-1, 3)[random.integers(0, X.size, count)]
@@ -73,11 +73,11 @@ def test_few_pixels_of_any_depth_are_never_fitted_worse_than_by_a_level_plane(se
     assert squared_error(flat.plane, z) <= np.square(z - z.mean()).sum() + 1e-9
 
 
-def test_two_pixels_have_no_plane() -> None:
+def test_best_plane_of_two_pixels_is_none() -> None:
     assert best_plane(RAYS.reshape(-1, 3)[:2], np.ones(2)) is None
 
 
-def test_both_baselines_are_measured_where_the_model_is() -> None:
+def test_depth_baselines_measured_at_pixels_of_model() -> None:
     """A model that covers the near half alone is compared with planes through the near half."""
     true = SURFACES["step"].astype(np.float32)
     shown = np.where(true < 100, true, 0).astype(np.float32)
@@ -88,7 +88,7 @@ def test_both_baselines_are_measured_where_the_model_is() -> None:
     assert found.level_rmse_share == pytest.approx(0) and found.plane_rmse_share == pytest.approx(0, abs=1e-6)
 
 
-def test_shares_of_the_baselines_of_a_known_surface() -> None:
+def test_depth_baseline_shares_of_known_surface() -> None:
     true = SURFACES["bowl"].astype(np.float32)
     sums = DepthShareSums()
     sums.add(CAMERA, true, true, np.ones(true.shape, bool))
@@ -100,7 +100,7 @@ def test_shares_of_the_baselines_of_a_known_surface() -> None:
     assert found.level_rmse_share == pytest.approx(level, rel=1e-6)
 
 
-def test_normals_of_a_tilted_plane_are_those_of_the_best_fit_and_not_of_the_level_plane() -> None:
+def test_normal_baselines_of_tilted_plane() -> None:
     true = SURFACES["tilted plane"].astype(np.float32)
     sums = NormalSums()
     sums.add(CAMERA, true, true, np.ones(true.shape, bool))

@@ -10,7 +10,7 @@ from gsplat_core.evaluation.protocols import MAX_POSES, PlaceFinder, Visits, eva
 from gsplat_core.scene.frames import FrameStatus
 
 
-def test_the_last_seconds_are_rendered_and_compared_with_a_frozen_picture(frame, picture, decibels):
+def test_retention_compares_last_seconds_with_frozen_image(frame, picture, decibels):
     frames = [frame(k, 100 + k) for k in range(11)]  # 0 to 0.4 s
     asked, log = [], []
 
@@ -27,7 +27,7 @@ def test_the_last_seconds_are_rendered_and_compared_with_a_frozen_picture(frame,
     assert found.places == ()
 
 
-def test_a_stream_shorter_than_that_is_rendered_whole_and_what_the_model_has_not_seen_is_not(frame, picture):
+def test_retention_renders_short_stream_within_model_window(frame, picture):
     asked = []
     evaluate_retention(
         [frame(k) for k in range(6)], lambda f: asked.append(f.seq) or picture(100), window_s=(0.04, 0.16), last_s=5
@@ -35,19 +35,19 @@ def test_a_stream_shorter_than_that_is_rendered_whole_and_what_the_model_has_not
     assert asked == [1, 2, 3, 4]
 
 
-def test_damaged_frames_are_left_out(frame, picture):
+def test_retention_omits_damaged_frames(frame, picture):
     frames = [frame(0), frame(1, status=FrameStatus.DAMAGED)]
     found = evaluate_retention(frames, lambda _: picture(100), window_s=(0, 1))
     assert found.last.left_out == {"damaged": 1} and found.last.frames == 1
     assert found.frozen.psnr_tissue_db is None
 
 
-def test_an_iterator_is_refused(frame, picture):
+def test_retention_rejects_iterator(frame, picture):
     with pytest.raises(InvalidInput, match="twice"):
         evaluate_retention(iter([frame(0)]), lambda _: picture(0), window_s=(0, 1))
 
 
-def test_both_stays_at_a_place_are_scored(frame, picture, decibels):
+def test_retention_scores_both_visits_of_place(frame, picture, decibels):
     frames = [frame(k, 100) for k in range(10)]
     place = Visits((0.0, 0.04), (0.2, 0.24))
     shown = lambda each: picture(102 if each.seq < 3 else 110)
@@ -57,7 +57,7 @@ def test_both_stays_at_a_place_are_scored(frame, picture, decibels):
     assert found.again.psnr_tissue_db == pytest.approx(decibels(10), abs=1e-6)
 
 
-def test_how_soon_a_place_is_found_again():
+def test_returns_count_frames_until_place_is_recovered():
     place = Visits((0.0, 1.0), (3.0, 4.0))
     values = {0.5: 40.0, 3.0: 20.0, 3.1: None, 3.2: 33.0, 3.3: 36.0, 5.0: 39.0}
     log = [{"time_s": time_s, "psnr_tissue_db": value} for time_s, value in values.items()]
@@ -84,14 +84,14 @@ def visits(positions):
     return finder.visits()
 
 
-def test_a_scope_that_leaves_and_returns_has_been_there_twice():
+def test_place_finder_reports_return_of_scope():
     there = [(0.0,)] * 5
     away = [(x,) for x in np.linspace(10, 100, 10)]
     (found,) = visits([*there, *away, *away[::-1], *there])[-1:]
     assert found.first == pytest.approx((0.0, 0.4)) and found.again == pytest.approx((2.5, 2.9))
 
 
-def test_turning_away_and_back_counts_too_and_the_unit_of_length_does_not_matter():
+def test_place_finder_reports_rotation_and_ignores_length_unit():
     turned = [(0.0, 0.0)] * 3 + [(0.0, 50.0)] * 3 + [(0.0, 1.0)] * 3
     (found,) = visits(turned)
     assert found.again == pytest.approx((0.6, 0.8))
@@ -101,11 +101,11 @@ def test_turning_away_and_back_counts_too_and_the_unit_of_length_does_not_matter
 
 
 @pytest.mark.parametrize("positions", [[], [(0.0,)], [(0.0,)] * 30, [(float(k),) for k in range(30)]])
-def test_a_scope_that_stays_or_goes_on_returns_nowhere(positions):
+def test_place_finder_reports_nothing_without_return(positions):
     assert visits(positions) == []
 
 
-def test_a_long_stream_keeps_a_bounded_number_of_poses(frame):
+def test_place_finder_limits_number_of_poses(frame):
     finder = PlaceFinder()
     for k in range(5 * MAX_POSES):
         finder.add(k / 10, pose(100.0 * (k // MAX_POSES % 2)))
@@ -113,7 +113,7 @@ def test_a_long_stream_keeps_a_bounded_number_of_poses(frame):
     assert len(finder.visits()) == 3
 
 
-def test_frames_without_poses_have_no_places(frame):
+def test_find_places_ignores_frames_without_poses(frame):
     assert find_places([frame(k) for k in range(5)]) == []
     posed = [frame(k, pose=pose(x)) for k, x in enumerate((0.0, 50.0, 0.0))]
     assert [v.again for v in find_places(posed)] == [(0.08, 0.08)]

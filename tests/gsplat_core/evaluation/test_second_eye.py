@@ -37,7 +37,7 @@ def stereo(seq, **fields):
     return Frame(seq, seq * 40_000_000, np.ascontiguousarray(left), **given)
 
 
-def test_an_exact_view_scores_the_cap_on_every_tenth_frame():
+def test_second_eye_exact_view_scores_cap_on_every_tenth_frame():
     asked, log = [], []
 
     def exact(frame, eye):
@@ -52,7 +52,7 @@ def test_an_exact_view_scores_the_cap_on_every_tenth_frame():
     assert found.left_out_px == round(BEYOND_TYPICAL * DISPARITY)
 
 
-def test_of_a_plane_the_shifted_picture_and_the_match_are_exact_and_another_picture_is_not():
+def test_second_eye_shift_and_match_baselines_exact_for_plane():
     frames = [stereo(seq) for seq in range(EVERY + 1)]
     found = evaluate_second_eye(frames, LEFT, lambda frame, eye: frame.image)
     assert found.baselines[SHIFTED].psnr_tissue_db > 40
@@ -61,7 +61,7 @@ def test_of_a_plane_the_shifted_picture_and_the_match_are_exact_and_another_pict
     assert found.score.psnr_tissue_db < 15, "the left picture itself"
 
 
-def test_the_eye_is_seen_from_the_frames_pose():
+def test_second_eye_uses_pose_of_frame():
     pose = np.eye(4)
     pose[:3, 3] = [1, 2, 3]
     eyes = []
@@ -69,7 +69,7 @@ def test_the_eye_is_seen_from_the_frames_pose():
     assert np.allclose(eyes[0].world_to_camera, RIGHT.world_to_camera @ pose)
 
 
-def test_columns_that_only_the_right_eye_sees_and_the_border_do_not_count():
+def test_second_eye_ignores_border_and_columns_of_right_eye_only():
     frame = stereo(0)
     wrong = frame.right_image.copy()
     wrong[:, WIDTH - 30 :] = 0
@@ -79,7 +79,7 @@ def test_columns_that_only_the_right_eye_sees_and_the_border_do_not_count():
     assert evaluate_second_eye([frame], LEFT, lambda *_: wrong, left_out_px=29).score.psnr_tissue_db < 40
 
 
-def test_a_tool_does_not_count_where_it_may_hide_the_view():
+def test_second_eye_ignores_area_possibly_hidden_by_tool():
     mask = np.ones((HEIGHT, WIDTH), np.uint8)
     mask[20:40, 80:100] = 0
     frame = stereo(0, mask=mask)
@@ -88,7 +88,7 @@ def test_a_tool_does_not_count_where_it_may_hide_the_view():
     assert evaluate_second_eye([frame], LEFT, lambda *_: wrong).score.psnr_tissue_db == PSNR_CAP_DB
 
 
-def test_a_straight_line_per_channel_is_no_error_and_a_curve_is():
+def test_line_psnr_ignores_linear_but_not_nonlinear_colour_change():
     true = wide(1)[:, :WIDTH]
     all_of_it = np.ones(true.shape[:2], bool)
     line = (true / 255) * [0.5, 0.8, 0.3] + [0.1, 0.0, 0.4]
@@ -96,7 +96,7 @@ def test_a_straight_line_per_channel_is_no_error_and_a_curve_is():
     assert line_psnr_db((true / 255) ** 2, true, all_of_it) < 40
 
 
-def test_psnr_is_that_of_what_the_line_leaves():
+def test_line_psnr_measures_residual_of_linear_fit():
     true = np.zeros((4, 4, 3), np.uint8)
     true[::2] = 20
     flat = np.full((4, 4, 3), 7, np.uint8)
@@ -104,7 +104,7 @@ def test_psnr_is_that_of_what_the_line_leaves():
     assert np.isnan(line_psnr_db(flat, true, np.zeros((4, 4), bool)))
 
 
-def test_frames_that_cannot_be_scored_are_counted_by_reason():
+def test_second_eye_counts_unscored_frames_by_reason():
     frames = [
         stereo(0, status=FrameStatus.DAMAGED),
         *(stereo(seq) for seq in range(1, 10)),
@@ -116,17 +116,17 @@ def test_frames_that_cannot_be_scored_are_counted_by_reason():
 
 
 @pytest.mark.parametrize("missing", ["right_image", "right_camera"])
-def test_without_a_right_eye_there_is_no_figure(missing):
+def test_second_eye_without_right_eye_is_none(missing):
     assert evaluate_second_eye([stereo(0, **{missing: None})], LEFT, lambda frame, eye: frame.image) is None
 
 
-def test_a_match_finds_disparity_to_either_side():
+def test_matched_disparity_of_either_sign():
     picture = wide(2)
     left, right = np.ascontiguousarray(picture[:, :WIDTH]), np.ascontiguousarray(picture[:, DISPARITY:])
     assert np.median(matched_disparity(left, right)) == pytest.approx(DISPARITY, abs=0.2)
     assert np.median(matched_disparity(right, left)) == pytest.approx(-DISPARITY, abs=0.2)
 
 
-def test_a_disparity_of_nothing_moves_nothing():
+def test_warp_by_zero_disparity_keeps_image():
     picture = wide(3)[:, :WIDTH]
     assert np.array_equal(warped_by_disparity(picture, np.zeros(picture.shape[:2], np.float32)), picture)

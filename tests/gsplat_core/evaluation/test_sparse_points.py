@@ -29,7 +29,7 @@ def drawn(points: SparsePoints, number: int) -> np.ndarray:
     return depth
 
 
-def test_another_unit_is_no_error() -> None:
+def test_sparse_depth_error_independent_of_unit() -> None:
     points = some_points()
     sums = SparseDepthSums(points)
     sums.add(0, 7 * drawn(points, 0), CAMERA)
@@ -43,7 +43,7 @@ def test_another_unit_is_no_error() -> None:
     assert found.sightings == 200
 
 
-def test_one_factor_serves_all_frames() -> None:
+def test_sparse_depth_uses_one_factor_for_all_frames() -> None:
     points = some_points()
     sums = SparseDepthSums(points)
     sums.add(0, drawn(points, 0), CAMERA)
@@ -53,7 +53,7 @@ def test_one_factor_serves_all_frames() -> None:
     assert found.median > 0.1
 
 
-def test_a_plane_has_no_order() -> None:
+def test_sparse_depth_rank_correlation_of_plane_is_zero() -> None:
     points = some_points()
     sums = SparseDepthSums(points)
     for number in (0, 1):
@@ -65,7 +65,7 @@ def test_a_plane_has_no_order() -> None:
     assert found.median == pytest.approx(found.level_median, rel=0.05)
 
 
-def test_what_has_no_depth_is_not_counted() -> None:
+def test_sparse_depth_ignores_pixels_without_depth() -> None:
     points = some_points()
     sums = SparseDepthSums(points)
     assert sums.errors() is None
@@ -77,14 +77,14 @@ def test_what_has_no_depth_is_not_counted() -> None:
     assert found.covered == pytest.approx(0.5)
 
 
-def test_points_behind_the_camera_or_outside_of_its_picture_are_left_out() -> None:
+def test_sparse_points_omit_points_behind_camera_or_outside_image() -> None:
     points = SparsePoints(np.array([[0, 0, -3.0], [9, 0, 3], [0, 0, 3]]), np.arange(3), np.zeros(3, np.int64))
     pixels, z = points.seen_in(0, CAMERA)
     assert pixels.tolist() == [[30, 20]]
     assert z.tolist() == [3]
 
 
-def test_files_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+def test_sparse_points_reject_inconsistent_files(tmp_path: Path) -> None:
     path = tmp_path / "points.npz"
     whole = {"points": np.zeros((3, 3)), "obs_point": np.zeros(4, int), "obs_frame": np.zeros(4, int)}
     np.savez(path, **whole)
@@ -102,12 +102,12 @@ def test_files_that_do_not_fit_are_refused(tmp_path: Path) -> None:
         SparsePoints.read(path)
 
 
-def test_a_depth_of_another_size_is_refused() -> None:
+def test_sparse_depth_rejects_depth_of_different_size() -> None:
     with pytest.raises(InvalidInput, match="60x40"):
         SparseDepthSums(some_points()).add(0, np.zeros((60, 40), np.float32), CAMERA)
 
 
-def test_both_planes_stand_beside_points_on_a_slope() -> None:
+def test_sparse_depth_plane_baselines_of_sloped_points() -> None:
     """Points on a tilted plane have no error to the best-fit plane and an error to the level plane."""
     pixels = np.mgrid[5:35:6, 5:55:8].reshape(2, -1).T[:, ::-1] + 0.5
     rays = np.column_stack([(pixels - CAMERA.K[:2, 2]) / np.diag(CAMERA.K)[:2], np.ones(len(pixels))])

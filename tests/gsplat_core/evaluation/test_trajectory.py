@@ -27,7 +27,7 @@ def _elsewhere(poses: np.ndarray, scale: float = 1.0) -> np.ndarray:
     return moved
 
 
-def test_the_same_way_in_another_world_has_no_error() -> None:
+def test_trajectory_error_zero_in_different_world_frame() -> None:
     way = _way()
     errors = evaluate_trajectory(_elsewhere(way), way)
     assert errors is not None and errors.frames == 40
@@ -36,7 +36,7 @@ def test_the_same_way_in_another_world_has_no_error() -> None:
     assert 0.02 < errors.still_share < 1
 
 
-def test_a_way_without_scale_is_right_after_one_factor() -> None:
+def test_trajectory_without_scale_correct_after_one_factor() -> None:
     way = _way()
     errors = evaluate_trajectory(_elsewhere(way, 0.25), way)
     assert errors is not None and errors.scale == pytest.approx(4)
@@ -45,7 +45,7 @@ def test_a_way_without_scale_is_right_after_one_factor() -> None:
     assert errors.rigid_share == pytest.approx(0.75 * errors.still_share)
 
 
-def test_errors_are_those_that_were_put_in() -> None:
+def test_trajectory_error_equals_added_noise() -> None:
     way = _way()
     off = way.copy()
     jitter = 0.3 * np.random.default_rng(0).standard_normal((len(way), 3))
@@ -56,7 +56,7 @@ def test_errors_are_those_that_were_put_in() -> None:
     assert errors.rigid_share == pytest.approx(errors.rigid_rmse / errors.path)
 
 
-def test_a_scope_at_rest_has_no_figure_and_an_estimate_at_rest_has_the_baseline() -> None:
+def test_trajectory_of_scope_at_rest_is_none_and_static_estimate_is_baseline() -> None:
     way, still = _way(), np.tile(np.eye(4), (40, 1, 1))
     assert evaluate_trajectory(way, still) is None
     errors = evaluate_trajectory(still, way)
@@ -65,7 +65,7 @@ def test_a_scope_at_rest_has_no_figure_and_an_estimate_at_rest_has_the_baseline(
 
 
 @pytest.mark.slow
-def test_too_few_poses_are_refused() -> None:
+def test_trajectory_rejects_too_few_poses() -> None:
     with pytest.raises(InvalidInput, match=r"\[2, 4, 4\]"):
         evaluate_trajectory(_way(2), _way(2))
     with pytest.raises(InvalidInput, match="three or more"):

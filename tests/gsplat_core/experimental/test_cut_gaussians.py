@@ -72,7 +72,7 @@ def camera():
     return Camera(np.eye(3), 40, 40, model="ortho")
 
 
-def test_points_of_a_curve_are_zeros_of_its_implicit_form():
+def test_implicit_form_zero_on_curve():
     curves = random_curves(20)
     on = points_on(curves, torch.linspace(0, 1, 7, dtype=torch.float64))
     value = implicit_form(on, curves[:, None])
@@ -81,7 +81,7 @@ def test_points_of_a_curve_are_zeros_of_its_implicit_form():
     assert float(value.abs().max()) < 1e-9 * float(off.abs().max())
 
 
-def test_the_side_of_a_straight_curve_does_not_depend_on_its_spacing_as_the_sign_of_the_implicit_form_does():
+def test_signed_distance_of_straight_curve_independent_of_spacing():
     x = torch.tensor([[-3.0, -1.2, 1, 3], [-3, -1, 1, 3], [-3, -0.8, 1, 3]], dtype=torch.float64)
     lines = torch.stack([x, torch.zeros_like(x)], -1)
     point = torch.tensor([0.3, 1.0], dtype=torch.float64)
@@ -89,7 +89,7 @@ def test_the_side_of_a_straight_curve_does_not_depend_on_its_spacing_as_the_sign
     torch.testing.assert_close(signed_distance(point, lines), torch.ones(3, dtype=torch.float64))
 
 
-def test_distances_are_those_of_an_exhaustive_search(monkeypatch):
+def test_signed_distance_equals_exhaustive_search(monkeypatch):
     curves = random_curves(200)
     points = 2 * torch.randn(200, 2, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
     wanted = reference_distance(points, curves)
@@ -103,7 +103,7 @@ def test_distances_are_those_of_an_exhaustive_search(monkeypatch):
     torch.testing.assert_close(signed_distance(points, curves).abs(), wanted.abs(), atol=1e-3, rtol=0)
 
 
-def test_the_distance_is_0_on_the_curve_and_on_the_tangents_beyond_its_ends(monkeypatch):
+def test_signed_distance_zero_on_curve_and_end_tangents(monkeypatch):
     curves = random_curves(20)
     on = points_on(curves, torch.linspace(0, 1, 7, dtype=torch.float64))
     beyond = [curves[:, 3] + 2 * (curves[:, 3] - curves[:, 2]), curves[:, 0] + 2 * (curves[:, 0] - curves[:, 1])]
@@ -112,7 +112,7 @@ def test_the_distance_is_0_on_the_curve_and_on_the_tangents_beyond_its_ends(monk
     assert float(signed_distance(on, curves[:, None]).abs().max()) < 1e-9
 
 
-def test_gradients_of_the_distance_are_those_of_finite_differences(monkeypatch):
+def test_signed_distance_passes_gradcheck(monkeypatch):
     monkeypatch.setattr(cut_gaussians, "REFINEMENTS", 40)
     curves = random_curves(20).requires_grad_()
     points = torch.randn(20, 2, generator=torch.Generator().manual_seed(4), dtype=torch.float64, requires_grad=True)
@@ -120,7 +120,7 @@ def test_gradients_of_the_distance_are_those_of_finite_differences(monkeypatch):
     assert torch.autograd.gradcheck(signed_distance, (points[:3, None], curves[None, :4]))
 
 
-def test_gradients_with_the_usual_refinements_are_close():
+def test_signed_distance_gradient_accurate_with_default_refinements():
     curves = random_curves(200).requires_grad_()
     points = torch.randn(200, 2, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
     (found,) = torch.autograd.grad(signed_distance(points, curves).sum(), curves)
@@ -138,7 +138,7 @@ def test_gradients_with_the_usual_refinements_are_close():
         ([-1e4, -1e3, 1e3, 1e4], [0.0, 0, 0, 0]), ([-3.0, -1, 1, 3], [1e-6, -1e-6, 1e-6, 0]),
     ],
 )  # fmt: skip
-def test_straight_curves_of_any_spacing_give_the_distance_from_their_line(x, y):
+def test_signed_distance_of_straight_curves_equals_distance_from_line(x, y):
     curve = torch.tensor([x, y]).T.requires_grad_()
     points = torch.tensor([[0.1, 0.5], [0.1, -0.5], [40.0, 7], [-40.0, -7], [0.0, 0]], requires_grad=True)
     found = signed_distance(points, curve)
@@ -159,7 +159,7 @@ def test_straight_curves_of_any_spacing_give_the_distance_from_their_line(x, y):
     ],
     ids=["point", "cusp", "loop", "double ends", "back and forth", "far away"],
 )  # fmt: skip
-def test_degenerate_curves_have_finite_distances_and_gradients(curve):
+def test_signed_distance_of_degenerate_curves_is_finite(curve):
     curve = curve.clone().requires_grad_()
     side = torch.linspace(-4, 4, 41)
     points = torch.stack(torch.meshgrid(side, side, indexing="ij"), -1).requires_grad_()
@@ -172,14 +172,14 @@ def test_degenerate_curves_have_finite_distances_and_gradients(curve):
     assert (found.abs() <= nearest.amin(-1) + 0.1).all()
 
 
-def test_the_gaussian_kernel_gives_the_picture_of_alpha_blending(camera, device):
+def test_gaussian_kernel_equals_alpha_blending(camera, device):
     scene = splats().to(device)
     background = torch.tensor([0.2, 0.4, 0.6], device=device)
     found = render_kernel(scene, camera, KERNELS["gaussian"](), background)
     torch.testing.assert_close(found, render(scene, camera, background).image, rtol=1e-4, atol=1e-4)
 
 
-def test_curves_far_away_cut_nothing_and_near_ones_cut_their_part(camera, device):
+def test_cut_kernel_far_curves_cut_nothing_and_near_curves_cut_part(camera, device):
     scene = splats().to(device)
     g = torch.Generator().manual_seed(5)
     whole = render_kernel(scene, camera, KERNELS["gaussian"]())
@@ -193,7 +193,7 @@ def test_curves_far_away_cut_nothing_and_near_ones_cut_their_part(camera, device
     assert all(t.grad.isfinite().all() and t.grad.abs().sum() > 0 for t in (near.extra[CURVES], near.means))
 
 
-def test_one_straight_edge_shows_where_it_is_projected():
+def test_cut_kernel_straight_edge_at_projected_position():
     camera = Camera.from_focal(40.0, 32, 32)
     scene = Gaussians(
         torch.tensor([[0.0, 0, 20]]), torch.tensor([[1.0, 0, 0, 0]]), torch.tensor([[6.0, 6, 0.1]]).log(),
@@ -215,7 +215,7 @@ def test_one_straight_edge_shows_where_it_is_projected():
 
 
 @pytest.mark.parametrize("model", ["pinhole", "ortho"])
-def test_a_splat_shows_the_same_part_from_in_front_and_behind(model):
+def test_cut_kernel_shows_same_part_from_front_and_back(model):
     g = torch.Generator().manual_seed(6)
     scene = with_curves(
         Gaussians(
@@ -237,7 +237,7 @@ def test_a_splat_shows_the_same_part_from_in_front_and_behind(model):
     torch.testing.assert_close(shown[0].flip(1), shown[1], rtol=1e-3, atol=1e-4)
 
 
-def test_the_gradient_of_the_picture_is_that_of_finite_differences(camera):
+def test_cut_kernel_image_gradient_equals_finite_differences(camera):
     scene = with_curves(splats(count=3), 2, torch.Generator().manual_seed(5), distance=0.5)
     scene.requires_grad_()
     kernel = KERNELS["cut"](width_px=2.0)
@@ -258,7 +258,7 @@ def test_the_gradient_of_the_picture_is_that_of_finite_differences(camera):
         assert slope == pytest.approx(float(tensor.grad.norm()), rel=0.05)
 
 
-def test_a_curve_moves_to_the_edge_of_a_picture():
+def test_cut_kernel_optimisation_moves_curve_to_image_edge():
     camera = Camera(np.eye(3), 32, 32, model="ortho")
     wanted = torch.zeros(32, 32, 3)
     wanted[:, :11] = 1
@@ -282,14 +282,14 @@ def test_a_curve_moves_to_the_edge_of_a_picture():
 
 
 @pytest.mark.parametrize("kernel", [*KERNELS])
-def test_no_gaussians_show_the_background(camera, kernel):
+def test_render_kernel_without_gaussians_shows_background(camera, kernel):
     empty = with_curves(splats().select(slice(0)), 1, torch.Generator())
     background = torch.tensor([0.2, 0.5, 0.7])
     picture = render_kernel(empty, camera, KERNELS[kernel](), background)
     assert torch.equal(picture, background.expand(camera.height_px, camera.width_px, 3))
 
 
-def test_wrong_arguments_are_refused(camera):
+def test_render_kernel_rejects_invalid_arguments(camera):
     with pytest.raises(InvalidInput, match="needs Gaussians with curves"):
         render_kernel(splats(), camera, KERNELS["cut"]())
     with pytest.raises(InvalidInput, match="fisheye"):

@@ -14,7 +14,7 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.gaussians import SH_C0, Gaussians
 
 
-def test_lists_of_tiles_are_padded_to_the_longest():
+def test_padded_pads_tile_lists_to_longest():
     lists, listed = cut_gaussians._padded(torch.tensor([0, 2, 2, 5]), torch.tensor([7, 8, 3, 4, 5, 9]))
     assert listed.tolist() == [[True, True, False], [False] * 3, [True] * 3, [True, False, False]]
     assert [row[keep].tolist() for row, keep in zip(lists, listed, strict=True)] == [[7, 8], [], [3, 4, 5], [9]]
@@ -22,7 +22,7 @@ def test_lists_of_tiles_are_padded_to_the_longest():
     assert lists.shape == listed.shape == (2, 1) and not listed.any()
 
 
-def test_pixels_of_tiles_are_the_centres_in_the_order_of_rows():
+def test_tile_pixels_are_centres_in_row_order():
     pixels = cut_gaussians._tile_pixels(TileGrid(16, 3, 2), torch.device("cpu"))
     assert pixels.shape == (6, 256, 2)
     assert pixels[0, 0].tolist() == [0.5, 0.5] and pixels[0, 17].tolist() == [1.5, 1.5]
@@ -42,7 +42,7 @@ def splats(opacities, depths=(40.0,), colour=1.0, size=2.0):
 CAMERA = Camera.from_focal(60.0, 33, 25)
 
 
-def test_opacity_is_limited_and_colours_are_blended_from_front_to_back():
+def test_render_kernel_limits_opacity_and_blends_front_to_back():
     scene = splats([0.9999, 0.5], (40.0, 50.0))
     scene = replace(scene, sh=torch.stack([torch.full((1, 3), (each - 0.5) / SH_C0) for each in (1.0, 0.5)]))
     picture = render_kernel(scene, CAMERA, GaussianKernel(), torch.tensor([0.25, 0.0, 0.0]))
@@ -56,9 +56,9 @@ def test_opacity_is_limited_and_colours_are_blended_from_front_to_back():
 
 
 @pytest.mark.parametrize(("opacity", "is_shown"), [(0.9 / 255, False), (1.1 / 255, True)])
-def test_alpha_below_a_level_is_not_shown(opacity, is_shown):
+def test_render_kernel_hides_alpha_below_level(opacity, is_shown):
     assert bool(render_kernel(splats([opacity]), CAMERA, GaussianKernel()).any()) == is_shown
 
 
-def test_colours_below_0_are_black():
+def test_render_kernel_clamps_negative_colours_to_black():
     assert not render_kernel(splats([0.9], colour=-0.5), CAMERA, GaussianKernel()).any()

@@ -28,12 +28,12 @@ def error(picture: NDArray[np.float32] | None, came: NDArray[np.float32]) -> flo
     return float(np.square(picture - came)[8:-8, 8:-8].mean())
 
 
-def test_a_motion_moves_a_picture() -> None:
+def test_moved_shifts_image_by_motion() -> None:
     picture, motion = texture(), STILL + np.float32([3, -2])
     np.testing.assert_allclose(moved(picture, motion)[4:-4, 4:-4], picture[6:-2, 1:-7], atol=1e-3)
 
 
-def test_where_a_cell_came_from_is_what_brings_it_there() -> None:
+def test_origin_inverts_motion() -> None:
     rows, columns = np.mgrid[: CELLS[0], : CELLS[1]].astype(np.float32)
     motion = np.stack([2 * np.sin(columns / 5), 1.5 * np.cos(rows / 4)], axis=2)
     came = origin(motion)
@@ -42,7 +42,7 @@ def test_where_a_cell_came_from_is_what_brings_it_there() -> None:
     assert np.abs(there - came).max() < 0.05
 
 
-def test_what_stays_is_expected_to_stay() -> None:
+def test_expected_picture_of_still_scene_is_unchanged() -> None:
     expected = ExpectedPicture()
     for _ in range(4):
         expected.take(as_bytes(texture()), None, STILL)
@@ -50,7 +50,7 @@ def test_what_stays_is_expected_to_stay() -> None:
     np.testing.assert_allclose(picture, as_bytes(texture()), atol=0.01)
 
 
-def test_noise_is_learned_not_to_stay() -> None:
+def test_expected_picture_reduces_noise() -> None:
     expected, clean = ExpectedPicture(), texture()
     noise = np.random.default_rng(1)
     for _ in range(40):
@@ -60,7 +60,7 @@ def test_noise_is_learned_not_to_stay() -> None:
     assert error(picture, clean) < 0.4 * error(newest, clean)
 
 
-def test_flicker_in_one_place_does_not_change_the_others() -> None:
+def test_expected_picture_local_flicker_does_not_affect_other_places() -> None:
     expected, clean, flicker = ExpectedPicture(), texture(), np.random.default_rng(1)
     for _ in range(40):
         newest = clean.copy()
@@ -72,7 +72,7 @@ def test_flicker_in_one_place_does_not_change_the_others() -> None:
     assert np.square(picture - clean)[:, 4:20].mean() < 0.6 * np.square(newest - clean)[:, 4:20].mean()
 
 
-def test_without_a_motion_it_begins_anew_and_keeps_what_it_learned() -> None:
+def test_expected_picture_without_motion_restarts_and_keeps_learned_shares() -> None:
     expected = ExpectedPicture()
     assert expected.after(STILL) is None
     expected.take(as_bytes(texture(0)), None, STILL)
@@ -80,7 +80,7 @@ def test_without_a_motion_it_begins_anew_and_keeps_what_it_learned() -> None:
     np.testing.assert_allclose(expected.after(STILL), as_bytes(texture(1)), atol=0.01)
 
 
-def test_where_one_of_two_motions_comes_their_mean_is_learned_to_be_expected() -> None:
+def test_expected_picture_learns_mean_of_two_alternative_motions() -> None:
     """The continuation is ambiguous: the mean of both pictures is closer to the next frame than either of them."""
     expected, chance, errors = ExpectedPicture(), np.random.default_rng(0), []
     ahead, back = STILL + np.float32([3, 0]), STILL - np.float32([3, 0])
@@ -95,7 +95,7 @@ def test_where_one_of_two_motions_comes_their_mean_is_learned_to_be_expected() -
     assert of_mean < 0.7 * of_one
 
 
-def test_masked_pixels_are_not_learned_from() -> None:
+def test_expected_picture_does_not_learn_from_masked_pixels() -> None:
     """The right side is noise, of which nothing stays; that is learned for the whole picture where it is not masked."""
     changed = []
     for masked in (True, False):

@@ -50,19 +50,19 @@ def causal_db(prior: str, shift_px: Callable[[int], float], frames: int, scored_
 
 
 @pytest.mark.slow
-def test_a_beat_is_predicted_better_than_by_the_last_motion() -> None:
+def test_learned_prior_predicts_beat_better_than_flow_prior() -> None:
     flow, of_beat = (causal_db(prior, beat, 46, 9) for prior in ("flow", "learned"))
     assert of_beat > flow + 3.0
 
 
 @pytest.mark.slow
-def test_a_constant_velocity_is_predicted_no_worse_than_by_the_last_motion() -> None:
+def test_learned_prior_predicts_constant_velocity_like_flow_prior() -> None:
     flow, of_velocity = (causal_db(prior, lambda frame: 0.8 * frame, 12, 5) for prior in ("flow", "learned"))
     assert of_velocity > flow - 0.2
 
 
 @pytest.mark.slow
-def test_a_still_scene_stays_still() -> None:
+def test_learned_prior_keeps_still_scene_still() -> None:
     model = learned(learner(), stream([0.0] * 12))
     newest_s = 11 * INTERVAL_S
     moved = model.at(newest_s + INTERVAL_S).means - model.at(newest_s).means
@@ -70,13 +70,13 @@ def test_a_still_scene_stays_still() -> None:
     assert scored(model, newest_s + INTERVAL_S, picture(0.0)) > scored(model, newest_s, picture(0.0)) - 0.1
 
 
-def test_a_jump_of_the_picture_does_not_go_on() -> None:
+def test_learned_prior_does_not_continue_jump() -> None:
     model = learned(learner(), stream([0.0, 0.2, 0.4, 0.6, 6.0]))
     newest_s = 4 * INTERVAL_S
     assert torch.equal(model.at(newest_s).means, model.at(newest_s + INTERVAL_S).means)
 
 
-def test_it_is_said_about_the_next_frame_only() -> None:
+def test_learned_prior_predicts_next_frame_only() -> None:
     model = learned(learner(), stream([0.0, 1.0, 2.0]))
     newest_s = 2 * INTERVAL_S
     next_means = model.at(newest_s + INTERVAL_S).means
@@ -85,7 +85,7 @@ def test_it_is_said_about_the_next_frame_only() -> None:
 
 
 @pytest.mark.slow
-def test_a_camera_that_moves_has_the_motion_of_the_flow_prior() -> None:
+def test_learned_prior_equals_flow_prior_for_moving_camera() -> None:
     models = []
     for prior in ("flow", "learned"):
         frames = []
@@ -98,13 +98,13 @@ def test_a_camera_that_moves_has_the_motion_of_the_flow_prior() -> None:
 
 
 @pytest.mark.slow
-def test_the_same_frames_give_the_same_bytes() -> None:
+def test_learned_prior_is_deterministic() -> None:
     first, second = (learned(learner(), stream([0.0, 1.0, 2.0, 2.5, 2.0])).at(5 * INTERVAL_S) for _ in range(2))
     assert all(torch.equal(a, b) for a, b in zip(first.tensors().values(), second.tensors().values(), strict=True))
 
 
 @pytest.mark.slow
-def test_publishing_changes_no_later_model() -> None:
+def test_learned_prior_unaffected_by_publishing() -> None:
     often, seldom = learner(), learner()
     for frame in stream([0.0, 1.0, 2.0, 3.0, 2.5]):
         for reconstructor in (often, seldom):
@@ -116,14 +116,14 @@ def test_publishing_changes_no_later_model() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("value", [0, 255])
-def test_pictures_without_tissue_or_light_give_finite_models(value: int) -> None:
+def test_learned_prior_finite_for_images_without_tissue_or_light(value: int) -> None:
     frames = list(stream([0.0, 1.0, 2.0, 3.0, 4.0]))
     frames[2] = frames[2].with_fields(image=np.full((*SIZE, 3), value, np.uint8), mask=np.zeros(SIZE, np.uint8))
     model = learned(learner(), frames)
     assert all(t.isfinite().all() for t in model.at(5 * INTERVAL_S).tensors().values())
 
 
-def test_another_scene_begins_without_what_was_learned() -> None:
+def test_learned_prior_forget_clears_learned_motion() -> None:
     reconstructor = learner()
     learned(reconstructor, stream([0.0, 1.0, 2.0]))
     step, prior = reconstructor._step, reconstructor._motion.prior
@@ -133,5 +133,5 @@ def test_another_scene_begins_without_what_was_learned() -> None:
     assert prior.velocity(step) is None
 
 
-def test_every_published_state_shows_its_own_continuation(device: str) -> None:
+def test_learned_prior_published_states_have_own_continuation(device: str) -> None:
     check_published_continuations(learner(device=device), stream([0.0, 1.0, 2.2, 3.0, 3.1]), CAMERA, INTERVAL_S)

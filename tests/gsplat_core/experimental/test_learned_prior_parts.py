@@ -30,11 +30,11 @@ def after(*values: float) -> list[tuple[float, float]]:
     return [(weight, float(motion.mean())) for weight, motion in moments.next_motions()]
 
 
-def test_the_motions_after_six_moments_are_expected():
+def test_expected_motions_follow_six_similar_moments():
     assert len(after(*[float(number % 5) for number in range(60)])) == 6
 
 
-def test_weights_fall_exponentially_with_what_moments_are_unlike_over_that_of_the_best():
+def test_moment_weights_decay_exponentially_with_relative_difference():
     """Two pairs of motions before: one off by 1 and then 1, the other by 2 and then 1, each with a weight of 0.64."""
     rest = [50.0, -50.0] * 4
     values = [*rest, 11.0, 21.0, 7.0, *rest, 12.0, 21.0, 8.0, *rest, 10.0, 20.0]
@@ -43,13 +43,13 @@ def test_weights_fall_exponentially_with_what_moments_are_unlike_over_that_of_th
     assert found[8] / found[7] == pytest.approx(np.exp(1 - far / near), rel=0.02)
 
 
-def test_moments_of_the_last_255_frames_are_remembered():
+def test_moments_limited_to_last_255_frames():
     values = [9.0, 5.0, *[0.0] * 252]
     assert any(value == 5.0 for _, value in after(*values, 9.0))
     assert not any(value == 5.0 for _, value in after(*values, 0.0, 9.0))
 
 
-def test_pictures_are_averaged_with_a_fifth_of_the_newest_and_their_mixture_is_clipped(monkeypatch):
+def test_expected_picture_averages_with_fifth_of_newest_and_clips(monkeypatch):
     still = np.zeros((48 // CELL_PX, 64 // CELL_PX, 2), np.float32)
     picture = ExpectedPicture()
     levels = [100, 200, 50, 250]
@@ -65,7 +65,7 @@ def test_pictures_are_averaged_with_a_fifth_of_the_newest_and_their_mixture_is_c
     np.testing.assert_array_equal(picture.after(still), 255.0)
 
 
-def test_the_other_guesses_are_the_unmoved_the_blurred_and_the_mean_of_other_motions():
+def test_expected_picture_guesses_unmoved_blurred_and_mean():
     """Expected blur: a line of one pixel has its Gaussian profile of a standard deviation of 1.5 pixels."""
     image = np.zeros((48, 64, 3), np.uint8)
     image[:, 30] = 240
@@ -82,7 +82,7 @@ def test_the_other_guesses_are_the_unmoved_the_blurred_and_the_mean_of_other_mot
     assert spread[20, [26, 30, 34], 0].tolist() == [180, 60, 0]
 
 
-def test_only_tissue_is_learned_from(monkeypatch):
+def test_expected_picture_learns_from_tissue_only(monkeypatch):
     picture, weights = ExpectedPicture(), []
     still, mask = np.zeros((48 // CELL_PX, 64 // CELL_PX, 2), np.float32), np.ones((48, 64), np.uint8)
     mask[:, :20] = 0
@@ -102,7 +102,7 @@ def prior_of(interval_s: float) -> LearnedPrior:
 
 
 @pytest.mark.parametrize("interval_s", [1 / 30, 1 / 15])
-def test_motions_are_learned_per_thirtieth_of_a_second(interval_s):
+def test_next_motion_learned_in_units_of_thirtieth_second(interval_s):
     """Six tenths of a motion are expected at first. Then its share is that of ridge regression, locally and as a whole."""
     prior, scale = prior_of(interval_s), interval_s * 30
     flow = np.zeros((10, 12, 2), np.float32)
@@ -124,7 +124,7 @@ def test_motions_are_learned_per_thirtieth_of_a_second(interval_s):
     np.testing.assert_allclose(ahead, (came + 4 * whole) / (square + 4) * flow, rtol=1e-3)
 
 
-def test_motions_after_similar_moments_are_returned_in_the_unit_of_the_frame():
+def test_next_motion_of_similar_moments_in_units_of_frame():
     prior = prior_of(1 / 15)
     flow = np.full((10, 12, 2), 3.0, np.float32)
     for _ in range(9):
@@ -133,7 +133,7 @@ def test_motions_after_similar_moments_are_returned_in_the_unit_of_the_frame():
     assert prior._guesses[1] == pytest.approx(flow / 2, rel=1e-3)
 
 
-def test_what_is_learned_is_said_for_one_interval_at_most_150_ms():
+def test_learned_prior_horizon_is_one_interval_up_to_150_ms():
     prior = prior_of(0.04)
     assert prior.horizon_s == 0.15
     prior._expected = SimpleNamespace()
@@ -142,7 +142,7 @@ def test_what_is_learned_is_said_for_one_interval_at_most_150_ms():
     assert prior.horizon_s == 0.15
 
 
-def test_velocities_are_motion_and_colour_per_second(monkeypatch):
+def test_learned_prior_velocity_is_motion_and_colour_per_second(monkeypatch):
     """Colours are fitted to the expected picture where its tissue will be."""
     prior, asked = prior_of(0.04), []
     ahead = torch.tensor([[1.0, 2.0, 3.0], [0.0, 0.5, 0.0]])
@@ -169,7 +169,7 @@ def test_velocities_are_motion_and_colour_per_second(monkeypatch):
     assert int((velocity != 0).sum()) == 4 + 6
 
 
-def test_the_expected_picture_has_values_from_0_to_1_and_weighs_tissue_alone(monkeypatch):
+def test_learned_prior_expected_image_scaled_to_1_and_weighted_by_tissue(monkeypatch):
     prior = prior_of(1 / 30)
     frame = next(iter(stream([0.0])))
     height, width = frame.image.shape[:2]
@@ -192,7 +192,7 @@ def test_the_expected_picture_has_values_from_0_to_1_and_weighs_tissue_alone(mon
     assert prior._expected is None, "the scope moves"
 
 
-def test_an_expectation_without_a_usable_motion_predicts_nothing(monkeypatch):
+def test_learned_prior_without_usable_motion_predicts_nothing(monkeypatch):
     """After a cut, say, where the expectation is that of the scene before."""
     prior = prior_of(1 / 30)
     prior._expected = object()

@@ -49,7 +49,7 @@ def noise(seed, cell_px):
     return cv2.resize(grid, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC)
 
 
-def test_a_lambertian_surface_is_found():
+def test_light_depth_recovers_lambertian_surface():
     found, true = depth_of(picture(bowl())), bowl()
     assert found.doubt is None
     assert (found.origin, found.metric) == (DEPTH_ORIGINS["light"], False)
@@ -58,27 +58,27 @@ def test_a_lambertian_surface_is_found():
     assert found.confidence.min() > 0.5
 
 
-def test_twice_the_light_shows_the_same_relief():
+def test_light_depth_independent_of_light_intensity():
     dim, bright = depth_of(picture(bowl(), light=0.15)), depth_of(picture(bowl(), light=0.3))
     assert error(dim.depth, bright.depth) < 0.02
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_textured_plane_does_not_become_a_relief(seed):
+def test_light_depth_textured_plane_stays_flat(seed):
     pigment = np.exp(-np.maximum(noise(seed, 12), 0)[..., None] * np.array([0.3, 0.9, 0.8]))
     found = depth_of(picture(plane(), PINK * pigment))
     depth = plane() if found.doubt else found.depth
     assert error(depth, plane()) < 0.04
 
 
-def test_vessels_and_pale_tissue_do_not_hide_a_relief():
+def test_light_depth_recovers_relief_despite_pigment():
     pigment = np.exp(-np.maximum(noise(3, 8), 0)[..., None] * np.array([0.3, 0.9, 0.8]))
     found, true = depth_of(picture(bowl(), PINK * pigment)), bowl()
     # Measured 0.22 to 0.26 over six pigments; the best tilted plane has 0.75.
     assert error(found.depth, true) < 0.35 * error(plane(), true)
 
 
-def test_the_mixture_of_channels_leaves_the_light_and_not_the_pigment():
+def test_shading_channel_mixture_suppresses_pigment():
     pigment = np.exp(-np.maximum(noise(3, 4), 0)[..., None] * np.array([0.3, 0.9, 0.8]))
     mixed = shading_in(SmallPicture.of(Frame(0, 0, picture(plane(), PINK * pigment))))
     red = shading_in(SmallPicture.of(Frame(0, 0, np.repeat(picture(plane(), PINK * pigment)[..., :1], 3, axis=2))))
@@ -86,21 +86,21 @@ def test_the_mixture_of_channels_leaves_the_light_and_not_the_pigment():
 
 
 @pytest.mark.parametrize("level", [0, 8, 252, 255])
-def test_dark_and_overexposed_frames_say_that_nothing_is_seen(level):
+def test_light_depth_dark_and_overexposed_frames_are_unseen(level):
     found = depth_of(np.full((HEIGHT, WIDTH, 3), level, np.uint8))
     assert found.doubt == UNSEEN
     assert not found.confidence.any()
 
 
-def test_a_facing_plane_without_texture_says_that_there_is_no_relief():
+def test_light_depth_untextured_facing_plane_is_flat():
     assert depth_of(picture(plane())).doubt == FLAT
 
 
-def test_a_frame_full_of_tools_says_that_nothing_is_seen():
+def test_light_depth_frame_full_of_tools_is_unseen():
     assert depth_of(picture(bowl()), mask=np.zeros((HEIGHT, WIDTH), np.uint8)).doubt == UNSEEN
 
 
-def test_what_a_tool_hides_is_believed_less():
+def test_light_depth_confidence_low_under_tool():
     mask = np.ones((HEIGHT, WIDTH), np.uint8)
     mask[:, 100:] = 0
     found = depth_of(picture(bowl()), mask=mask)
@@ -109,7 +109,7 @@ def test_what_a_tool_hides_is_believed_less():
 
 
 @pytest.mark.slow
-def test_the_answer_is_steady_and_the_same_twice():
+def test_light_depth_is_stable_and_deterministic():
     first, second = LightDepth(), LightDepth()
     rng = np.random.default_rng(0)
     depths = []
@@ -124,7 +124,7 @@ def test_the_answer_is_steady_and_the_same_twice():
 
 
 @pytest.mark.slow
-def test_another_scene_size_or_pose_begins_anew():
+def test_light_depth_restarts_for_new_scene_size_or_pose():
     estimator = LightDepth()
     estimator.estimate(Frame(0, 0, picture(bowl())), CAMERA)
     mirrored = picture(bowl()[:, ::-1])
@@ -139,16 +139,16 @@ def test_another_scene_size_or_pose_begins_anew():
     assert estimator.estimate(Frame(3, 3, small), CAMERA.scaled(0.5)).depth.shape == (64, 80)
 
 
-def test_a_camera_without_a_pinhole_gets_no_answer():
+def test_light_depth_is_none_for_fisheye_camera():
     fisheye = Camera(CAMERA.K, WIDTH, HEIGHT, CAMERA.world_to_camera, model="fisheye")
     assert LightDepth().estimate(Frame(0, 0, picture(bowl())), fisheye) is None
 
 
-def test_light_depth_is_found_by_its_name():
+def test_light_depth_registered_by_name():
     assert DEPTHS["light"] is LightDepth
 
 
-def test_half_of_a_relief_is_believed_where_its_brightness_changes_as_much_as_errors_do():
+def test_share_of_distance_half_at_brightness_change_of_error_size():
     grid = Grid.of(CAMERA, (32, 40))
     relief = np.zeros((1, len(grid.half_waves)))
     relief[0, 0] = 1.0
@@ -158,7 +158,7 @@ def test_half_of_a_relief_is_believed_where_its_brightness_changes_as_much_as_er
     assert light.share_of_distance(grid, 2 * relief) == pytest.approx(0.8)
 
 
-def test_confidence_halves_over_a_twentieth_of_the_longer_side():
+def test_light_confidence_halves_over_twentieth_of_longer_side():
     known = np.zeros((32, 40), bool)
     known[:, :10] = True
     found = light._near_seen(SimpleNamespace(known=known))
@@ -166,20 +166,20 @@ def test_confidence_halves_over_a_twentieth_of_the_longer_side():
 
 
 @pytest.mark.parametrize(("share", "is_enough"), [(0.25, True), (0.24, False)])
-def test_a_quarter_of_the_picture_must_be_seen(share, is_enough):
+def test_light_depth_requires_quarter_of_image(share, is_enough):
     known = np.arange(100) < round(100 * share)
     assert light.shows_enough(SimpleNamespace(shading=SimpleNamespace(known=known))) == is_enough
 
 
 @pytest.mark.parametrize(("elapsed_s", "is_new"), [(0.29, False), (0.3, True)])
-def test_depth_is_estimated_anew_every_three_tenths_of_a_second(elapsed_s, is_new):
+def test_light_depth_re_estimated_every_0_3_seconds(elapsed_s, is_new):
     estimator, frame = LightDepth(), Frame(0, 0, picture(bowl()))
     first = estimator.estimate(frame, CAMERA)
     second = estimator.estimate(Frame(1, round(elapsed_s * 1e9), picture(bowl())), CAMERA)
     assert (second is not first) == is_new
 
 
-def test_a_moved_scope_gets_a_new_answer_and_one_at_rest_keeps_its_own(monkeypatch):
+def test_light_depth_re_estimated_only_after_scope_motion(monkeypatch):
     answers = iter("abc")
     monkeypatch.setattr(LightDepth, "_estimated", lambda self, frame, camera: next(answers))
     monkeypatch.setattr(LightDepth, "_resized", lambda self, frame: False)
@@ -231,14 +231,14 @@ def averaged(monkeypatch):
     return found
 
 
-def test_reliefs_are_followed_from_picture_to_picture_and_averaged_with_a_fifth_of_the_newest_or_more(averaged):
+def test_reliefs_average_follows_changes_within_window(averaged):
     """All pictures of a window show the same relief here, so the average follows their change at once."""
     found, windows = averaged([1.0, 2.0, 5.0, 3.0, 3.0, 3.0, 9.0])
     np.testing.assert_allclose(found, [101.0, 102.0, 105.0, 103.0, 103.0, 103.0, 109.0])
     assert len(windows) == 1
 
 
-def test_another_window_takes_part_by_one_over_the_number_of_pictures_and_a_fifth_at_least(averaged):
+def test_reliefs_of_new_window_weighted_by_count_and_at_least_fifth(averaged):
     """The second window begins with another relief, and without the picture before it."""
     found, windows = averaged([1.0, 1.0, 4.0, 6.0], refuse=2)
     # The third picture has no relation to the second: a third of 204 and two of 101, and then its change by 2.
@@ -249,7 +249,7 @@ def test_another_window_takes_part_by_one_over_the_number_of_pictures_and_a_fift
     assert late[-1] - late[-2] == pytest.approx((100 * len(windows) + 4 - late[-2]) / 5)
 
 
-def test_a_window_of_thirteen_pictures_is_followed_by_one_of_the_newest_six_and_this_one(averaged):
+def test_light_window_of_13_images_succeeded_by_window_of_newest_seven(averaged):
     _, windows = averaged([1.0] * 13)
     assert len(windows) == 2 and len(windows[0].pictures) == 13 and len(windows[1].pictures) == 7
     assert windows[1].pictures[:6] == windows[0].pictures[6:12]

@@ -17,7 +17,7 @@ def change(first, second):
     return Follower(shaded_picture(first, CAMERA)).change_to(shaded_picture(second, CAMERA))
 
 
-def test_tissue_that_tilts_changes_its_light_by_that_and_not_by_its_pigment():
+def test_light_change_of_tilting_tissue_independent_of_pigment():
     tilted = 60 * np.exp(0.06 * rays()[0])
     found = change(frame(0, PLANE, pigment()), frame(1, tilted, pigment()))
     light = [np.log(facing / distance**2) for facing, distance in map(facing_and_distance, (PLANE, tilted))]
@@ -26,7 +26,7 @@ def test_tissue_that_tilts_changes_its_light_by_that_and_not_by_its_pigment():
     assert np.abs((found.brighter - true)[found.known]).mean() < 0.2 * np.abs(true[found.known]).mean()
 
 
-def test_glints_that_come_and_go_hardly_change_anything():
+def test_light_change_little_affected_by_glints():
     first, second = (frame(seed, PLANE, pigment(), noise(seed, 3) > 1.6) for seed in (11, 12))
     found = change(first, second)
     blue = [
@@ -36,7 +36,7 @@ def test_glints_that_come_and_go_hardly_change_anything():
     assert np.abs(found.brighter[found.known]).mean() < 0.2 * np.abs(2.2 * np.log(blue[1] / blue[0])).mean()
 
 
-def test_where_it_went_is_found():
+def test_light_change_finds_displacement():
     picture = frame(0, PLANE, pigment()).image
     moved = cv2.warpAffine(picture, np.float32([[1, 0, 3], [0, 1, -2]]), (WIDTH, HEIGHT), borderMode=cv2.BORDER_REFLECT)
     found = change(Frame(0, 0, picture), Frame(1, 1, moved))
@@ -44,7 +44,7 @@ def test_where_it_went_is_found():
 
 
 @pytest.mark.parametrize("other", ["unlike", "darker here and there"])
-def test_another_view_is_not_followed(other):
+def test_light_change_does_not_follow_different_view(other):
     first = frame(0, PLANE, pigment())
     second = {
         "unlike": frame(1, PLANE, pigment(seed=8)),
@@ -53,12 +53,12 @@ def test_another_view_is_not_followed(other):
     assert not change(first, second).is_followed
 
 
-def test_below_a_tool_nothing_is_known():
+def test_light_change_unknown_under_tool():
     mask = np.ones((HEIGHT, WIDTH), np.uint8)
     mask[:, 100:] = 0
     found = change(frame(0, PLANE, pigment()), frame(1, PLANE, pigment(), mask=mask))
     assert not found.known[:, 26:].any() and found.known[:, 4:20].all()
 
 
-def test_a_black_frame_is_not_followed():
+def test_light_change_does_not_follow_black_frame():
     assert not change(frame(0, PLANE, pigment()), Frame(1, 1, np.zeros((HEIGHT, WIDTH, 3), np.uint8))).is_followed

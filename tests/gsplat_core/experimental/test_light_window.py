@@ -38,14 +38,14 @@ def solved(monkeypatch):
     return counts
 
 
-def test_the_relief_is_found_anew_at_1_2_4_8_and_12_pictures(solved):
+def test_light_window_solves_at_1_2_4_8_and_12_images(solved):
     window = LightWindow(None, picture("key"))
     for number in range(13):
         assert window.add(picture(number))
     assert solved == [1, 2, 4, 8, 12]
 
 
-def test_between_solutions_a_picture_gets_the_key_and_its_own_change(solved):
+def test_light_window_adds_image_change_between_solutions(solved):
     pictures = [picture(number) for number in range(3)]
     window = LightWindow(None, pictures[0])
     assert window.relief_of(pictures[0]) == [10.0]
@@ -58,13 +58,13 @@ def test_between_solutions_a_picture_gets_the_key_and_its_own_change(solved):
     assert window.relief_of(picture("another")) is None
 
 
-def test_a_picture_that_is_not_followed_changes_nothing(solved):
+def test_light_window_rejects_unfollowed_image(solved):
     window = LightWindow(None, picture("key"))
     assert not window.add(picture("elsewhere", followed=False))
     assert len(window.pictures) == 1 and solved == [1]
 
 
-def test_earlier_pictures_are_taken_back_to_the_first_that_is_not_followed(solved):
+def test_light_window_takes_earlier_images_until_unfollowed(solved):
     before = [picture("a"), picture("b", followed=False), picture("c"), picture("d")]
     window = LightWindow(None, picture("key"), before)
     assert [each.shading for each in window.pictures] == ["key", "d", "c"]

@@ -24,13 +24,13 @@ def taught(shares: LocalShares, share_of: NDArray[np.float32], frames: int = 10)
     return shares
 
 
-def test_before_anything_was_learned_the_first_shares_hold() -> None:
+def test_local_shares_start_with_initial_values() -> None:
     shares = LocalShares(SETTINGS)
     assert shares.whole().tolist() == [0.5, 0.0]
     assert np.all(shares.local((10, 20)) == np.float32([0.5, 0.0]))
 
 
-def test_they_are_found_place_by_place() -> None:
+def test_local_shares_vary_by_place() -> None:
     share_of = np.full((48, 64), 0.2, np.float32)
     share_of[:, 32:] = 0.9
     local = taught(LocalShares(SETTINGS), share_of).local((48, 64))
@@ -39,7 +39,7 @@ def test_they_are_found_place_by_place() -> None:
     assert np.abs(local[..., 1]).mean() < 0.05
 
 
-def test_whole_is_the_least_squares_fit_of_the_weighted_sums() -> None:
+def test_local_shares_whole_equals_weighted_least_squares_fit() -> None:
     """Compare with `lstsq` over all pixels: earlier pixels weigh less, and the pull to the first shares adds rows."""
     shares, rows, right = LocalShares(SETTINGS), [], []
     weight = np.random.default_rng(9).uniform(0, 1, (20, 30)).astype(np.float32)
@@ -55,18 +55,18 @@ def test_whole_is_the_least_squares_fit_of_the_weighted_sums() -> None:
     np.testing.assert_allclose(shares.whole(), expected, atol=1e-5)
 
 
-def test_they_follow_what_changes() -> None:
+def test_local_shares_follow_changes() -> None:
     shares = taught(LocalShares(SETTINGS), np.full((48, 64), 0.9, np.float32))
     assert taught(shares, np.full((48, 64), 0.1, np.float32), 40).whole()[0] == pytest.approx(0.1, abs=0.03)
 
 
-def test_what_is_not_tissue_says_nothing() -> None:
+def test_local_shares_ignore_pixels_without_tissue() -> None:
     shares, weight = LocalShares(SETTINGS), np.zeros((48, 64), np.float32)
     shares.learn([noise(0), noise(1)], noise(2), weight)
     np.testing.assert_allclose(shares.whole(), SETTINGS.at_first, atol=1e-6)
 
 
-def test_fields_of_another_size_begin_anew() -> None:
+def test_local_shares_restart_after_size_change() -> None:
     shares = taught(LocalShares(SETTINGS), np.full((48, 64), 0.9, np.float32))
     first = noise(0, (12, 100, 3))
     shares.learn([first, noise(1, (12, 100, 3))], 0.3 * first, np.ones((12, 100), np.float32))
@@ -74,6 +74,6 @@ def test_fields_of_another_size_begin_anew() -> None:
 
 
 @pytest.mark.parametrize(("shape", "cells"), [((512, 640), (40, 32)), ((1, 900), (40, 1)), ((5, 3), (3, 5))])
-def test_the_number_of_cells_is_bounded(shape: tuple[int, int], cells: tuple[int, int]) -> None:
+def test_local_shares_number_of_cells_is_limited(shape: tuple[int, int], cells: tuple[int, int]) -> None:
     assert cells_for(shape) == cells
     assert max(cells) <= MOST_CELLS

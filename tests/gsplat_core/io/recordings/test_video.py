@@ -64,7 +64,7 @@ def test_bare_video_gets_a_stated_default_camera(video_folder: Path) -> None:
     assert recording.camera_at(7) == recording.camera
 
 
-def test_a_single_video_of_any_name_is_found(video_folder: Path, refused: Refused, make: SimpleNamespace) -> None:
+def test_single_video_of_any_name_is_found(video_folder: Path, refused: Refused, make: SimpleNamespace) -> None:
     (video_folder / "video.mp4").rename(video_folder / "scope.mp4")
     assert open_recording(video_folder).frame_count == 8
     make.video(video_folder / "room.mp4", 8)
@@ -169,7 +169,7 @@ def test_stated_rate_does_not_change_variable_frame_times(tmp_path: Path) -> Non
     assert any("states 60 frames/s, and the video has 17.24 frames/s on average" in note for note in recording.notes)
 
 
-def test_a_video_longer_than_a_day_is_refused(tmp_path: Path, refused: Refused) -> None:
+def test_video_longer_than_one_day_rejected(tmp_path: Path, refused: Refused) -> None:
     videos.write_timed(tmp_path / "v.mkv", [0, 1, 25 * 86_401])
     refused(tmp_path / "v.mkv", RecordingInvalid, "86401 s after the first one", "25 frames/s")
 
