@@ -460,7 +460,7 @@ UNCONFIRMED = "two depth maps by parallax disagree about the relief, so a level 
 
 
 @dataclass(frozen=True)
-class Look:
+class ReducedDepth:
     """Depth map at reduced size with its camera, for the comparison of two maps (`agree`)."""
 
     inverse: NDArray[np.float32]
@@ -471,7 +471,7 @@ class Look:
     """Camera with its pose, scaled to the size of the map."""
 
     @classmethod
-    def of(cls, depth: NDArray[np.float32], confidence: NDArray[np.float32] | None, camera: Camera) -> Look:
+    def of(cls, depth: NDArray[np.float32], confidence: NDArray[np.float32] | None, camera: Camera) -> ReducedDepth:
         """Return the reduced depth map. Without a confidence, every known depth counts as confident.
 
         Args:
@@ -490,7 +490,7 @@ class Look:
         )
 
 
-def disagreement(first: Look, second: Look) -> float:
+def disagreement(first: ReducedDepth, second: ReducedDepth) -> float:
     """Return the median relative depth difference over the median relief of the second map;
     infinite if they share too little tissue.
 
@@ -516,6 +516,6 @@ def disagreement(first: Look, second: Look) -> float:
     return off / relief if relief > 0 else np.inf
 
 
-def agree(first: Look, second: Look) -> bool:
+def agree(first: ReducedDepth, second: ReducedDepth) -> bool:
     """Return True if two depth maps of the same tissue confirm each other: they differ by at most `MOST_DISAGREEMENT`."""
     return disagreement(first, second) <= MOST_DISAGREEMENT

@@ -24,7 +24,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsplat_core.depth.maps import UNCONFIRMED, DepthMap, Estimator, Look, RecordingDepth, agree, doubted
+from gsplat_core.depth.maps import UNCONFIRMED, DepthMap, Estimator, RecordingDepth, ReducedDepth, agree, doubted
 from gsplat_core.geometry.tracks import followed
 from gsplat_core.machine import usable_cores
 from gsplat_core.ops.plane_sweep import WINDOW_PX, MatchingCosts, select_planes, sweep_planes
@@ -413,7 +413,7 @@ class ParallaxDepth(Estimator):
     def __init__(self) -> None:
         self._kept: list[tuple[float, View]] = []
         self._found_s: float | None = None
-        self._look: Look | None = None
+        self._last: ReducedDepth | None = None
         """Reduced copy of the last depth map, estimated at time `_found_s`, which has to confirm the next one."""
 
     def estimate(self, frame: Frame, camera: Camera) -> DepthMap | None:
@@ -421,7 +421,7 @@ class ParallaxDepth(Estimator):
         than pinholes, and within `EVERY_S` seconds of the last map.
         """
         if frame.new_scene is not None:
-            self._kept, self._found_s, self._look = [], None, None
+            self._kept, self._found_s, self._last = [], None, None
         if frame.pose is None or camera.model != "pinhole":
             return None
         now_s = frame.time_s
@@ -454,11 +454,11 @@ class ParallaxDepth(Estimator):
     def _confirmed(self, found: DepthMap, camera: Camera, now_s: float) -> DepthMap | None:
         """Return the depth if it agrees with the previous depth map, a rejected map if not, or None for the first one."""
         is_first = self._found_s is None or not 0 <= now_s - self._found_s <= LONGEST_S
-        before, self._look = self._look, Look.of(found.depth, found.confidence, camera)
+        before, self._last = self._last, ReducedDepth.of(found.depth, found.confidence, camera)
         self._found_s = now_s
         if is_first or before is None:
             return None
-        return found if agree(before, self._look) else doubted(found.depth.shape, found.origin, UNCONFIRMED)
+        return found if agree(before, self._last) else doubted(found.depth.shape, found.origin, UNCONFIRMED)
 
     def _is_elsewhere(self, camera: Camera) -> bool:
         """Return True if the scope is farther from every key frame than the closest two key frames are from each other.
@@ -492,13 +492,13 @@ def _confirmed(frames: list[Frame], doubts: Counter[str], cameras: Sequence[Came
     distances. `agree` compares two depth maps. Reasons are added to `doubts`.
     """
     numbers = [number for number, frame in enumerate(frames) if frame.depth is not None]
-    looks = [
-        Look.of(depth, frames[number].depth_confidence, cameras[number])
+    reduced = [
+        ReducedDepth.of(depth, frames[number].depth_confidence, cameras[number])
         for number in numbers
         if (depth := frames[number].depth) is not None
     ]
     confirmed: set[int] = set()
-    for (one, first), (other, second) in pairwise(zip(numbers, looks, strict=True)):
+    for (one, first), (other, second) in pairwise(zip(numbers, reduced, strict=True)):
         if agree(first, second):
             confirmed |= {one, other}
     if 2 * len(confirmed) < len(numbers):

@@ -1,4 +1,4 @@
-"""Depth by parallax is used where two looks agree on the relief, and not where tissue that moves feigns it."""
+"""Depth by parallax is used if two maps agree on the relief, and rejected if moving tissue looks like relief."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from gsplat_core.depth.maps import MOST_DISAGREEMENT, UNCONFIRMED, Look, agree, disagreement
+from gsplat_core.depth.maps import MOST_DISAGREEMENT, UNCONFIRMED, ReducedDepth, agree, disagreement
 from gsplat_core.depth.multiview import ParallaxDepth, _confirmed
 from gsplat_core.io.recordings.synthetic.rendered import RenderSettings, render_recording
 from gsplat_core.scene.cameras import Camera
@@ -41,49 +41,52 @@ def true_depth(camera: Camera) -> NDArray[np.float32]:
     return z.astype(np.float32)
 
 
-def look(camera: Camera, depth: NDArray[np.float32] | None = None) -> Look:
-    return Look.of(true_depth(camera) if depth is None else depth, None, camera)
+def reduced_depth(camera: Camera, depth: NDArray[np.float32] | None = None) -> ReducedDepth:
+    return ReducedDepth.of(true_depth(camera) if depth is None else depth, None, camera)
 
 
-def test_looks_at_the_truth_agree_from_wherever_they_are() -> None:
+def test_true_depth_maps_agree_from_any_position() -> None:
     for place in ((0.0, 0.0, 0.0), (5.0, -3.0, 4.0), (-8.0, 6.0, -5.0)):
-        assert disagreement(look(CAMERA), look(moved_by(*place))) < 0.06
+        assert disagreement(reduced_depth(CAMERA), reduced_depth(moved_by(*place))) < 0.06
 
 
 @pytest.mark.parametrize("factor", [0.8, 1.25])
-def test_looks_at_other_distances_do_not_agree(factor: float) -> None:
+def test_depth_maps_at_other_distances_disagree(factor: float) -> None:
     other = moved_by(4.0, 0.0, 0.0)
-    assert not agree(look(CAMERA), look(other, factor * true_depth(other)))
+    assert not agree(reduced_depth(CAMERA), reduced_depth(other, factor * true_depth(other)))
 
 
-def test_a_look_at_a_relief_that_is_not_there_does_not_agree() -> None:
+def test_wrong_relief_disagrees() -> None:
     other = moved_by(4.0, 2.0, 0.0)
-    assert not agree(look(CAMERA), look(other, np.flip(true_depth(other), axis=1).copy()))
+    assert not agree(reduced_depth(CAMERA), reduced_depth(other, np.flip(true_depth(other), axis=1).copy()))
     flat = np.full((HEIGHT, WIDTH), 60, np.float32)
-    assert disagreement(look(CAMERA), look(other, flat)) == np.inf
+    assert disagreement(reduced_depth(CAMERA), reduced_depth(other, flat)) == np.inf
 
 
 def test_noise_counts_as_much_as_it_is_beside_the_relief() -> None:
     other, random = moved_by(4.0, 0.0, 0.0), np.random.default_rng(2)
     noise = lambda share: np.exp(share * random.standard_normal((HEIGHT, WIDTH))).astype(np.float32)
-    found = [disagreement(look(CAMERA), look(other, true_depth(other) * noise(share))) for share in (0.005, 0.02, 0.08)]
+    found = [
+        disagreement(reduced_depth(CAMERA), reduced_depth(other, true_depth(other) * noise(share)))
+        for share in (0.005, 0.02, 0.08)
+    ]
     assert found[0] < MOST_DISAGREEMENT < found[2] and found == sorted(found)
 
 
-def test_looks_that_share_no_tissue_say_nothing() -> None:
-    assert disagreement(look(CAMERA), look(moved_by(200.0, 0.0, 0.0))) == np.inf
-    nothing = Look.of(np.zeros((HEIGHT, WIDTH), np.float32), None, CAMERA)
-    assert disagreement(nothing, look(CAMERA)) == disagreement(look(CAMERA), nothing) == np.inf
-    unsure = Look.of(true_depth(CAMERA), np.full((HEIGHT, WIDTH), 0.2, np.float32), CAMERA)
-    assert disagreement(unsure, look(CAMERA)) == np.inf
+def test_disagreement_is_infinite_without_shared_tissue() -> None:
+    assert disagreement(reduced_depth(CAMERA), reduced_depth(moved_by(200.0, 0.0, 0.0))) == np.inf
+    nothing = ReducedDepth.of(np.zeros((HEIGHT, WIDTH), np.float32), None, CAMERA)
+    assert disagreement(nothing, reduced_depth(CAMERA)) == disagreement(reduced_depth(CAMERA), nothing) == np.inf
+    unsure = ReducedDepth.of(true_depth(CAMERA), np.full((HEIGHT, WIDTH), 0.2, np.float32), CAMERA)
+    assert disagreement(unsure, reduced_depth(CAMERA)) == np.inf
 
 
-def test_in_a_stream_a_first_look_gives_nothing_and_a_second_one_confirms_it() -> None:
+def test_stream_returns_depth_after_second_map_confirms_first() -> None:
     found = answers(ParallaxDepth(), stream(20))
     assert [each.doubt for each in found if each is not None] == [None, None]
 
 
-def test_a_look_long_ago_confirms_nothing() -> None:
+def test_stream_depth_is_not_confirmed_by_old_map() -> None:
     estimator, frames = ParallaxDepth(), stream(20)
     late = [frame.with_fields(pts_ns=frame.pts_ns + 10_000_000_000) for frame in frames[8:]]
     found = answers(estimator, frames[:5]) + answers(estimator, late)
@@ -106,7 +109,7 @@ def test_breathing_tissue_gets_no_depth_by_parallax_in_a_stream(breathing) -> No
 
 
 @pytest.mark.parametrize(("factors", "kept"), [((1.0, 1.3, 1.0, 1.0, 1.0), 5), ((1.0, 1.3, 1.7, 1.0, 1.0), 0)])
-def test_offline_all_depth_is_kept_where_most_looks_are_confirmed(factors: tuple[float, ...], kept: int) -> None:
+def test_offline_keeps_all_depth_if_most_maps_are_confirmed(factors: tuple[float, ...], kept: int) -> None:
     """Frames that keep depth next to frames that lose it would start at different distances."""
     cameras = [moved_by(2.0 * number, 0.0, 0.0) for number in range(5)]
     frames = [
@@ -128,16 +131,16 @@ def test_offline_all_depth_is_kept_where_most_looks_are_confirmed(factors: tuple
 def test_disagreement_is_the_logarithm_of_a_wrong_scale_over_the_spread_of_the_relief(factor: float) -> None:
     depth = true_depth(CAMERA).astype(np.float64)
     spread = np.median(np.abs(np.log(depth) - np.median(np.log(depth))))
-    found = disagreement(look(CAMERA), look(CAMERA, (factor * depth).astype(np.float32)))
+    found = disagreement(reduced_depth(CAMERA), reduced_depth(CAMERA, (factor * depth).astype(np.float32)))
     assert found == pytest.approx(abs(np.log(factor)) / spread, rel=0.03)
 
 
 @pytest.mark.parametrize(("rows", "is_compared"), [(6, False), (14, True)])
-def test_looks_must_share_a_tenth_of_the_picture(rows: int, is_compared: bool) -> None:
+def test_depth_maps_must_share_a_tenth_of_the_picture(rows: int, is_compared: bool) -> None:
     depth = true_depth(CAMERA)
     depth[rows:] = 0
-    assert np.isfinite(disagreement(look(CAMERA), look(CAMERA, depth))) == is_compared
-    assert np.isfinite(disagreement(look(CAMERA, depth), look(CAMERA))) == is_compared
+    assert np.isfinite(disagreement(reduced_depth(CAMERA), reduced_depth(CAMERA, depth))) == is_compared
+    assert np.isfinite(disagreement(reduced_depth(CAMERA, depth), reduced_depth(CAMERA))) == is_compared
 
 
 @pytest.mark.parametrize(("size", "compared"), [((640, 480), (120, 160)), ((100, 80), (80, 100))])
@@ -147,7 +150,7 @@ def test_large_depth_maps_are_compared_at_160_pixels(size: tuple[int, int], comp
     depth[:, : size[0] // 2] = 0
     confidence = np.full(size[::-1], 0.9, np.float32)
     confidence[: size[1] // 2] = 0.1
-    found = Look.of(depth, confidence, camera)
+    found = ReducedDepth.of(depth, confidence, camera)
     assert found.inverse.shape == found.believed.shape == compared
     columns, rows = np.arange(compared[1]) >= compared[1] // 2, np.arange(compared[0]) >= compared[0] // 2
     np.testing.assert_allclose(found.inverse, np.tile(columns / 50, (compared[0], 1)))
