@@ -34,7 +34,7 @@ def scene(make_scene):
 
 @pytest.mark.parametrize(("mode", "channels"), [("RGB", 3), ("D", 1), ("ED", 1), ("RGB+D", 4), ("RGB+ED", 4)])
 @pytest.mark.parametrize("packed", [False, True])
-def test_render_modes(scene, mode, channels, packed):
+def test_rasterization_render_modes(scene, mode, channels, packed):
     image, alpha, _ = rasterize(scene, render_mode=mode, packed=packed)
     assert image.shape == (2, 37, 52, channels) and alpha.shape == (2, 37, 52, 1)
     rgb, depth = rasterize(scene, render_mode="RGB")[0], rasterize(scene, render_mode="D")[0]
@@ -48,7 +48,7 @@ def test_render_modes(scene, mode, channels, packed):
 
 @pytest.mark.parametrize("mode", ["RGB+D", "RGB+ED", "RGB-d", "RGB-Ed"])
 @pytest.mark.parametrize("changes", [{}, {"packed": True}, {"with_ut": True, "with_eval3d": True}], ids=str)
-def test_colors_without_channels_leave_the_depth(scene, mode, changes):
+def test_rasterization_colors_without_channels_give_depth_only(scene, mode, changes):
     """Programs concatenate the features that a caller asks for, which may be none."""
     options = {"sh_degree": None, "packed": False, **changes}
     means = scene.means.clone().requires_grad_()
@@ -64,7 +64,7 @@ def test_colors_without_channels_leave_the_depth(scene, mode, changes):
 
 @pytest.mark.parametrize("count", [1, 3, 7, 40])
 @pytest.mark.parametrize("per_camera", [False, True])
-def test_plain_colors_with_any_number_of_channels(scene, count, per_camera):
+def test_rasterization_plain_colors_with_any_number_of_channels(scene, count, per_camera):
     g = torch.Generator().manual_seed(1)
     colors = torch.rand(*((2,) if per_camera else ()), 50, count, generator=g)
     background = torch.rand(2, count, generator=g)
@@ -79,26 +79,26 @@ def test_plain_colors_with_any_number_of_channels(scene, count, per_camera):
 
 
 @pytest.mark.parametrize("degree", range(5))
-def test_sh_degrees_up_to_what_the_coefficients_hold(make_scene, degree, assert_near):
+def test_rasterization_sh_degrees_up_to_coefficients(make_scene, degree, assert_near):
     scene = make_scene(30, degree=4)
     image, _, _ = rasterize(scene.to(torch.float32), sh_degree=degree)
     exact, _, _ = rasterize(scene.to(torch.float64), reference, sh_degree=degree)
     assert_near(image, exact, of_largest=1e-4)
 
 
-def test_coefficients_per_camera(scene):
+def test_rasterization_coefficients_per_camera(scene):
     shared, _, _ = rasterize(scene)
     own, _, _ = rasterize(scene, colors=scene.sh.expand(2, -1, -1, -1))
     torch.testing.assert_close(own, shared, rtol=0, atol=0)
 
 
-def test_covars_give_the_same_image(scene):
+def test_rasterization_covars_give_same_image(scene):
     covars, _ = gsplat.quat_scale_to_covar_preci(scene.quats, scene.scales, compute_preci=False)
     image, _, _ = rasterize(scene, quats=None, scales=None, covars=covars)
     torch.testing.assert_close(image, rasterize(scene)[0], rtol=1e-3, atol=1e-4)
 
 
-def test_batches_and_cameras_are_separate_images(make_scene):
+def test_rasterization_batches_and_cameras_are_separate_images(make_scene):
     scene = make_scene(30, (2, 2), 3).to(torch.float32)
     background = torch.rand(2, 2, 3, 3)
     together, alpha, meta = rasterize(scene, packed=False, backgrounds=background)
@@ -112,7 +112,7 @@ def test_batches_and_cameras_are_separate_images(make_scene):
 
 
 @pytest.mark.parametrize("tile_size", [4, 8, 16, 32, None])
-def test_tile_size_is_honoured_and_changes_nothing(scene, tile_size):
+def test_rasterization_tile_size_does_not_change_image(scene, tile_size):
     image, _, meta = rasterize(scene, tile_size=tile_size, packed=False)
     size = tile_size or 16
     assert meta["tile_size"] == size
@@ -120,7 +120,7 @@ def test_tile_size_is_honoured_and_changes_nothing(scene, tile_size):
     torch.testing.assert_close(image, rasterize(scene)[0], rtol=1e-4, atol=1e-5)
 
 
-def test_meta_dense(scene):
+def test_rasterization_meta_dense(scene):
     _, _, meta = rasterize(scene, packed=False)
     assert list(meta) == META
     assert all(meta[name] is None for name in META[:3])
@@ -140,7 +140,7 @@ def test_meta_dense(scene):
     assert torch.equal(meta["isect_ids"], meta["isect_ids"].sort().values)
 
 
-def test_meta_is_a_dict_a_pytree_and_picklable(scene):
+def test_rasterization_meta_is_picklable_pytree_dict(scene):
     with torch.no_grad():
         _, _, meta = rasterize(scene, packed=False)
     assert type(meta) is dict
@@ -151,7 +151,7 @@ def test_meta_is_a_dict_a_pytree_and_picklable(scene):
     assert torch.equal(again["isect_ids"], meta["isect_ids"])
 
 
-def test_all_arguments_can_be_given_by_position(scene):
+def test_rasterization_accepts_all_arguments_by_position(scene):
     given = (scene.means, scene.quats, scene.scales, scene.opacities, scene.sh, scene.viewmats, scene.Ks, 52, 37)
     given += (0.01, 1e10, 0.0, 0.3, 3, False, 16, None, "RGB+ED", False, False, "antialiased", 32, False, "pinhole")
     image, alpha, _ = gsplat.rasterization(*given)
@@ -160,7 +160,7 @@ def test_all_arguments_can_be_given_by_position(scene):
     assert torch.equal(alpha, wanted[1])
 
 
-def test_meta_packed_has_the_visible_rows(scene):
+def test_rasterization_meta_packed_has_visible_rows(scene):
     dense, packed = rasterize(scene, packed=False)[2], rasterize(scene)[2]
     seen = dense["radii"][..., 0] > 0
     assert list(packed) == META
@@ -172,7 +172,7 @@ def test_meta_packed_has_the_visible_rows(scene):
 
 
 @pytest.mark.parametrize("packed", [False, True])
-def test_absgrad(scene, packed):
+def test_rasterization_absgrad_not_below_gradient_magnitude(scene, packed):
     scene.means.requires_grad_()
     image, _, meta = rasterize(scene, packed=packed, absgrad=True)
     meta["means2d"].retain_grad()
@@ -184,7 +184,7 @@ def test_absgrad(scene, packed):
 
 
 @pytest.mark.slow
-def test_absgrad_matches_the_reference(make_scene, assert_near):
+def test_rasterization_absgrad_matches_reference(make_scene, assert_near):
     def absolute(module, dtype):
         scene = make_scene(30).to(dtype)
         scene.means.requires_grad_()
@@ -195,7 +195,7 @@ def test_absgrad_matches_the_reference(make_scene, assert_near):
     assert_near(absolute(gsplat, torch.float32), absolute(reference, torch.float64), relative=1e-2, of_largest=1e-3)
 
 
-def test_antialiasing_dims_what_is_smaller_than_a_pixel(make_scene):
+def test_rasterization_antialiasing_dims_sub_pixel_gaussians(make_scene):
     scene = make_scene(20).to(torch.float32)
     scene.scales.fill_(0.01)
     classic, aliased = (rasterize(scene, rasterize_mode=mode, packed=False) for mode in ("classic", "antialiased"))
@@ -215,7 +215,7 @@ def test_antialiasing_dims_what_is_smaller_than_a_pixel(make_scene):
     ],
 )
 @pytest.mark.parametrize("module", [gsplat, reference])
-def test_one_bad_gaussian_changes_nothing_but_itself(make_scene, what, value, module):
+def test_rasterization_invalid_gaussian_does_not_affect_others(make_scene, what, value, module):
     scene = make_scene(30)
     scene = scene.to(torch.float32)
     scene.means[3] = torch.tensor([0.0, 0.0, 5.0])
@@ -239,14 +239,14 @@ def test_one_bad_gaussian_changes_nothing_but_itself(make_scene, what, value, mo
 
 @pytest.mark.parametrize("module", [gsplat, reference])
 @pytest.mark.parametrize("value", [math.inf, -math.inf])
-def test_one_infinite_coefficient_culls_and_does_not_show_black(make_scene, module, value):
+def test_rasterization_culls_gaussian_with_infinite_coefficient(make_scene, module, value):
     scene = make_scene(10).to(torch.float32)
     scene.sh[0, 0] = value  # the sum is infinite, of this sign
     _, _, meta = rasterize(scene, module, packed=False)
     assert meta["radii"][0, 0].tolist() == [0, 0]
 
 
-def test_plain_colors_that_are_not_finite_are_culled(scene):
+def test_rasterization_culls_non_finite_plain_colors(scene):
     colors = torch.rand(50, 3)
     colors[4, 1] = math.nan
     image, _, meta = rasterize(scene, colors=colors, sh_degree=None, packed=False)
@@ -266,18 +266,18 @@ class Shutter(enum.Enum):
         ("camera_model", "ftheta"), ("camera_model", "lidar"),
     ],
 )  # fmt: skip
-def test_what_is_not_supported_says_so(scene, argument, value):
+def test_rasterization_unsupported_argument_error_names_value(scene, argument, value):
     shown = r"\[2, " if isinstance(value, torch.Tensor) else str(value).split(" at ")[0].replace("<", "")
     with pytest.raises(NotImplementedError, match=f"{argument}.*{shown}"):
         rasterize(scene, **{argument: value})
 
 
-def test_what_changes_no_result_is_accepted(scene):
+def test_rasterization_accepts_options_without_effect(scene):
     image, _, _ = rasterize(scene, segmented=True, channel_chunk=2, rolling_shutter=Shutter.GLOBAL, with_ut=False)
     torch.testing.assert_close(image, rasterize(scene)[0], rtol=0, atol=0)
 
 
-def test_wrong_arguments_are_refused(scene):
+def test_rasterization_rejects_invalid_arguments(scene):
     for changes, message in [
         ({"means": scene.means[:, :2]}, r"means must be \[..., N, 3\], got \[50, 2\]"),
         ({"quats": scene.quats[:9]}, r"quats .*\[50, 4\], got \[9, 4\]"),

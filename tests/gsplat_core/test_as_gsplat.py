@@ -54,7 +54,7 @@ def installed(request):
 
 
 @pytest.mark.slow
-def test_a_program_runs_unchanged_with_the_modules_in_its_folder(tmp_path):
+def test_as_gsplat_runs_program_with_modules_in_own_folder(tmp_path):
     (tmp_path / "helper.py").write_text("SIZE = 16\n")
     (tmp_path / "program.py").write_text(PROGRAM)
     command = [sys.executable, "-m", "gsplat_core.as_gsplat", str(tmp_path / "program.py"), "--steps", "3"]
@@ -89,7 +89,7 @@ if __name__ == "__main__":
 
 @pytest.mark.slow
 @pytest.mark.parametrize("constants", ["1.6", "1.5.3"])
-def test_processes_that_a_program_spawns_have_the_modules_too(tmp_path, constants):
+def test_as_gsplat_spawned_processes_have_modules(tmp_path, constants):
     (tmp_path / "gsplat.py").write_text("raise ImportError('this folder has another gsplat')\n")
     (tmp_path / "program.py").write_text(SPAWNING)
     command = [
@@ -108,7 +108,7 @@ def test_processes_that_a_program_spawns_have_the_modules_too(tmp_path, constant
 
 
 @pytest.mark.parametrize("constants", ["1.6", "1.5.3"])
-def test_a_module_on_the_path_gives_way_to_that_of_the_hook(monkeypatch, constants):
+def test_as_gsplat_hook_precedes_module_on_path(monkeypatch, constants):
     monkeypatch.setattr(sys, "meta_path", [each for each in sys.meta_path if not isinstance(each, as_gsplat.Finder)])
     monkeypatch.setenv("INTRASPLAT_GSPLAT_CONSTANTS", constants)
     monkeypatch.syspath_prepend(as_gsplat.PATH_ENTRY)
@@ -132,7 +132,7 @@ def test_a_module_on_the_path_gives_way_to_that_of_the_hook(monkeypatch, constan
         (["-m", "no_such_package.module"], "there is no module no_such_package.module"),
     ],
 )
-def test_a_program_that_is_not_there_is_a_wrong_argument(tmp_path, monkeypatch, capsys, program, found):
+def test_as_gsplat_missing_program_is_argument_error(tmp_path, monkeypatch, capsys, program, found):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["as_gsplat", *program])
     monkeypatch.setattr(sys, "path", list(sys.path))
@@ -143,7 +143,7 @@ def test_a_program_that_is_not_there_is_a_wrong_argument(tmp_path, monkeypatch, 
     assert ended.value.code == 2 and found in capsys.readouterr().err
 
 
-def test_every_name_exists(installed):
+def test_as_gsplat_every_name_exists(installed):
     for module_name, homes in as_gsplat.MODULES.items():
         module = importlib.import_module(module_name)
         for name in homes:
@@ -151,14 +151,14 @@ def test_every_name_exists(installed):
         assert set(homes) <= set(dir(module))
 
 
-def test_names_are_those_of_the_package_itself(installed):
+def test_as_gsplat_names_equal_package_names(installed):
     module = importlib.import_module("gsplat")
     for name in as_gsplat.MODULES["gsplat"]:
         if name in gsplat_core.__all__:
             assert getattr(module, name) is getattr(gsplat_core, name)
 
 
-def test_the_older_projection_is_that_of_a_pinhole_camera(installed):
+def test_as_gsplat_persp_proj_equals_pinhole_projection(installed):
     wrapper = importlib.import_module("gsplat.cuda._wrapper")
     splats = torch.tensor([[[0.1, 0.2, 2.0], [0.3, -0.1, 3.0]]]), torch.eye(3).expand(1, 2, 3, 3)
     K = torch.tensor([[[20.0, 0, 8], [0, 20, 8], [0, 0, 1]]])
@@ -166,7 +166,7 @@ def test_the_older_projection_is_that_of_a_pinhole_camera(installed):
     torch.testing.assert_close(wrapper.persp_proj(*splats, K, 16, 16), expected)
 
 
-def test_starts_of_tile_lists_are_found_by_the_argument_names_of_the_plain_function(installed):
+def test_as_gsplat_isect_offset_encode_accepts_plain_argument_names(installed):
     plain = importlib.import_module("gsplat.cuda._torch_impl")
     means2d, radii = torch.tensor([[[4.0, 4.0], [20.0, 4.0]]]), torch.full((1, 2, 2), 3, dtype=torch.int32)
     _, ids, _ = plain._isect_tiles(means2d, radii, torch.ones(1, 2), 16, 2, 1)
@@ -174,7 +174,7 @@ def test_starts_of_tile_lists_are_found_by_the_argument_names_of_the_plain_funct
 
 
 @pytest.mark.parametrize(("installed", "most"), [("1.6", 0.99), ("1.5.3", 0.999)], indirect=["installed"])
-def test_the_constants_are_those_of_the_chosen_version(installed, most):
+def test_as_gsplat_constants_of_chosen_version(installed, most):
     gsplat = importlib.import_module("gsplat")
     assert importlib.import_module("gsplat.rendering").rasterization is gsplat.rasterization
     opaque = torch.tensor([[0.0, 0, 2]]), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), 0.5), torch.ones(1)
@@ -190,7 +190,7 @@ def test_the_constants_are_those_of_the_chosen_version(installed, most):
         install("1.5.3" if most == 0.99 else "1.6")
 
 
-def test_an_unknown_name_is_reported_with_those_that_exist(installed):
+def test_as_gsplat_unknown_name_error_lists_existing_names(installed):
     module = importlib.import_module("gsplat.exporter")
     with pytest.raises(AttributeError, match=r"no attribute 'export_gltf'.*export_splats"):
         module.export_gltf  # noqa: B018
@@ -213,7 +213,7 @@ def test_an_unknown_name_is_reported_with_those_that_exist(installed):
     assert not hasattr(importlib.import_module("gsplat"), "rasterize_gaussians")
 
 
-def test_functions_of_the_compiled_extension_are_refused_when_they_are_called(installed):
+def test_as_gsplat_compiled_extension_functions_rejected_at_call(installed):
     extension = importlib.import_module("gsplat.cuda._backend")._C
     wrapper = importlib.import_module("gsplat.cuda._wrapper")
     assert extension is not None and not hasattr(extension, "CameraModelType")
@@ -225,12 +225,12 @@ def test_functions_of_the_compiled_extension_are_refused_when_they_are_called(in
 
 
 @pytest.mark.parametrize("name", ["strategy", "__version__"])
-def test_modules_and_version_of_gsplat_without_the_hook_are_refused_with_its_name(name):
+def test_gsplat_modules_without_hook_error_names_hook(name):
     with pytest.raises(AttributeError, match=rf"no attribute '{name}'; for gsplat's modules .*as_gsplat\.install\(\)"):
         getattr(gsplat_core, name)
 
 
-def test_programs_that_ask_for_version_file_and_extension_get_answers(installed):
+def test_as_gsplat_provides_version_file_and_extension(installed):
     module = importlib.import_module("gsplat")
     assert importlib.metadata.version("gsplat") == module.__version__
     assert Path(module.__file__).is_file()
@@ -239,7 +239,7 @@ def test_programs_that_ask_for_version_file_and_extension_get_answers(installed)
     assert module.rasterization is gsplat_core.rasterization
 
 
-def test_names_that_gsplats_own_modules_import_are_found_in_them(installed):
+def test_as_gsplat_provides_names_imported_by_gsplat_modules(installed):
     """Programs import some names from modules that only import them."""
     default = importlib.import_module("gsplat.strategy.default")
     assert default.remove is importlib.import_module("gsplat.strategy.ops").remove
@@ -251,7 +251,7 @@ def test_names_that_gsplats_own_modules_import_are_found_in_them(installed):
     assert importlib.import_module("gsplat.cuda._torch_impl_2dgs")._quat_scale_to_matrix is plain._quat_scale_to_matrix
 
 
-def test_a_ply_file_is_read_back_as_splats(tmp_path):
+def test_ply_file_round_trip(tmp_path):
     random = torch.Generator().manual_seed(0)
     draw = lambda *shape: torch.randn(*shape, generator=random)
     splats = {
@@ -272,7 +272,7 @@ def test_a_ply_file_is_read_back_as_splats(tmp_path):
 
 @pytest.mark.parametrize("kind", ["ply", "splat", "ply_compressed"])
 @pytest.mark.parametrize("count", [0, 2])
-def test_a_scene_without_visible_gaussians_is_written_as_an_empty_file(tmp_path, kind, count):
+def test_export_splats_without_visible_gaussians_writes_empty_file(tmp_path, kind, count):
     """`count` Gaussians have no finite position."""
     empty = {
         "means": torch.full((count, 3), torch.nan), "scales": torch.zeros(count, 3), "quats": torch.ones(count, 4),
@@ -284,13 +284,13 @@ def test_a_scene_without_visible_gaussians_is_written_as_an_empty_file(tmp_path,
         assert utils.load_ply_to_splats(tmp_path / "a.ply")["means"].shape == (0, 3)
 
 
-def test_another_gsplat_that_is_loaded_already_is_not_replaced(monkeypatch):
+def test_as_gsplat_does_not_replace_loaded_gsplat(monkeypatch):
     monkeypatch.setitem(sys.modules, "gsplat", ModuleType("gsplat"))
     with pytest.raises(ImportError, match="before the first import of gsplat"):
         install()
 
 
-def test_a_point_of_a_depth_map_is_projected_back_to_its_pixel():
+def test_depth_to_points_projects_back_to_pixels():
     K = torch.tensor([[20.0, 0, 7], [0, 22, 5], [0, 0, 1]])
     pose = torch.eye(4)
     pose[:3, :3] = utils.normalized_quat_to_rotmat(torch.tensor([0.5, 0.5, 0.5, 0.5]))
@@ -305,7 +305,7 @@ def test_a_point_of_a_depth_map_is_projected_back_to_its_pixel():
     torch.testing.assert_close((along_ray - pose[:3, 3]).norm(dim=-1, keepdim=True), depths)
 
 
-def test_the_normals_of_a_plane_are_its_normal():
+def test_depth_to_normal_of_plane():
     K = torch.tensor([[20.0, 0, 6], [0, 20, 4], [0, 0, 1]])
     normal = torch.nn.functional.normalize(torch.tensor([0.3, -0.2, -1.0]), dim=0)
     y, x = torch.meshgrid(torch.arange(8) + 0.5, torch.arange(12) + 0.5, indexing="ij")
@@ -316,7 +316,7 @@ def test_the_normals_of_a_plane_are_its_normal():
     assert not normals[0].any()
 
 
-def test_the_projection_matrix_sends_near_and_far_planes_to_0_and_1():
+def test_projection_matrix_maps_near_and_far_to_0_and_1():
     matrix = utils.get_projection_matrix(0.5, 10.0, 1.2, 0.8, device="cpu")
     edge = torch.tensor([0.5 * torch.tan(torch.tensor(0.6)), 0.5 * torch.tan(torch.tensor(0.4)), 0.5, 1.0])
     near = matrix @ edge
@@ -327,6 +327,6 @@ def test_the_projection_matrix_sends_near_and_far_planes_to_0_and_1():
     assert utils.get_projection_matrix(0.5, 10.0, 1.2, 0.8).device.type == expected
 
 
-def test_the_logarithmic_transform_has_an_inverse():
+def test_log_transform_inverse():
     values = torch.linspace(-50, 50, 21, dtype=torch.float64)
     torch.testing.assert_close(utils.inverse_log_transform(utils.log_transform(values)), values)

@@ -21,19 +21,19 @@ from gsplat_core.training.config import ReconstructorConfig
 
 
 @pytest.mark.parametrize("name", OPTIONS)
-def test_the_tables_state_what_the_renderers_state(name):
+def test_combination_tables_match_renderer_capabilities(name):
     capabilities = RENDERERS[name].capabilities
     assert {*OPTIONS[name]} == {*capabilities.options}
     assert {*OUTPUTS_OF[name]} == {*capabilities.outputs}
 
 
-def test_every_registered_renderer_is_in_the_tables():
+def test_combination_tables_contain_every_renderer():
     assert set(OPTIONS) == set(OUTPUTS_OF) == set(RENDERERS)
 
 
 @pytest.mark.parametrize("renderer", OPTIONS)
 @pytest.mark.parametrize("option", ["samples", "order", "progressive"])
-def test_an_option_that_a_renderer_lacks_is_refused_with_a_renderer_that_has_it(renderer, option):
+def test_unsupported_renderer_option_error_names_alternative(renderer, option):
     if option in OPTIONS[renderer]:
         check_renderer_options(renderer, [option])
         return
@@ -42,7 +42,7 @@ def test_an_option_that_a_renderer_lacks_is_refused_with_a_renderer_that_has_it(
 
 
 @pytest.mark.parametrize("renderer", OUTPUTS_OF)
-def test_an_output_that_a_renderer_lacks_is_refused_with_those_that_it_has(renderer):
+def test_unsupported_renderer_output_error_names_alternatives(renderer):
     check_outputs(renderer, OUTPUTS_OF[renderer])
     if renderer != "alpha":
         with pytest.raises(
@@ -51,12 +51,12 @@ def test_an_output_that_a_renderer_lacks_is_refused_with_those_that_it_has(rende
             check_outputs(renderer, ["depth", "normals"])
 
 
-def test_a_renderer_of_another_package_is_checked_when_it_is_created():
+def test_external_renderer_not_checked_by_tables():
     check_renderer_options("another", ["samples"])
     check_outputs("another", ["heat"])
 
 
-def test_a_loss_without_data_is_refused_with_the_folder_that_gives_it():
+def test_loss_without_data_error_names_folder():
     check_compared(["semantics:0.5", "range"], ["labels", "ranges"], "case")
     check_compared(["flow"], [], "case")
     with pytest.raises(InvalidSetting, match="case has none; add labels/ to the recording"):
@@ -66,7 +66,7 @@ def test_a_loss_without_data_is_refused_with_the_folder_that_gives_it():
 
 
 @pytest.mark.parametrize("loss", LOSSES)
-def test_weighted_sums_are_trained_with_the_losses_of_every_step_only(loss):
+def test_weighted_sum_renderers_accept_per_step_losses_only(loss):
     for renderer in RENDERERS:
         if renderer in OWN_OPACITIES and loss not in OF_EVERY_STEP:
             with pytest.raises(InvalidSetting, match="choose renderer alpha, or leave the losses"):

@@ -13,7 +13,7 @@ from gsplat_core import rasterization
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")  # of torch's compiler, about its own parts
-def test_a_compiled_render_is_one_graph_and_equals_the_eager_one(make_scene, assert_compiled_equal):
+def test_compiled_render_is_one_graph_and_equals_eager(make_scene, assert_compiled_equal):
     scene = make_scene(60).to(torch.float32)
     scene.sh[3, 1, 1] = math.nan  # is culled by a branch in eager mode, by a mask in a graph
 

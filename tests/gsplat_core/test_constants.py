@@ -35,17 +35,17 @@ def compiled() -> dict[str, float]:
     return {name: float(value) / float(divisor or 1) for name, value, divisor in rows}
 
 
-def test_every_constant_is_compared():
+def test_constants_header_and_python_cover_same_names():
     assert compiled().keys() == PYTHON.keys()
     assert HEADER.read_text().count("constexpr") == len(PYTHON)
 
 
 @pytest.mark.parametrize("name", PYTHON)
-def test_compiled_and_python_agree(name):
+def test_compiled_constants_equal_python(name):
     assert compiled()[name] == pytest.approx(PYTHON[name], rel=1e-6)
 
 
-def test_the_constants_of_1_6_are_those_compiled_and_the_defaults():
+def test_constants_of_1_6_equal_compiled_values_and_defaults():
     of_1_6 = settings.CONSTANTS["1.6"]
     assert of_1_6 == (compositing.ALPHA_MAX, arguments.COMPENSATION_FLOOR)
     for home in (gsplat_core, reference):
@@ -54,5 +54,5 @@ def test_the_constants_of_1_6_are_those_compiled_and_the_defaults():
         assert (defaults, floor) == of_1_6
 
 
-def test_python_states_the_cutoff_once():
+def test_alpha_cutoff_equals_alpha_min():
     assert arguments.ALPHA_CUTOFF == compositing.ALPHA_MIN

@@ -85,23 +85,23 @@ def cuda_library() -> None:
 
 
 @pytest.mark.slow
-def test_the_sources_implement_what_has_a_schema():
+def test_cuda_sources_implement_ops_with_schema():
     on_cuda = implemented("CUDA")
     assert len(on_cuda) >= 12
     assert on_cuda <= set(SCHEMAS)
     assert set(SCHEMAS) - on_cuda == WITHOUT_CUDA
 
 
-def test_every_kernel_in_the_sources_is_registered(cuda_library):
+def test_every_cuda_kernel_in_sources_is_registered(cuda_library):
     missing = {name for name in implemented("CUDA") if not has_kernel(name, "CUDA")}
     assert not missing
 
 
-def test_the_library_says_what_it_was_built_for(cuda_library):
+def test_cuda_build_string_names_compiler_and_targets(cuda_library):
     assert re.fullmatch(r"nvcc \d+\.\d+ for \d+\.\d(, \d+\.\d)*", native.cuda_build())
 
 
-def test_ci_builds_for_the_newest_instructions(cuda_library):
+def test_ci_cuda_build_targets_newest_architecture(cuda_library):
     if os.environ.get("INTRASPLAT_REQUIRE_CUDA_BUILD") != "1":
         pytest.skip("only where CI has built it: others build for the GPU at hand")
     assert native.cuda_build().endswith(" for 9.0"), "one file is compiled for earlier GPUs as well, see .ci/run"
@@ -113,7 +113,7 @@ def test_every_op_has_a_fake_kernel(name):
     assert has_kernel(name, "Meta")
 
 
-def test_a_picture_is_traced_on_cuda_without_a_gpu(cuda_library):
+def test_image_ops_traced_on_cuda_without_gpu(cuda_library):
     """The ops of a plain render, forward and backward: shapes and devices from the fake kernels alone."""
     with FakeTensorMode(shape_env=ShapeEnv()):
         means, quats, scales, opacities, sh = gaussians(9)
@@ -145,7 +145,7 @@ def test_a_picture_is_traced_on_cuda_without_a_gpu(cuda_library):
 
 
 @pytest.mark.slow
-def test_a_frame_and_its_gradient_are_traced_on_cuda_without_a_gpu(cuda_library):
+def test_frame_and_gradient_traced_on_cuda_without_gpu(cuda_library):
     with FakeTensorMode():
         raw = gaussians(16)
         deltas, view = floats(N, 16), View(floats(4, 4), floats(3, 3), 64, 48)
@@ -158,7 +158,7 @@ def test_a_frame_and_its_gradient_are_traced_on_cuda_without_a_gpu(cuda_library)
 
 
 @pytest.mark.parametrize("bases", [1, 4])
-def test_adam_in_the_gradient_is_traced_on_cuda_without_a_gpu(cuda_library, bases):
+def test_frame_adam_traced_on_cuda_without_gpu(cuda_library, bases):
     with FakeTensorMode():
         raw, first, second = gaussians(bases), gaussians(bases), gaussians(bases)
         view = View(floats(4, 4), floats(3, 3), 64, 48, floats(3))

@@ -16,7 +16,7 @@ WIDE_REGISTERS = {"%zmm": ("6avx512",), "%ymm": ("6avx512", "4avx2")}
 
 @pytest.mark.slow
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="the wider sets are those of x86-64")
-def test_wide_registers_are_used_only_inside_their_namespaces() -> None:
+def test_wide_registers_used_only_inside_own_namespaces() -> None:
     """An inline function that an AVX-512 file shares with others would be linked once, and crash older processors."""
     code = subprocess.run(["objdump", "-d", str(LIBRARY_PATH)], check=True, capture_output=True, text=True).stdout
     users: dict[str, set[str]] = {register: set() for register in WIDE_REGISTERS}

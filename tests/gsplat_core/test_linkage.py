@@ -36,7 +36,7 @@ def symbols(library: Path, *options: str) -> list[str]:
     return [line[17:].strip() for line in text.splitlines()]
 
 
-def test_no_iostreams(library):
+def test_libraries_do_not_import_iostreams(library):
     """In a library with a static libstdc++, iostreams are a second copy that is never initialised."""
     names = symbols(library)
     if any(name.endswith("std::ios_base_library_init()") and not name.startswith("U ") for name in names):
@@ -47,7 +47,7 @@ def test_no_iostreams(library):
     )
 
 
-def test_the_pattern_knows_iostreams():
+def test_iostreams_pattern_matches_known_symbols():
     for name in (
         "U std::ios_base::Init::Init()@GLIBCXX_3.4",
         "U std::__cxx11::basic_ostringstream<char, std::char_traits<char>, std::allocator<char> >::basic_ostringstream()",
@@ -57,12 +57,12 @@ def test_the_pattern_knows_iostreams():
         assert IOSTREAMS.search(name)
 
 
-def test_only_our_own_names_are_exported(library):
+def test_libraries_export_own_names_only(library):
     exported = {name.split(maxsplit=1)[1] for name in symbols(library, "-D", "--defined-only")}
     assert {name for name in exported if not name.startswith("gsplat_core_")} == set()
 
 
-def test_our_sources_throw_by_our_own_check():
+def test_native_sources_use_own_check_macros():
     """torch's macros format through iostreams and let exceptions out; torch_abi.h has what takes their place."""
     sources = [path for ending in ("cpp", "h", "cu", "cuh") for path in (ROOT / "gsplat_core").rglob(f"*.{ending}")]
     assert len(sources) > 50
@@ -71,7 +71,7 @@ def test_our_sources_throw_by_our_own_check():
 
 
 @pytest.mark.slow
-def test_an_argument_is_refused_with_a_static_runtime():
+def test_invalid_argument_rejected_with_static_runtime():
     """Link the CPU library's objects with this toolchain's static libstdc++ and libgcc, in a separate process."""
     build = ROOT / "build" / "editable"
     if not (build / "CMakeCache.txt").exists():

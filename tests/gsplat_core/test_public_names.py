@@ -104,7 +104,7 @@ SIGNATURES = {
 }
 
 
-def test_public_names():
+def test_public_names_match_expected_list():
     assert sorted(gsplat_core.__all__) == PUBLIC
     assert set(PUBLIC) <= set(dir(gsplat_core))
     for name in PUBLIC:
@@ -112,7 +112,7 @@ def test_public_names():
         assert getattr(gsplat_core, name) is getattr(module, name)
 
 
-def test_signatures_are_gsplats_here_and_in_the_reference():
+def test_signatures_match_gsplat_in_package_and_reference():
     for name, expected in SIGNATURES.items():
         for home in (gsplat_core, reference):
             parameters = inspect.signature(getattr(home, name)).parameters
@@ -123,13 +123,13 @@ def test_signatures_are_gsplats_here_and_in_the_reference():
             assert all(p.kind is p.KEYWORD_ONLY for p in extra), (home.__name__, name)
 
 
-def test_rasterization_takes_gsplats_arguments_by_position_too():
+def test_rasterization_accepts_gsplat_arguments_by_position():
     parameters = inspect.signature(gsplat_core.rasterization).parameters
     for name in RASTERIZATION.split():
         assert parameters[name].kind is inspect.Parameter.POSITIONAL_OR_KEYWORD, name
 
 
-def test_the_version_of_the_constants_is_asked_for_by_keyword_and_1_6_unless():
+def test_rasterization_constants_keyword_defaults_to_1_6():
     for home in (gsplat_core, reference):
         *_, constants = inspect.signature(home.rasterization).parameters.values()
         assert (constants.name, constants.kind, constants.default) == (
@@ -139,7 +139,7 @@ def test_the_version_of_the_constants_is_asked_for_by_keyword_and_1_6_unless():
         )
 
 
-def test_an_unknown_name_is_an_attribute_error():
+def test_unknown_name_raises_attribute_error():
     try:
         gsplat_core.rasterisation  # noqa: B018
     except AttributeError as error:
@@ -149,7 +149,7 @@ def test_an_unknown_name_is_an_attribute_error():
 
 
 @pytest.mark.slow
-def test_the_reference_works_without_the_compiled_library():
+def test_reference_works_without_compiled_library():
     program = (
         "import pathlib, sys\n"
         "from pathlib import Path\n"

@@ -28,7 +28,7 @@ def in_a_thread(work: Callable[[], int]) -> int:
     return answers[0]
 
 
-def test_one_thread_is_for_the_thread_that_asks_and_for_no_other():
+def test_use_one_thread_affects_calling_thread_only():
     def alone():
         use_one_thread()
         torch.ones(1_000_000).exp_()
@@ -38,7 +38,7 @@ def test_one_thread_is_for_the_thread_that_asks_and_for_no_other():
     assert torch.get_num_threads() == 3 and in_a_thread(torch.get_num_threads) == 3
 
 
-def test_inside_the_block_there_is_one_and_afterwards_there_are_as_many_as_before():
+def test_one_thread_block_restores_previous_count():
     with one_thread():
         assert torch.get_num_threads() == 1 and in_a_thread(torch.get_num_threads) == 3
         with one_thread():
@@ -47,7 +47,7 @@ def test_inside_the_block_there_is_one_and_afterwards_there_are_as_many_as_befor
     assert torch.get_num_threads() == 3 and in_a_thread(torch.get_num_threads) == 3
 
 
-def test_an_error_gives_the_threads_back():
+def test_one_thread_restores_count_after_error():
     @one_thread()
     def fail():
         assert torch.get_num_threads() == 1
@@ -59,7 +59,7 @@ def test_an_error_gives_the_threads_back():
         assert torch.get_num_threads() == 3
 
 
-def test_another_thread_computes_with_its_own_number_meanwhile():
+def test_one_thread_does_not_affect_other_threads():
     """Its LAPACK, too: the last bits of a large system tell how many threads solved it."""
     matrix = torch.randn(400, 400, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     solved = lambda: torch.linalg.inv(matrix).sum(1)

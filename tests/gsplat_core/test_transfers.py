@@ -9,7 +9,7 @@ import torch
 from gsplat_core.transfers import HostCopy, StagedCopies, tensor_of
 
 
-def test_on_the_cpu_nothing_is_copied():
+def test_transfers_on_cpu_share_memory():
     array = np.arange(6, dtype=np.float32).reshape(2, 3)
     tensor = tensor_of(array)
     array[1, 2] = 7
@@ -19,7 +19,7 @@ def test_on_the_cpu_nothing_is_copied():
     assert HostCopy(tensor).numpy()[0, 0] == 9
 
 
-def test_an_array_that_must_not_be_written_to_is_copied():
+def test_tensor_of_copies_read_only_array():
     array = np.arange(4, dtype=np.uint8)
     array.setflags(write=False)
     tensor = tensor_of(array)
@@ -27,7 +27,7 @@ def test_an_array_that_must_not_be_written_to_is_copied():
     assert array[0] == 0
 
 
-def test_one_value():
+def test_host_copy_item_returns_single_value():
     assert HostCopy(torch.tensor(2.5, requires_grad=True)).item() == 2.5
     with pytest.raises(ValueError, match="size 1"):
         HostCopy(torch.zeros(2)).item()
@@ -35,7 +35,7 @@ def test_one_value():
 
 @pytest.mark.cuda
 @pytest.mark.parametrize("dtype", [np.uint8, np.float32, np.int64, np.bool_])
-def test_there_and_back_again(gpu, dtype):
+def test_transfer_to_gpu_and_back_keeps_values(gpu, dtype):
     array = (np.arange(60).reshape(5, 12) % 7).astype(dtype)[:, ::2]
     there = tensor_of(array, gpu)
     assert there.device == gpu
@@ -45,7 +45,7 @@ def test_there_and_back_again(gpu, dtype):
 
 
 @pytest.mark.cuda
-def test_later_changes_on_either_side_are_not_seen(gpu):
+def test_transfers_unaffected_by_later_changes(gpu):
     array = np.zeros(1 << 20, np.float32)
     torch.cuda._sleep(10_000_000)  # the copies below are queued behind this
     there = tensor_of(array, gpu)
@@ -58,7 +58,7 @@ def test_later_changes_on_either_side_are_not_seen(gpu):
 
 @pytest.mark.cuda
 @pytest.mark.parametrize("shape", [(), (0, 3), (5, 7), (3, StagedCopies.PIECE_BYTES // 4 + 1)])
-def test_a_copy_in_pieces_is_the_tensor(gpu, shape):
+def test_staged_copies_equal_tensor(gpu, shape):
     values = torch.arange(int(np.prod(shape)), dtype=torch.float32).reshape(shape)
     there = values.to(gpu)
     copies = StagedCopies(gpu)
@@ -68,7 +68,7 @@ def test_a_copy_in_pieces_is_the_tensor(gpu, shape):
 
 
 @pytest.mark.cuda
-def test_a_copy_in_pieces_waits_for_no_other_stream(gpu):
+def test_staged_copies_do_not_wait_for_other_streams(gpu):
     values = torch.ones(3 * StagedCopies.PIECE_BYTES // 4, device=gpu)
     copies = StagedCopies(gpu)
     copies.stream.wait_stream(torch.cuda.default_stream(gpu))

@@ -16,7 +16,7 @@ def field(value):
     return np.full((20, 30, 2), value, np.float32)
 
 
-def test_the_share_of_the_whole_picture_is_pulled_to_the_first_one():
+def test_local_shares_whole_regularised_towards_initial_share():
     shares = LocalShares(SETTINGS)
     assert shares.whole() == [0.6]
     weight = np.full((20, 30), 0.5, np.float32)
@@ -26,7 +26,7 @@ def test_the_share_of_the_whole_picture_is_pulled_to_the_first_one():
     assert shares.whole() == pytest.approx([(2 + 0.5 * 1 + 0.15) / (2 + 0.5 * 2 + 0.25)])
 
 
-def test_the_share_of_a_place_is_pulled_to_that_of_the_picture():
+def test_local_shares_regularised_towards_whole_share():
     shares = LocalShares(SETTINGS)
     came = field(1.0)
     came[:, 15:] = 3.0
@@ -39,16 +39,16 @@ def test_the_share_of_a_place_is_pulled_to_that_of_the_picture():
 
 
 @pytest.mark.parametrize(("shape", "cells"), [((20, 30), (30, 20)), ((40, 40), (40, 40)), ((60, 80), (40, 30)), ((1, 400), (40, 1))])  # fmt: skip
-def test_there_are_forty_cells_along_the_longer_side_at_most(shape, cells):
+def test_cells_limited_to_forty_along_longer_side(shape, cells):
     assert cells_for(shape) == cells
 
 
 @pytest.mark.parametrize(("spacing", "sigma"), [(0.5, 0.3), (1.0, 0.3), (10.0, 3.0)])
-def test_blur_before_colours_are_taken(spacing, sigma):
+def test_blur_sigma_by_grid_spacing(spacing, sigma):
     assert blur_sigma_px(spacing) == pytest.approx(sigma)
 
 
-def test_a_jittered_grid_covers_the_picture_evenly():
+def test_jittered_grid_covers_image_evenly():
     pixels, spacing = jittered_grid(80, 60, 48, 0)
     assert spacing == 10 and pixels.shape == (48, 2)
     off = pixels.reshape(6, 8, 2) - np.stack(np.meshgrid(np.arange(8) * 10 + 5.0, np.arange(6) * 10 + 5.0), -1)
@@ -56,7 +56,7 @@ def test_a_jittered_grid_covers_the_picture_evenly():
     np.testing.assert_array_equal(pixels, jittered_grid(80, 60, 48, 0)[0])
 
 
-def test_points_of_each_camera_model_and_the_length_of_a_pixel_there():
+def test_unprojected_points_and_pixel_length_per_camera_model():
     from gsplat_core.scene.cameras import Camera
 
     K = np.array([[100.0, 0, 40], [0, 100, 30], [0, 0, 1]])

@@ -31,7 +31,7 @@ def given(frames: slice = slice(None)) -> tuple[list[Frame], list[Camera]]:
 
 
 @pytest.mark.slow
-def test_depth_of_every_frame() -> None:
+def test_moving_tissue_depth_of_every_frame() -> None:
     frames, cameras = given()
     found = MovingTissue(frames, cameras)
     assert found.doubts == ()
@@ -53,7 +53,7 @@ def test_depth_of_every_frame() -> None:
 
 
 @pytest.mark.slow
-def test_a_frame_that_is_not_looked_at_is_between_its_neighbours(monkeypatch) -> None:  # type: ignore[no-untyped-def]
+def test_moving_tissue_interpolates_depth_of_skipped_frame(monkeypatch) -> None:  # type: ignore[no-untyped-def]
     monkeypatch.setattr(breathing_depth, "RATE_HZ", FPS / 2)
     frames, cameras = given()
     found = MovingTissue(frames, cameras)
@@ -62,7 +62,7 @@ def test_a_frame_that_is_not_looked_at_is_between_its_neighbours(monkeypatch) ->
 
 
 @pytest.mark.slow
-def test_too_short_a_recording_is_not_believed() -> None:
+def test_moving_tissue_doubts_too_short_recording() -> None:
     found = MovingTissue(*given(slice(0, 14)))
     assert found.doubts == (TOO_SHORT,)
     depth = found.depth_of(4)
@@ -71,7 +71,7 @@ def test_too_short_a_recording_is_not_believed() -> None:
 
 
 @pytest.mark.slow
-def test_poses_of_another_way_are_not_believed() -> None:
+def test_moving_tissue_doubts_wrong_poses() -> None:
     frames, cameras = given(slice(0, 40))
     poses = np.random.default_rng(0).permutation(len(cameras))
     found = MovingTissue(frames, [cameras[number] for number in poses])
@@ -80,7 +80,7 @@ def test_poses_of_another_way_are_not_believed() -> None:
 
 
 @pytest.mark.slow
-def test_pictures_without_texture_are_not_believed() -> None:
+def test_moving_tissue_doubts_images_without_texture() -> None:
     frames, cameras = given(slice(0, 16))
     grey = [frame.with_fields(image=np.full_like(frame.image, 120)) for frame in frames]
     found = MovingTissue(grey, cameras)

@@ -18,7 +18,7 @@ FOCAL_PX = 100.0
 
 
 @pytest.mark.parametrize(("length_s", "count"), [(3.0, 1), (8.0, 1), (8.5, 2), (12.0, 2), (12.5, 3), (20.0, 4)])
-def test_windows_of_8_seconds_overlap_by_half_or_more(monkeypatch, length_s, count):
+def test_breathing_windows_of_8_seconds_overlap_by_half(monkeypatch, length_s, count):
     monkeypatch.setattr(breathing_depth, "seen_by", lambda frame, camera: (frame, camera))
     times = 5 + np.arange(round(length_s * 30) + 1) / 30
     frames = list(range(len(times)))
@@ -33,7 +33,7 @@ def test_windows_of_8_seconds_overlap_by_half_or_more(monkeypatch, length_s, cou
         assert second[0] - first[0] <= 4 + 1 / 30
 
 
-def test_a_slow_stream_is_looked_at_whole(monkeypatch):
+def test_breathing_windows_use_all_frames_of_slow_stream(monkeypatch):
     monkeypatch.setattr(breathing_depth, "seen_by", lambda frame, camera: frame)
     ((pictures, _),) = breathing_depth._windows(list(range(11)), list(range(11)), np.arange(11) * 0.5)
     assert pictures == list(range(11))
@@ -67,12 +67,12 @@ def decided(monkeypatch, points=100, hz=(0.5,), off_px=1.0, cycles=4.0, error=0.
         ({"motion_error": 0.0325}, TOO_SHORT), ({"error": 0.0245}, TOO_SHORT), ({"hz": (4.1,)}, TOO_SHORT),
     ],
 )  # fmt: skip
-def test_a_window_is_not_believed_beyond_its_limits(monkeypatch, given, said):
+def test_breathing_window_rejected_beyond_limits(monkeypatch, given, said):
     assert decided(monkeypatch, **given)[0] == said
 
 
 @pytest.mark.parametrize(("given"), [{}, {"cycles": 1.0, "hz": (0.2,)}, {"hz": (4.0,)}])
-def test_a_window_is_believed_at_its_limits(monkeypatch, given):
+def test_breathing_window_accepted_at_limits(monkeypatch, given):
     window, _ = decided(monkeypatch, **({"motion_error": 0.0319} | given))
     assert not isinstance(window, str)
     assert window.error == 0.024
@@ -82,7 +82,7 @@ def test_a_window_is_believed_at_its_limits(monkeypatch, given):
 
 
 @pytest.mark.parametrize(("cycles", "count"), [(0.6, 2), (4.0, 8)])
-def test_there_is_a_key_every_1_2_seconds_and_two_at_least(monkeypatch, cycles, count):
+def test_breathing_window_key_frames_every_1_2_seconds_and_two_at_least(monkeypatch, cycles, count):
     _, keys = decided(monkeypatch, cycles=cycles, hz=(0.5,))
     assert len(keys) == count and keys[0] == 0 and keys[-1] == 40
 
@@ -102,7 +102,7 @@ def window_of(start_s=0.0, error=0.0, points=3, off=0.0):
 
 
 @pytest.mark.parametrize(("time_s", "share"), [(2.0, 1.0), (3.0, 0.5), (1.0, 0.5), (4.0, 0.02), (0.0, 0.02)])
-def test_a_window_counts_most_in_its_middle(time_s, share):
+def test_breathing_window_share_largest_in_middle(time_s, share):
     assert breathing_depth._share(window_of(), time_s) == pytest.approx(share)
 
 
@@ -119,7 +119,7 @@ def surface_of(monkeypatch, window, time_s):
     return passed, confidence
 
 
-def test_points_are_where_they_were_seen_and_as_far_as_their_motion_says(monkeypatch):
+def test_breathing_surface_uses_observed_pixels_and_depth_of_motion(monkeypatch):
     window = window_of()
     window.off[1], window.off[2] = [0.04, 0.0], [0.0, 0.08]
     passed, _ = surface_of(monkeypatch, window, 1.25)
@@ -131,7 +131,7 @@ def test_points_are_where_they_were_seen_and_as_far_as_their_motion_says(monkeyp
     assert passed["size"] == (24, 32)
 
 
-def test_only_points_that_both_neighbours_show_and_that_are_in_front_count(monkeypatch):
+def test_breathing_surface_uses_points_seen_by_both_neighbours_in_front(monkeypatch):
     window = window_of()
     window.tracks.seen[2, 0] = False
     assert len(surface_of(monkeypatch, window, 1.5)[0]["depth"]) == 2
@@ -141,12 +141,12 @@ def test_only_points_that_both_neighbours_show_and_that_are_in_front_count(monke
 
 
 @pytest.mark.parametrize(("error", "confidence"), [(0.0, 1 / (1 + 0.25**2)), (np.sqrt(15) * 0.01, 0.5)])
-def test_an_error_of_4_percent_is_believed_by_one_half(monkeypatch, error, confidence):
+def test_breathing_confidence_half_at_4_percent_error(monkeypatch, error, confidence):
     _, found = surface_of(monkeypatch, window_of(error=error), 2.0)
     np.testing.assert_allclose(found, confidence)
 
 
-def test_a_pull_moves_points_along_the_line_of_sight_and_is_uncertain_by_two_fifths(monkeypatch):
+def test_breathing_pull_moves_points_along_line_of_sight_with_uncertainty(monkeypatch):
     window = window_of()
     asked = []
 
@@ -167,7 +167,7 @@ def test_a_pull_moves_points_along_the_line_of_sight_and_is_uncertain_by_two_fif
 
 
 @pytest.mark.parametrize("pull", [None, Pull(np.array([0.6, 0.0, -0.8]), 1.01)])
-def test_without_a_clear_pull_points_stay_where_their_motion_has_them(monkeypatch, pull):
+def test_breathing_without_clear_pull_keeps_points(monkeypatch, pull):
     monkeypatch.setattr(breathing_depth, "pull_of", lambda *given: pull)
     nearer, own = breathing_depth._pulled(window_of(), 2, np.eye(4), np.zeros((1, 2)), np.array([[0.03, 0.04]]))
     assert nearer == [0.0] and own == pytest.approx([0.15])
@@ -184,7 +184,7 @@ def tissue(monkeypatch, windows, surfaces, frames):
     return MovingTissue(frames, [Camera.from_focal(FOCAL_PX, 32, 24)] * len(frames))
 
 
-def test_overlapping_windows_are_blended_by_share_and_confidence(monkeypatch):
+def test_breathing_windows_blended_by_share_and_confidence(monkeypatch):
     image, mask = np.zeros((24, 32, 3), np.uint8), np.ones((24, 32), np.uint8)
     mask[:, :8] = 0
     loss_mask = mask[:, ::-1].copy()
@@ -197,7 +197,7 @@ def test_overlapping_windows_are_blended_by_share_and_confidence(monkeypatch):
 
 
 @pytest.mark.parametrize(("time_s", "is_known"), [(0.0, True), (4.0, True), (4.1, False)])
-def test_there_is_no_depth_outside_of_the_windows(monkeypatch, time_s, is_known):
+def test_breathing_depth_unknown_outside_windows(monkeypatch, time_s, is_known):
     frame = Frame(0, round(time_s * 1e9), np.zeros((24, 32, 3), np.uint8))
     found = tissue(monkeypatch, [window_of(), TOO_SHORT], {2.0: (50.0, 0.8)}, [frame])
     assert found.doubts == (TOO_SHORT,)
@@ -205,7 +205,7 @@ def test_there_is_no_depth_outside_of_the_windows(monkeypatch, time_s, is_known)
 
 
 @pytest.mark.parametrize(("most_pixels", "looked_at"), [(10**6, [0, 1, 2, 3, 4]), (3 * 48, [0, 2, 4]), (1, [0])])
-def test_frames_with_depth_are_spread_from_the_first_to_the_last(monkeypatch, most_pixels, looked_at):
+def test_breathing_depth_frames_spread_over_recording(monkeypatch, most_pixels, looked_at):
     """Pictures have 48 pixels. The third frame is rejected, and its reason is counted."""
     size, asked = (6, 8), []
 
@@ -231,7 +231,7 @@ def test_frames_with_depth_are_spread_from_the_first_to_the_last(monkeypatch, mo
 
 
 @pytest.mark.parametrize(("model", "has_depth"), [("pinhole", True), ("fisheye", False)])
-def test_a_recording_with_depth_or_another_camera_stays_as_it_is(monkeypatch, model, has_depth):
+def test_breathing_depth_skips_recording_with_depth_or_other_camera(monkeypatch, model, has_depth):
     monkeypatch.setattr(breathing_depth, "MovingTissue", None)
     frames = [Frame(seq, seq, np.zeros((6, 8, 3), np.uint8)) for seq in range(3)]
     if has_depth:

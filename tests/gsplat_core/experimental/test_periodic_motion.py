@@ -43,7 +43,7 @@ def relative_errors(motion: PeriodicMotion, tracks: GridTracks, points: np.ndarr
 
 
 @pytest.mark.slow
-def test_distances_of_breathing_tissue() -> None:
+def test_periodic_fit_distances_of_breathing_tissue() -> None:
     tracks, points = seen()
     moving = fitted(tracks, TRUE)
     assert np.median(relative_errors(moving, tracks, points)) < 0.008
@@ -54,14 +54,14 @@ def test_distances_of_breathing_tissue() -> None:
 
 
 @pytest.mark.slow
-def test_distances_are_not_shortened_by_noise() -> None:
+def test_periodic_fit_distances_unbiased_by_noise() -> None:
     tracks, points = seen(noise_px=0.5)
     found = in_cameras(fitted(tracks, TRUE).at(tracks.times_s), tracks.poses)[..., 2]
     assert abs(np.median(found / in_cameras(points, tracks.poses)[..., 2]) - 1) < 0.01
 
 
 @pytest.mark.slow
-def test_what_a_tool_pulls_now_and_then_decides_nothing() -> None:
+def test_periodic_fit_robust_to_temporary_pull() -> None:
     tracks, points = seen()
     pulled = tracks.rays.copy()
     pulled[10:20, :60] += 0.05
@@ -72,14 +72,14 @@ def test_what_a_tool_pulls_now_and_then_decides_nothing() -> None:
 
 
 @pytest.mark.slow
-def test_frequencies_are_found() -> None:
+def test_periodic_fit_finds_frequencies() -> None:
     tracks, _ = seen()
     found = found_in(tracks)
     assert found.hz == pytest.approx(TRUE, abs=0.01)
     assert found.error < 0.03
 
 
-def test_still_tissue_has_none() -> None:
+def test_periodic_fit_still_tissue_has_no_frequency() -> None:
     tracks, points = seen(breathes=0.0)
     assert found_in(tracks).hz == ()
     assert np.median(relative_errors(fitted(tracks, ()), tracks, points)) < 0.005
@@ -87,7 +87,7 @@ def test_still_tissue_has_none() -> None:
 
 @pytest.mark.parametrize(("length_s", "reach"), [(1.2, 1.0), (5.0, 0.02)], ids=["short", "hardly moving"])
 @pytest.mark.slow
-def test_distances_that_cannot_be_told_are_said_to_be_uncertain(length_s: float, reach: float) -> None:
+def test_periodic_fit_reports_large_error_of_undetermined_distances(length_s: float, reach: float) -> None:
     tracks, _ = seen(length_s, reach=reach)
     found = found_in(tracks)
     error = np.hypot(np.median(fitted(tracks, found.hz or TRUE).error), found.error)
@@ -103,24 +103,24 @@ def of_order(order: int, number: int, x: float) -> float:
 
 
 @pytest.mark.parametrize("count", [4, 7])
-def test_splines_are_those_of_coxs_and_de_boors_recursion(count: int) -> None:
+def test_splines_equal_cox_de_boor_recursion(count: int) -> None:
     share = np.array([-0.3, 0.0, 0.1, 0.37, 0.5, 0.8, 0.99])
     places = share.clip(0, 1) * (count - 3) + 3
     np.testing.assert_allclose(splines(share, count), [[of_order(4, n, x) for n in range(count)] for x in places])
     np.testing.assert_allclose(splines(np.array([1.0, 2.0]), count)[:, -3:], [[1 / 6, 4 / 6, 1 / 6]] * 2)
 
 
-def test_waves_begin_with_what_rests() -> None:
+def test_waves_start_with_constant_term() -> None:
     found = waves(np.array([0.0, 0.5]), (1.0,))
     np.testing.assert_allclose(found, [[1, 1, 0], [1, -1, 0]], atol=1e-12)
 
 
-def test_the_same_tracks_give_the_same_bytes() -> None:
+def test_periodic_fit_is_deterministic() -> None:
     tracks, _ = seen()
     assert fitted(tracks, TRUE, rounds=3).terms.tobytes() == fitted(tracks, TRUE, rounds=3).terms.tobytes()
 
 
-def test_points_without_observations_get_the_usual_distance_and_stay_where_they_were_across() -> None:
+def test_periodic_fit_unobserved_points_get_median_distance() -> None:
     """The median distance is that of the others. Sideways nothing is known, so that only the start counts."""
     tracks, points = seen(breathes=0.0)
     seen_by = tracks.seen.copy()
@@ -136,7 +136,7 @@ def test_points_without_observations_get_the_usual_distance_and_stay_where_they_
     np.testing.assert_allclose(found[:20, :2], begun[:20, :2], rtol=1e-6, atol=1e-6)
 
 
-def test_the_motion_varies_over_the_picture_of_a_narrow_view_too() -> None:
+def test_periodic_fit_motion_varies_over_narrow_view() -> None:
     """Opposite sides of the picture move in opposite directions. The view is a fifth as wide as elsewhere."""
     times_s = np.arange(0, 4, 0.1)
     rest, poses = places(times_s, 0.0)[0] * [0.2, 0.2, 1.0], swaying(times_s, 0.2)

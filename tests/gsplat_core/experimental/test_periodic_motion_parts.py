@@ -21,7 +21,7 @@ from tests.gsplat_core.experimental.test_periodic_motion import seen
 from tests.gsplat_core.geometry.breathing_points import BREATHING_HZ, EXTENT, FOCAL_PX
 
 
-def test_smoothness_is_the_sum_of_squared_second_differences():
+def test_smoothness_is_sum_of_squared_second_differences():
     values = np.random.default_rng(0).normal(size=(5, 4))
     across = sum((values[i - 1, j] - 2 * values[i, j] + values[i + 1, j]) ** 2 for i in range(1, 4) for j in range(4))
     down = sum((values[i, j - 1] - 2 * values[i, j] + values[i, j + 1]) ** 2 for i in range(5) for j in range(1, 3))
@@ -36,7 +36,7 @@ def bends(grid: tuple[int, int]) -> np.ndarray:
 
 
 @pytest.mark.parametrize("hz", [(), (BREATHING_HZ,)])
-def test_the_fit_is_the_minimum_of_the_robust_errors_and_the_priors_and_knows_its_errors(hz):
+def test_periodic_fit_minimises_robust_cost_and_estimates_errors(hz):
     """Residuals have a Cauchy scale of 0.5 pixels and an error of 0.35, three in sequence count as one, depth is within a
     half of the median, vectors within 4 % of it and within 0.8 % of their neighbours. Errors of depth are tripled.
     """
@@ -86,7 +86,7 @@ def test_the_fit_is_the_minimum_of_the_robust_errors_and_the_priors_and_knows_it
     assert np.mean(np.abs(ratio - 1) < 0.01) > 0.9  # points with outliers do not converge
 
 
-def test_points_begin_at_the_distance_that_explains_them():
+def test_periodic_fit_starts_at_best_common_distance():
     """Seen from two places, on a sphere about the first one, and without turning."""
     rays = np.random.default_rng(1).uniform(-0.4, 0.4, (30, 2))
     poses = np.stack([np.eye(4)] * 3)
@@ -102,7 +102,7 @@ def test_points_begin_at_the_distance_that_explains_them():
     assert np.isfinite(periodic_motion._at_one_distance(still)).all()
 
 
-def test_depths_stay_within_a_quarter_and_four_times_the_usual_one():
+def test_periodic_fit_limits_depths_to_quarter_and_four_times_median():
     whole, points = seen(2.0)
     tracks = whole.of(slice(0, 9))
     fit = periodic_motion._Fit(tracks, (), points[0, :9], (4, 4))
@@ -116,7 +116,7 @@ def test_depths_stay_within_a_quarter_and_four_times_the_usual_one():
     np.testing.assert_allclose((limited[:, :2] / limited[:, 2:])[ahead], (local[:, :2] / local[:, 2:])[ahead])
 
 
-def test_deviations_of_neighbours_are_averaged_over_24_pixels_and_far_ones_hardly_count():
+def test_together_px_averages_deviations_over_24_pixels_robustly():
     """Against sums over all observations of a picture, whose positions are the centres of cells of 4 pixels."""
     random = np.random.default_rng(4)
     cells = random.integers(0, [70, 55], (2, 60, 2))
@@ -164,13 +164,13 @@ def search(monkeypatch):
 
 
 @pytest.mark.parametrize(("deep", "hz"), [(0.09, ()), (0.11, (0.3,))])
-def test_breathing_is_accepted_if_it_lowers_the_cost_by_a_tenth(search, deep, hz):
+def test_frequency_search_accepts_breathing_lowering_cost_by_tenth(search, deep, hz):
     found, _ = search(lambda each: 1 - valley(each[0], 0.3, deep))
     assert found.hz == pytest.approx(hz, abs=0.002)
 
 
 @pytest.mark.parametrize(("deep", "hz"), [(0.03, (0.3,)), (0.05, (0.3, 1.2))])
-def test_a_heart_is_accepted_if_it_lowers_the_cost_by_four_per_cent(search, deep, hz):
+def test_frequency_search_accepts_heart_lowering_cost_by_four_percent(search, deep, hz):
     found, _ = search(
         lambda each: (1 - valley(each[0], 0.3, 0.5)) * (1 - (valley(each[1], 1.2, deep) if len(each) > 1 else 0))
     )
@@ -180,7 +180,7 @@ def test_a_heart_is_accepted_if_it_lowers_the_cost_by_four_per_cent(search, deep
 @pytest.mark.parametrize(
     ("length_s", "times", "slowest", "fastest"), [(12.0, 95, 0.1, 1.57), (4.0, 48, 0.15, 3.0), (12.0, 48, 0.1, 1.57)]
 )
-def test_frequencies_are_tried_every_quarter_of_a_cycle(search, length_s, times, slowest, fastest):
+def test_frequency_search_steps_are_quarter_cycles(search, length_s, times, slowest, fastest):
     """From 0.6 cycles on, and the heart from 0.8 Hz to 3 or two fifths of the rate of the 48 times and 400 points used."""
     _, tried = search(lambda each: 1 - valley(each[0], 0.4, 0.5, 0.4), length_s, times)
     assert {shape for _, shape in tried} == {(48, 400)}
@@ -193,19 +193,19 @@ def test_frequencies_are_tried_every_quarter_of_a_cycle(search, length_s, times,
     np.testing.assert_allclose(np.diff(beats), 0.25 / length_s)
 
 
-def test_short_and_small_tracks_are_used_whole(search):
+def test_frequency_search_uses_short_and_small_tracks_whole(search):
     _, tried = search(lambda each: 1.0, 3.0, times=30, points=50)
     assert {shape for _, shape in tried} == {(30, 50)}
 
 
-def test_frequencies_are_refined_and_stay_in_their_bands(search):
+def test_frequency_search_refines_within_bands(search):
     off = lambda each: 1 - valley(each[0], 0.317, 0.5) - (valley(each[1], 1.234, 0.2) if len(each) > 1 else 0)
     found, _ = search(off)
     assert found.hz == pytest.approx((0.317, 1.234), abs=0.0015)
     assert search(lambda each: 1 - valley(each[0], 0.05, 0.9, 0.5))[0].hz == pytest.approx((0.1,))
 
 
-def test_the_error_is_the_largest_change_of_depth_among_fits_that_cost_up_to_six_per_cent_more(search):
+def test_frequency_search_error_is_largest_depth_change_within_six_percent_cost(search):
     """The cost rises by 6 % over 0.006 Hz, and the depth changes by 1 % per 0.001 Hz."""
     found, _ = search(
         lambda each: 0.5 + 5.0 * abs(each[0] - 0.3) if len(each) == 1 else 2.0,
@@ -215,7 +215,7 @@ def test_the_error_is_the_largest_change_of_depth_among_fits_that_cost_up_to_six
 
 
 @pytest.mark.parametrize(("pulled", "used"), [(6, False), (8, True)])
-def test_disturbed_observations_are_left_out_unless_less_than_three_tenths_are_left(monkeypatch, pulled, used):
+def test_fitted_undisturbed_keeps_three_tenths_of_observations_at_least(monkeypatch, pulled, used):
     """Some of the ten observations of each point deviate by a pixel. The motion is fitted again without them."""
     tracks = GridTracks(
         np.zeros((10, 5, 2)), np.ones((10, 5), bool), np.stack([np.eye(4)] * 10), np.arange(10.0), FOCAL_PX, EXTENT

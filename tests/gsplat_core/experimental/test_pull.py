@@ -21,7 +21,7 @@ def pulled(strength: float, seed: int, noise_px: float = 0.3) -> tuple[np.ndarra
     return rays, rays - points[:, :2] / points[:, 2:], moved[:, 2] / points[:, 2] - 1
 
 
-def test_how_far_pulled_tissue_comes_nearer() -> None:
+def test_pull_estimates_approach_of_pulled_tissue() -> None:
     pictures = [pulled(strength, seed) for seed, strength in enumerate((5.0, 6.0, 6.5))]
     pull = pull_of([each[0] for each in pictures], [each[1] for each in pictures], [np.eye(3)] * 3, FOCAL_PX)
     assert pull is not None
@@ -35,7 +35,7 @@ def test_how_far_pulled_tissue_comes_nearer() -> None:
     assert np.median(unexplained) * FOCAL_PX < 0.5
 
 
-def test_cameras_that_turn_between_pictures() -> None:
+def test_pull_direction_follows_camera_rotation() -> None:
     angle = 0.2
     turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
     pictures = [pulled(6.0, seed) for seed in (0, 1)]
@@ -46,14 +46,14 @@ def test_cameras_that_turn_between_pictures() -> None:
     assert abs(turned.direction @ turn @ straight.direction) == pytest.approx(1, abs=1e-6)
 
 
-def test_nothing_is_said_of_still_tissue_and_of_motion_in_all_directions() -> None:
+def test_pull_none_for_still_tissue_and_random_motion() -> None:
     rays, off, _ = pulled(0.0, 0)
     assert pull_of([rays], [off], [np.eye(3)], FOCAL_PX) is None
     anywhere = np.random.default_rng(1).normal(0, 6 / FOCAL_PX, off.shape)
     assert pull_of([rays], [anywhere], [np.eye(3)], FOCAL_PX) is None
 
 
-def test_motion_along_the_line_of_sight_has_the_sign_of_the_motion() -> None:
+def test_pull_along_line_of_sight_has_sign_of_motion() -> None:
     rays = np.array([[0.2, 0.0]])
     for sign in (1, -1):
         along, unexplained = Pull(sign * np.array([0.0, 0.0, 1.0]), 0.1).along(rays, np.array([[0.02, 0.0]]))
@@ -62,7 +62,7 @@ def test_motion_along_the_line_of_sight_has_the_sign_of_the_motion() -> None:
         assert unexplained[0] < 0.002
 
 
-def test_points_that_were_followed_wrongly_do_not_decide_the_direction() -> None:
+def test_pull_direction_robust_to_wrong_tracks() -> None:
     """Some points seem to move in another direction altogether, and farther than the tissue does."""
     rays, off, _ = pulled(6.0, 3)
     random = np.random.default_rng(8)

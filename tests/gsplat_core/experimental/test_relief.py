@@ -16,13 +16,13 @@ def coefficients(seed, size=0.1):
     return np.random.default_rng(seed).normal(0, size, len(GRID.half_waves)) / (1 + GRID.half_waves**2)
 
 
-def test_the_grid_lies_on_the_picture():
+def test_relief_grid_aligned_with_image():
     assert (GRID.focal, GRID.centre) == ((35.0, 35.0), (20.0, 16.0))
     assert GRID.half_waves.min() == 1 and GRID.half_waves.max() <= 9
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_brightness_and_angle_are_those_of_the_surface(seed):
+def test_relief_brightness_and_angle_equal_surface(seed):
     column, row = np.random.default_rng(seed).uniform([[2], [2]], [[38], [30]], (2, 50))
     found = coefficients(seed)
 
@@ -42,7 +42,7 @@ def test_brightness_and_angle_are_those_of_the_surface(seed):
 
 
 @pytest.mark.parametrize("slopes", [0.0, 0.4, 1.0])
-def test_derivatives_are_those_of_the_values(slopes):
+def test_relief_derivatives_equal_finite_differences(slopes):
     places, found = Places.at(GRID, *GRID.middles()), coefficients(5, 0.4)
     shown = appearance(places, found, slopes)
     for number in (0, 1, 7, len(found) - 1):

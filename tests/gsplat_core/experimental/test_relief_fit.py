@@ -41,18 +41,18 @@ def left(found, true):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_brightness_without_pigment_shows_the_relief(seed):
+def test_relief_fit_from_brightness_without_pigment(seed):
     assert left(find_reliefs(GRID, [shading_of(relief(seed))], [None]).key, relief(seed)) < 0.15
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_change_of_brightness_shows_the_change_of_the_relief(seed):
+def test_relief_fit_change_from_brightness_change(seed):
     true = relief(seed + 10, 0.03)
     found = find_change(GRID, relief(seed), change_between(relief(seed), relief(seed) + true))
     assert left(found, true) < 0.3
 
 
-def test_the_key_and_each_change_are_found_together():
+def test_relief_fit_finds_key_and_changes_together():
     key, moved = relief(1), [relief(seed, 0.03) for seed in (20, 21, 22)]
     shadings = [shading_of(key), *(shading_of(key + each) for each in moved)]
     found = find_reliefs(GRID, shadings, [None, *(change_between(key, key + each) for each in moved)])
@@ -63,7 +63,7 @@ def test_the_key_and_each_change_are_found_together():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_glints_mend_what_pigment_feigns(seed):
+def test_relief_fit_glints_correct_error_of_pigment(seed):
     key, feigned = relief(seed), appearance(PLACES, relief(seed + 30)).lit.reshape(32, 40)
     dry, wet = shading_of(key, detail=0.05), shading_of(key, glints_of(key), ONES, detail=0.05)
     errors = []
@@ -73,14 +73,14 @@ def test_glints_mend_what_pigment_feigns(seed):
     assert errors[1] < 0.8 * errors[0]
 
 
-def test_glints_everywhere_alike_make_no_relief():
+def test_relief_fit_uniform_glints_give_flat_relief():
     flat = np.zeros(len(GRID.half_waves))
     glints = 0.01 * ONES
     found = find_reliefs(GRID, [shading_of(flat, glints, ONES)], [None]).key
     assert np.std(PLACES.value @ found) < 0.02
 
 
-def test_a_light_that_becomes_brighter_is_no_relief():
+def test_relief_fit_ignores_uniform_brightness_change():
     changed = Change(0.3 * ONES, ONES, np.zeros((32, 40, 2)), 1.0)
     assert np.std(PLACES.value @ find_change(GRID, relief(0), changed)) < 0.005
 
@@ -109,7 +109,7 @@ def analytic_view(seed):
 
 
 @pytest.mark.parametrize(("seed", "most"), [(0, 0.56), (1, 0.13), (2, 0.47), (4, 0.26)])
-def test_the_relief_of_an_analytic_surface_is_found(seed, most):
+def test_relief_fit_of_analytic_surface(seed, most):
     """Measured 0.51, 0.08, 0.41 and 0.20 of the relief left; the best tilted plane leaves 0.87 to 1.00."""
     lit, true = analytic_view(seed)
     found = PLACES.value @ find_reliefs(GRID, [Shading(lit, ONES, LEAST_DETAIL, NOTHING, NOTHING)], [None]).key
@@ -119,7 +119,7 @@ def test_the_relief_of_an_analytic_surface_is_found(seed, most):
     assert np.corrcoef(found, true)[0, 1] > 0.85
 
 
-def test_a_step_is_that_of_all_unknowns_together():
+def test_equations_step_equals_joint_least_squares():
     """The elimination of the own unknowns, against one dense least-squares problem with the priors as rows."""
     random = np.random.default_rng(6)
     own, relief_by, off = random.normal(size=(30, 3)), random.normal(size=(30, 4)), random.normal(size=30)
@@ -140,7 +140,7 @@ def test_a_step_is_that_of_all_unknowns_together():
     np.testing.assert_allclose(equations.own_step(step), together[:3], rtol=1e-8)
 
 
-def test_weak_evidence_leaves_the_relief_small():
+def test_relief_fit_of_noise_stays_small():
     """Noise far above the brightness of any relief: the prior keeps the relief near the plane."""
     noise = np.random.default_rng(9).normal(0, 1.0, (32, 40))
     found = find_reliefs(GRID, [Shading(noise, ONES, 1.0, NOTHING, NOTHING)], [None]).key
@@ -163,7 +163,7 @@ def equations(monkeypatch):
 FLAT = np.zeros(len(GRID.half_waves))
 
 
-def test_a_change_of_light_is_held_against_an_error_of_2_percent_and_weighs_three_tenths(equations):
+def test_light_change_equations_weights_and_prior(equations):
     share = 0.5 * ONES
     brighter = np.where(np.arange(40) < 20, 0.0, 0.06) * ONES
     light_module.Followed(GRID, Change(brighter, share, np.zeros((32, 40, 2)), 1.0)).equations(FLAT, FLAT)
@@ -178,7 +178,7 @@ def test_a_change_of_light_is_held_against_an_error_of_2_percent_and_weighs_thre
     assert one["prior"][-1] == 1e-6
 
 
-def test_brightness_is_held_against_its_detail_and_pigment_is_expected_to_be_coarse(equations):
+def test_brightness_equations_weights_and_pigment_prior(equations):
     seen = np.where(np.arange(40) < 20, 0.0, 0.2) * ONES
     seen[:, 19] = 0.0
     brightness = light_module.Brightness(GRID, [Shading(seen, ONES, 0.1, NOTHING, NOTHING)] * 2, [0, 1], 0.5)
@@ -193,7 +193,7 @@ def test_brightness_is_held_against_its_detail_and_pigment_is_expected_to_be_coa
     np.testing.assert_allclose(one["away"], [*FLAT, np.median(seen), 0])
 
 
-def test_glints_become_rarer_by_a_twelfth_radian(equations):
+def test_glint_equations_decay_with_angle(equations):
     found = light_module.Glints(GRID, [Shading(NOTHING, ONES, 0.1, 0.1 * ONES, ONES)] * 8)
     found.equations(FLAT, np.zeros((8, len(FLAT))))
     (one,) = equations
@@ -209,7 +209,7 @@ def test_glints_become_rarer_by_a_twelfth_radian(equations):
     np.testing.assert_allclose(equations[1]["weight"], (expected + 0.3) * 0.5 / max(1.0, spread))
 
 
-def test_cells_that_are_hardly_wet_say_nothing_of_glints(equations):
+def test_glint_equations_ignore_cells_of_small_wet_share(equations):
     wet = np.where(np.arange(40) < 20, 0.4, 0.6) * ONES
     light_module.Glints(GRID, [Shading(NOTHING, ONES, 0.1, NOTHING, wet)]).equations(FLAT, FLAT[None])
     weight = equations[0]["weight"].reshape(32, 40)
@@ -225,14 +225,14 @@ def test_cells_that_are_hardly_wet_say_nothing_of_glints(equations):
         (np.full(9, 90.0), np.zeros(9), 2.0),  # the most
     ],
 )
-def test_the_width_of_a_prior_is_that_of_what_was_found_and_of_a_hundred_expected(scaled, undecided, width):
+def test_prior_width_combines_found_and_expected_values(scaled, undecided, width):
     found = light_module._width(
         scaled, undecided, light_module.RELIEF, light_module.RELIEF_COUNT, light_module.RELIEF_LIMITS
     )
     assert found == pytest.approx(width)
 
 
-def test_a_prior_pulls_a_relief_towards_none():
+def test_equations_without_evidence_return_to_prior_mean():
     """Without evidence a step returns the own unknowns to their prior mean."""
     none = Equations(np.zeros((3, 1)), np.zeros((3, 2)), np.zeros(3), np.ones(3), np.array([4.0]), np.array([0.5]))
     np.testing.assert_allclose(none.own_step(np.zeros(2)), [-0.5])

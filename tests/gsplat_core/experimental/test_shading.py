@@ -10,7 +10,7 @@ from gsplat_core.experimental.shading import SmallPicture, log_diffuse, shading_
 from gsplat_core.scene.frames import Frame
 
 
-def test_glints_are_counted_where_they_are_and_nowhere_else() -> None:
+def test_shading_counts_glints_at_their_places_only() -> None:
     """Small white dots on red tissue, on one side of the picture."""
     image = np.full((256, 320, 3), (150, 70, 60), np.uint8)
     dots = np.zeros((256, 320), np.uint8)
@@ -32,7 +32,7 @@ def recorded(light: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("excess", "share"), [(0.25, 0.0), (0.5, 1.0), (2.0, 1.0)])
-def test_a_glint_adds_white_of_a_third_of_the_surrounding_light(excess: float, share: float) -> None:
+def test_shading_glint_requires_white_excess_of_third(excess: float, share: float) -> None:
     """The lamp's reflection adds as much to each channel."""
     tissue = np.array([0.35, 0.08, 0.05])
     image, dots = np.zeros((256, 320, 3), np.uint8), np.zeros((256, 320), np.uint8)
@@ -46,7 +46,7 @@ def test_a_glint_adds_white_of_a_third_of_the_surrounding_light(excess: float, s
 
 
 @pytest.mark.parametrize("dimmer", [2.0, 5.0])
-def test_diffuse_brightness_is_the_logarithm_of_the_light_that_the_camera_recorded(dimmer: float) -> None:
+def test_shading_diffuse_brightness_is_logarithm_of_light(dimmer: float) -> None:
     tissue = np.array([0.6, 0.25, 0.2])
     image = np.zeros((256, 320, 3), np.uint8)
     image[:, :160], image[:, 160:] = recorded(tissue), recorded(tissue / dimmer)
@@ -57,7 +57,7 @@ def test_diffuse_brightness_is_the_logarithm_of_the_light_that_the_camera_record
 
 
 @pytest.mark.parametrize("tissue", [(0.6, 0.25, 0.2), (0.3, 0.1, 0.05)])
-def test_the_diffuse_light_is_the_excess_of_red_and_free_of_reflections(tissue: tuple[float, float, float]) -> None:
+def test_log_diffuse_is_red_excess_independent_of_reflections(tissue: tuple[float, float, float]) -> None:
     """A reflection adds as much to each channel. The unit of light is the recorded one of dim light."""
     light, reflection = np.array(tissue), 0.05
     image = np.zeros((64, 80, 3), np.uint8)

@@ -15,7 +15,7 @@ def small(levels: np.ndarray, usable: np.ndarray | None = None) -> SmallPicture:
     return SmallPicture(levels, weight, np.ones(levels.shape[:2], np.uint8))
 
 
-def test_the_logarithm_of_light_undoes_the_curve_and_the_shoulder():
+def test_log_light_inverts_srgb_curve_and_shoulder():
     light = np.array([0.01, 0.1, 0.3, 0.8])
     linear = (1 - np.exp(-0.8 * light)) / 0.8
     curve = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
@@ -26,11 +26,11 @@ def test_the_logarithm_of_light_undoes_the_curve_and_the_shoulder():
 
 
 @pytest.mark.parametrize(("shape", "cells"), [((240, 320), (40, 30)), ((320, 240), (30, 40)), ((4, 320), (40, 2))])
-def test_there_are_forty_cells_along_the_longer_side(shape, cells):
+def test_shading_forty_cells_along_longer_side(shape, cells):
     assert small(np.zeros((*shape, 3), np.uint8)).cells == cells
 
 
-def test_averages_are_weighted_and_0_where_nothing_is_usable():
+def test_shading_averages_are_weighted_and_zero_without_usable_pixels():
     weight = np.zeros((240, 320), np.float32)
     weight[:, :4], weight[:, 8:16] = 1, 0.25
     picture = small(np.zeros((240, 320, 3), np.uint8))
@@ -44,7 +44,7 @@ def test_averages_are_weighted_and_0_where_nothing_is_usable():
     np.testing.assert_allclose(three, mean[..., None] * [1, 2, 3])
 
 
-def test_steps_are_those_between_known_neighbours():
+def test_shading_steps_between_known_neighbours_only():
     cells = np.array([[1.0, 3.0, 7.0], [2.0, 9.0, 20.0]])
     share = np.array([[1.0, LEAST_KNOWN, 0.9], [1.0, LEAST_KNOWN - 0.01, 1.0]])
     assert sorted(shading._steps(cells, share)) == [1.0, 2.0, 4.0, 13.0]
@@ -52,13 +52,13 @@ def test_steps_are_those_between_known_neighbours():
     assert both.shape == (4, 2) and (both[:, 0] == -both[:, 1]).all()
 
 
-def test_the_spread_of_steps_is_their_standard_deviation_and_no_less_than_noise():
+def test_shading_spread_is_standard_deviation_with_lower_limit():
     steps = np.random.default_rng(0).normal(0, 0.2, 20_000)
     assert shading._spread(steps) == pytest.approx(0.2, rel=0.03)
     assert shading._spread(steps / 100) == shading._spread(steps[:0]) == LEAST_DETAIL
 
 
-def test_channels_are_mixed_so_that_pigment_cancels():
+def test_least_pigment_weights_cancel_pigment():
     """Pigment changes the channels by 1, 2 and 3 parts. Weights sum to 1."""
     strength = np.random.default_rng(0).normal(0, 0.3, (500, 1))
     weights = shading._least_pigment(strength * [1, 2, 3])
@@ -75,7 +75,7 @@ def test_channels_are_mixed_so_that_pigment_cancels():
         ((120, 60, 5), True, True), ((120, 60, 4), False, True),
     ],
 )  # fmt: skip
-def test_pixels_that_are_clipped_or_noise_are_left_out(colour, is_usable, is_lit):
+def test_shading_excludes_clipped_and_noisy_pixels(colour, is_usable, is_lit):
     picture = SmallPicture.of(Frame(0, 0, np.full((60, 80, 3), colour, np.uint8)))
     assert (picture.usable == is_usable).all() and (picture.tissue == is_lit).all()
 
@@ -83,12 +83,12 @@ def test_pixels_that_are_clipped_or_noise_are_left_out(colour, is_usable, is_lit
 @pytest.mark.parametrize(
     ("size", "reduced"), [((80, 60), (80, 60)), ((640, 400), (320, 200)), ((400, 640), (200, 320))]
 )
-def test_pictures_are_reduced_to_their_longer_side(size, reduced):
+def test_small_picture_reduces_by_longer_side(size, reduced):
     picture = SmallPicture.of(Frame(0, 0, np.full((size[1], size[0], 3), (150, 70, 60), np.uint8)))
     assert picture.levels.shape == (*reduced[::-1], 3) and picture.usable.shape == picture.tissue.shape == reduced[::-1]
 
 
-def test_margins_around_tools_are_wider_for_shadows_than_for_highlights():
+def test_shading_tool_margin_wider_for_shadows_than_highlights():
     mask = np.ones((240, 320), np.uint8)
     mask[:, 160:] = 0
     inside = np.ones((240, 320), np.uint8)
@@ -101,7 +101,7 @@ def test_margins_around_tools_are_wider_for_shadows_than_for_highlights():
     assert picture.tissue[:20, 10].all(), "highlights are searched up to the border of the picture"
 
 
-def test_diffuse_light_is_known_where_red_exceeds_the_others_by_a_tenth():
+def test_log_diffuse_requires_red_excess_of_tenth():
     light = lambda colour: np.searchsorted(np.exp(shading._LOG_LIGHT), colour)
     levels = np.array([[light([0.4, 0.35, 0.35]), light([0.4, 0.37, 0.37]), light([0.2, 0.4, 0.4])]], np.uint8)
     diffuse, known = log_diffuse(small(levels))
@@ -123,5 +123,5 @@ def change(found: float = 1.0, spread: float = 0.0, share: float = 1.0) -> Chang
         ({"share": LEAST_KNOWN}, True), ({"share": LEAST_KNOWN - 0.01}, False),
     ],
 )  # fmt: skip
-def test_a_picture_shows_the_same_tissue_within_limits(given, is_followed):
+def test_light_change_is_followed_thresholds(given, is_followed):
     assert change(**given).is_followed == is_followed

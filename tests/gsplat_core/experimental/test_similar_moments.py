@@ -16,7 +16,7 @@ def motion(phase: float, shape: tuple[int, int] = (12, 16)) -> NDArray[np.float3
     return np.broadcast_to(np.stack([wave, -wave], axis=1), (*shape, 2)).astype(np.float32)
 
 
-def test_there_is_nothing_to_compare_with_at_first() -> None:
+def test_similar_moments_empty_before_first_comparison() -> None:
     moments = SimilarMoments()
     assert moments.next_motions() == []
     for frame in range(SOONEST + 1):
@@ -28,7 +28,7 @@ def test_there_is_nothing_to_compare_with_at_first() -> None:
 
 @pytest.mark.parametrize("period", [11, 17.5])
 @pytest.mark.parametrize("frames", [60, REMEMBERED + 90])
-def test_a_periodic_motion_is_forecast(period: float, frames: int) -> None:
+def test_similar_moments_forecast_periodic_motion(period: float, frames: int) -> None:
     """Far better than by the last motion, within the ring and after it was written over."""
     moments = SimilarMoments()
     for frame in range(frames):
@@ -40,7 +40,7 @@ def test_a_periodic_motion_is_forecast(period: float, frames: int) -> None:
     assert np.square(forecast - came).mean() < 0.15 * of_last
 
 
-def test_how_unlike_two_moments_are_is_summed_over_what_came_before() -> None:
+def test_similar_moments_difference_includes_earlier_motions() -> None:
     """Two moments with the same last motion are distinguished by the motions before it."""
     up, down, same = (np.full((8, 8, 2), value, np.float32) for value in (1.0, -1.0, 0.25))
     rest = [np.zeros((8, 8, 2), np.float32)] * 8
@@ -50,14 +50,14 @@ def test_how_unlike_two_moments_are_is_summed_over_what_came_before() -> None:
     assert weighted_mean(moments.next_motions()).mean() < -0.4
 
 
-def test_a_still_scene_stays_still() -> None:
+def test_similar_moments_of_still_scene_predict_no_motion() -> None:
     moments = SimilarMoments()
     for _ in range(20):
         moments.take(np.zeros((12, 16, 2), np.float32))
     assert not weighted_mean(moments.next_motions()).any()
 
 
-def test_another_size_begins_anew() -> None:
+def test_similar_moments_restart_after_size_change() -> None:
     moments = SimilarMoments()
     for frame in range(20):
         moments.take(motion(frame / 9))

@@ -34,7 +34,7 @@ def breathing() -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_a_pull_does_not_disturb_what_repeats_itself(breathing) -> None:
+def test_fitted_undisturbed_reduces_error_of_pull(breathing) -> None:
     poses = swaying(TIMES_S)
     tracks = tracks_of(pulled(breathing), poses, TIMES_S)
     first = fitted(tracks, HZ)
@@ -48,7 +48,7 @@ def test_a_pull_does_not_disturb_what_repeats_itself(breathing) -> None:
 
 
 @pytest.mark.slow
-def test_without_a_pull_hardly_anything_changes(breathing) -> None:
+def test_fitted_undisturbed_nearly_unchanged_without_pull(breathing) -> None:
     tracks = tracks_of(breathing, swaying(TIMES_S), TIMES_S)
     first = fitted(tracks, HZ, rounds=16)
     again = fitted_undisturbed(tracks, first)
@@ -56,7 +56,7 @@ def test_without_a_pull_hardly_anything_changes(breathing) -> None:
     assert np.median(off) < 0.02, "of 70"
 
 
-def test_how_far_neighbours_are_off_together() -> None:
+def test_together_px_finds_common_deviation_of_neighbours() -> None:
     random = np.random.default_rng(0)
     rays = random.uniform(-0.5, 0.5, (2, 400, 2)) * [1.1, 0.9]
     seen = random.random((2, 400)) > 0.2
@@ -73,7 +73,7 @@ def test_how_far_neighbours_are_off_together() -> None:
 
 
 @pytest.mark.slow
-def test_a_point_that_is_always_off_keeps_its_sightings() -> None:
+def test_fitted_undisturbed_finite_for_permanently_deviating_points() -> None:
     """All points in that area move unlike breathing, so no undisturbed neighbour exists."""
     points = places(TIMES_S)
     points[:, points[0, :, 0] > 20] += np.linspace(0, 9, len(TIMES_S))[:, None, None] ** 1.5 * [0.0, 1.0, 0.0]
@@ -84,7 +84,7 @@ def test_a_point_that_is_always_off_keeps_its_sightings() -> None:
 
 
 @pytest.mark.slow
-def test_a_refit_leaves_out_the_pull() -> None:
+def test_fitted_undisturbed_with_few_points_excludes_pull() -> None:
     """With few points, errors near the pulled point shrink and the remaining motion is unchanged."""
     points, poses = places(TIMES_S, count=90), swaying(TIMES_S)
     tracks = tracks_of(pulled(points), poses, TIMES_S)
@@ -94,7 +94,7 @@ def test_a_refit_leaves_out_the_pull() -> None:
     assert after < 0.75 * before
 
 
-def test_points_beyond_the_picture_belong_to_its_outermost_cells() -> None:
+def test_together_px_assigns_outside_points_to_border_cells() -> None:
     random = np.random.default_rng(1)
     rays = random.uniform(-1.5, 1.5, (1, 300, 2))
     tracks = GridTracks(rays, np.ones((1, 300), bool), np.eye(4)[None], np.zeros(1), 280.0, (0.57, 0.45))

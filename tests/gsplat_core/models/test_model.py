@@ -25,14 +25,14 @@ def make_model(gaussians, kind="basis", version=1, window=(1.0, 3.0)):
 
 
 @KINDS
-def test_at_is_the_field_at_that_time(kind, make_gaussians):
+def test_model_at_equals_field_at_time(kind, make_gaussians):
     gaussians = make_gaussians(30)
     model = make_model(gaussians, kind)
     wanted = gaussians if kind is None else model.field(gaussians, 2.2)
     torch.testing.assert_close(model.at(2.2).means, wanted.means, rtol=1e-5, atol=1e-5)
 
 
-def test_the_last_time_is_remembered_and_other_times_are_not_confused_with_it(make_gaussians):
+def test_model_at_caches_last_time(make_gaussians):
     model = make_model(make_gaussians(30))
     first = model.at(2.0)
     assert model.at(2.0) is first
@@ -41,7 +41,7 @@ def test_the_last_time_is_remembered_and_other_times_are_not_confused_with_it(ma
     assert torch.equal(model.at(2.0).means, first.means)
 
 
-def test_times_outside_the_window_show_its_nearest_end(make_gaussians):
+def test_model_at_clamps_time_to_window(make_gaussians):
     model = make_model(make_gaussians(10))
     assert torch.equal(model.at(-4.0).means, model.at(1.0).means)
     assert torch.equal(model.at(400.0).means, model.at(3.0).means)
@@ -50,7 +50,7 @@ def test_times_outside_the_window_show_its_nearest_end(make_gaussians):
 
 
 @KINDS
-def test_render_shows_the_gaussians_at_that_time(kind, make_gaussians):
+def test_model_render_at_time(kind, make_gaussians):
     model = make_model(make_gaussians(60), kind)
     out = model.render(2.0)
     assert out.image.shape == (24, 32, 3) and out.depth.shape == (24, 32)
@@ -61,12 +61,12 @@ def test_render_shows_the_gaussians_at_that_time(kind, make_gaussians):
 
 
 @KINDS
-def test_an_empty_model_renders_the_background(kind, make_gaussians):
+def test_empty_model_renders_background(kind, make_gaussians):
     out = make_model(make_gaussians(0), kind).render(2.0, background=torch.tensor([0.1, 0.2, 0.3]))
     torch.testing.assert_close(out.image[5, 5], torch.tensor([0.1, 0.2, 0.3]))
 
 
-def test_the_digest_follows_the_content_and_not_the_version(make_gaussians):
+def test_model_digest_depends_on_content_not_version(make_gaussians):
     model = make_model(make_gaussians(20), version=1)
     digest = model.sha256()
     assert len(digest) == 64
@@ -85,13 +85,13 @@ def test_the_digest_follows_the_content_and_not_the_version(make_gaussians):
     assert model.sha256() != digest
 
 
-def test_parameters_are_counted(make_gaussians):
+def test_model_parameter_count(make_gaussians):
     gaussians = make_gaussians(7, sh_degree=1)
     assert make_model(gaussians, None).parameter_count == 7 * (3 + 4 + 3 + 1 + 12)
     assert make_model(gaussians).parameter_count == 7 * (3 + 4 + 3 + 1 + 12) + 7 * 26 * 15
 
 
-def test_what_cannot_be_published_is_refused(make_gaussians):
+def test_model_rejects_invalid_arguments(make_gaussians):
     gaussians = make_gaussians(4)
     with pytest.raises(InvalidInput, match=r"field\.weights.*require gradients"):
         Model(1, gaussians, new_field("basis", gaussians, (0.0, 1.0)), CAMERA, (0.0, 1.0))
@@ -106,14 +106,14 @@ def test_what_cannot_be_published_is_refused(make_gaussians):
         Model(1, gaussians, None, CAMERA, (1.0, 0.0))
 
 
-def test_a_model_is_frozen(make_gaussians):
+def test_model_is_frozen(make_gaussians):
     with pytest.raises(dataclasses.FrozenInstanceError):
         make_model(make_gaussians(2)).version = 3
 
 
 @KINDS
 @pytest.mark.cuda
-def test_another_device_has_the_same_model(gpu, kind, make_gaussians):
+def test_model_to_device_keeps_content_and_image(gpu, kind, make_gaussians):
     model = make_model(make_gaussians(60), kind)
     there = model.to(gpu)
     assert model.to("cpu") is model and there.to(gpu) is there

@@ -48,7 +48,7 @@ def model_of(gaussians, field):
 
 
 @KINDS
-def test_a_snapshot_is_the_model_at_that_moment(kind, make_gaussians, device):
+def test_snapshot_equals_model_at_publication(kind, make_gaussians, device):
     gaussians = make_gaussians(40).to(device)
     field = field_for(gaussians, kind)
     expected = model_of(gaussians, field)
@@ -64,7 +64,7 @@ def test_a_snapshot_is_the_model_at_that_moment(kind, make_gaussians, device):
         torch.testing.assert_close(tensor, expected.at(0.4).tensors()[name], rtol=1e-5, atol=1e-5)
 
 
-def test_deforming_in_a_slot_gives_the_same_bits(make_gaussians, device):
+def test_snapshot_deformation_equals_model(make_gaussians, device):
     gaussians = make_gaussians(40).to(device)
     field = field_for(gaussians, "basis")
     snapshot = publish(SnapshotSlots(device), gaussians, field)
@@ -74,7 +74,7 @@ def test_deforming_in_a_slot_gives_the_same_bits(make_gaussians, device):
             assert torch.equal(tensor, expected[name]), (time_s, name)
 
 
-def test_colours_of_the_right_eye_lie_in_the_slot_too(make_gaussians, device):
+def test_snapshot_slot_holds_right_eye_colours(make_gaussians, device):
     slots, left = SnapshotSlots(device), make_gaussians(40).to(device)
     both = dataclasses.replace(left, right_sh=torch.randn_like(left.sh))
     layout = publish(slots, left, None).slot.layout
@@ -86,7 +86,7 @@ def test_colours_of_the_right_eye_lie_in_the_slot_too(make_gaussians, device):
         del snapshot
 
 
-def test_spare_rows_are_never_seen(make_gaussians, device):
+def test_snapshot_spare_rows_are_invisible(make_gaussians, device):
     gaussians = make_gaussians(40).to(device)
     field = field_for(gaussians, "basis")
     snapshot = publish(SnapshotSlots(device), gaussians, field)
@@ -99,7 +99,7 @@ def test_spare_rows_are_never_seen(make_gaussians, device):
     assert torch.equal(shown.image, expected.image) and torch.equal(shown.depth, expected.depth)
 
 
-def test_a_scene_that_grows_within_the_capacity_keeps_its_addresses(make_gaussians, device):
+def test_snapshot_growth_within_capacity_keeps_addresses(make_gaussians, device):
     gaussians = make_gaussians(40).to(device)
     field = BasisField(40, WINDOW_S, bumps=6).to(device)
     slots = SnapshotSlots(device)
@@ -116,7 +116,7 @@ def test_a_scene_that_grows_within_the_capacity_keeps_its_addresses(make_gaussia
     assert second.as_model().sha256() == model_of(gaussians, field).sha256()
 
 
-def test_a_scene_that_shrinks_leaves_nothing_behind(make_gaussians, device):
+def test_snapshot_of_smaller_scene_clears_old_rows(make_gaussians, device):
     slots = SnapshotSlots(device)
     large = make_gaussians(50).to(device)
     publish(slots, large, field_for(large, "basis"))
@@ -132,7 +132,7 @@ def test_a_scene_that_shrinks_leaves_nothing_behind(make_gaussians, device):
 
 
 @pytest.mark.parametrize(("rows", "bumps"), [(5000, 6), (40, 90)])
-def test_beyond_the_capacity_the_slot_gets_larger_and_says_so(make_gaussians, device, rows, bumps):
+def test_snapshot_growth_beyond_capacity_changes_layout(make_gaussians, device, rows, bumps):
     slots = SnapshotSlots(device)
     gaussians = make_gaussians(40).to(device)
     layout = publish(slots, gaussians, BasisField(40, WINDOW_S, bumps=6).to(device)).slot.layout
@@ -144,7 +144,7 @@ def test_beyond_the_capacity_the_slot_gets_larger_and_says_so(make_gaussians, de
     assert snapshot.as_model().sha256() == model_of(gaussians, field).sha256()
 
 
-def test_a_held_snapshot_is_not_overwritten(make_gaussians):
+def test_held_snapshot_is_not_overwritten(make_gaussians):
     slots = SnapshotSlots("cpu", most=3)
     held = [publish(slots, make_gaussians(30, seed=k), None, version=k + 1) for k in range(3)]
     for k, snapshot in enumerate(held):
@@ -156,7 +156,7 @@ def test_a_held_snapshot_is_not_overwritten(make_gaussians):
     assert torch.equal(held[0].at(0.0).means, make_gaussians(30, seed=0).means)
 
 
-def test_the_copy_outlives_the_slot(make_gaussians):
+def test_snapshot_copy_unaffected_by_slot_reuse(make_gaussians):
     slots = SnapshotSlots("cpu", most=1)
     gaussians = make_gaussians(30)
     model = publish(slots, gaussians, field_for(gaussians, "basis")).as_model()
@@ -165,7 +165,7 @@ def test_the_copy_outlives_the_slot(make_gaussians):
     assert model.sha256() == digest and slots.count == 1
 
 
-def test_another_kind_of_scene_replaces_the_tensors(make_gaussians):
+def test_snapshot_of_other_scene_kind_replaces_tensors(make_gaussians):
     slots = SnapshotSlots("cpu", most=1)
     for number, (degree, kind) in enumerate([(0, None), (2, None), (2, "basis"), (2, "hexplane"), (0, None)]):
         gaussians = make_gaussians(30, sh_degree=degree)
@@ -176,13 +176,13 @@ def test_another_kind_of_scene_replaces_the_tensors(make_gaussians):
         del snapshot
 
 
-def test_an_empty_scene_can_be_published(make_gaussians):
+def test_empty_scene_can_be_published(make_gaussians):
     empty = make_gaussians(3).select(slice(0, 0))
     snapshot = publish(SnapshotSlots("cpu"), empty, BasisField(0, WINDOW_S))
     assert snapshot.gaussian_count == 0 and snapshot.at(0.5).count == 0
 
 
-def test_a_field_that_cannot_lie_in_a_slot_is_refused(make_gaussians):
+def test_snapshot_rejects_field_without_slot_support(make_gaussians):
     class Still(DeformationField):
         def forward(self, gaussians, time_s):
             return gaussians

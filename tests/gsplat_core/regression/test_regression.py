@@ -33,7 +33,7 @@ def random_splats(count=5, dims=2, channels=2):
     return Splats(torch.rand(count, dims, generator=g), factors, torch.randn(count, channels, generator=g))
 
 
-def test_the_loss_and_its_gradients_are_those_of_autograd(device, assert_near):
+def test_regression_loss_and_gradients_equal_autograd(device, assert_near):
     points, targets = bumps(1, channels=2)
     splats = random_splats()
     loss, gradients = loss_and_gradients(
@@ -49,7 +49,7 @@ def test_the_loss_and_its_gradients_are_those_of_autograd(device, assert_near):
         assert_near(actual.cpu(), expected, of_largest=1e-4)
 
 
-def test_the_metric_divides_by_the_mass():
+def test_regression_gradients_divided_by_mass():
     splats = random_splats()
     _, gradients = loss_and_gradients(splats, *bumps(1, channels=2))
     divided = gradients.divided_by_mass(splats.masses)
@@ -57,7 +57,7 @@ def test_the_metric_divides_by_the_mass():
     torch.testing.assert_close(divided.factors * splats.masses[:, None, None], gradients.factors)
 
 
-def test_probabilities_follow_the_distance_from_the_mean():
+def test_birth_death_probabilities_by_distance_from_mean():
     phi = torch.tensor([-1.0, 0.0, 1.0, torch.nan])
     death, birth = probabilities(phi, 0.5)
     spread = math.sqrt(2 / 3)
@@ -66,7 +66,7 @@ def test_probabilities_follow_the_distance_from_the_mean():
     assert not any(p.any() for p in probabilities(torch.ones(4), 0.5))
 
 
-def test_births_replace_deaths():
+def test_births_replace_deaths_one_to_one():
     phi = torch.randn(2000, generator=torch.Generator().manual_seed(1))
     moves = births_and_deaths(phi, 0.5, torch.Generator().manual_seed(2))
     assert 100 < len(moves.dying) == len(moves.parents)
@@ -85,7 +85,7 @@ def fitting(seed=5):
     return regression._Fitting(points, values, start, FitOptions(), g), points, values
 
 
-def test_copies_are_placed_where_the_loss_changes_most_with_their_value(monkeypatch):
+def test_regression_copies_placed_at_largest_loss_slope(monkeypatch):
     monkeypatch.setattr(regression, "BIRTH_PLACES", 300)
     fit_, points, values = fitting()
     parents = torch.tensor([2, 4])
@@ -105,7 +105,7 @@ def test_copies_are_placed_where_the_loss_changes_most_with_their_value(monkeypa
     assert ((places - torch.tensor([0.8, 0.7])).norm(dim=1) < 0.1).all()
 
 
-def test_copies_have_their_parents_shape_and_share_its_value():
+def test_regression_copies_share_shape_and_value_of_parent():
     fit_, points, _ = fitting()
     before = fit_._splats.factors.clone(), fit_._splats.values.clone(), fit_._splats.centres.clone()
     fit_._first[0][3], fit_._second[2][3] = 7.0, 9.0
@@ -124,7 +124,7 @@ def test_copies_have_their_parents_shape_and_share_its_value():
 
 
 @pytest.mark.slow
-def test_a_fit_from_one_corner_leaves_it(device):
+def test_regression_fit_escapes_start_in_corner(device):
     points, values = bumps(3, points=400)
     g = torch.Generator().manual_seed(4)
     start = Splats(
@@ -142,14 +142,14 @@ def test_a_fit_from_one_corner_leaves_it(device):
 
 
 @pytest.mark.parametrize("dims", [1, 2, 3, 4])
-def test_a_fit_without_a_start_in_every_dimension(dims):
+def test_regression_fit_without_start_in_every_dimension(dims):
     points, values = bumps(1, 200, dims, 3)
     fitted = fit(points, values, 30, FitOptions(steps=150, start_width=0.15))
     assert fitted.losses.shape == (151,)
     assert float(fitted.losses[-1]) < 0.5 * float(fitted.losses[0])
 
 
-def test_wrong_arguments_are_refused():
+def test_regression_rejects_invalid_arguments():
     points, values = bumps(1)
     with pytest.raises(InvalidInput, match=r"got \[300, 2\] and \[10, 1\]"):
         fit(points, values[:10])

@@ -14,14 +14,14 @@ from gsplat_core import Camera, InvalidInput
 K = np.array([[500.0, 0, 310], [0, 510, 250], [0, 0, 1]])
 
 
-def test_tensors_and_defaults():
+def test_camera_tensors_and_defaults():
     camera = Camera(K, 640, 480)
     assert camera.model == "pinhole"
     torch.testing.assert_close(camera.viewmat, torch.eye(4))
     torch.testing.assert_close(camera.intrinsics, torch.tensor(K, dtype=torch.float32))
 
 
-def test_it_cannot_be_changed():
+def test_camera_is_immutable():
     given = K.copy()
     camera = Camera(given, 640, 480)
     given[0, 0] = 1
@@ -32,7 +32,7 @@ def test_it_cannot_be_changed():
         camera.width_px = 3  # type: ignore[misc]
 
 
-def test_scaling_keeps_every_ray_in_its_place():
+def test_camera_scaling_keeps_rays():
     camera = Camera(K, 641, 480)
     half = camera.scaled(0.5)
     assert (half.width_px, half.height_px) == (320, 240)
@@ -42,7 +42,7 @@ def test_scaling_keeps_every_ray_in_its_place():
     assert camera.scaled(1e-9).width_px == 1
 
 
-def test_position_and_pose():
+def test_camera_position_from_pose():
     pose = np.eye(4)
     pose[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
     pose[:3, 3] = [1, 2, 3]
@@ -50,7 +50,7 @@ def test_position_and_pose():
     np.testing.assert_allclose(pose @ [*camera.position, 1], [0, 0, 0, 1], atol=1e-12)
 
 
-def test_equal_cameras_are_equal():
+def test_camera_equality_and_hash():
     camera = Camera(K, 640, 480)
     assert camera == Camera(K.tolist(), 640, 480) and hash(camera) == hash(Camera(K, 640, 480))
     zero = np.eye(4)
@@ -59,7 +59,7 @@ def test_equal_cameras_are_equal():
     assert camera != Camera(K, 640, 481) and camera != Camera(K, 640, 480, model="fisheye") and camera != 3
 
 
-def test_wrong_cameras_are_refused():
+def test_camera_rejects_invalid_arguments():
     skewed, mirrored, nan, affine = K.copy(), K.copy(), K.copy(), np.eye(4)
     skewed[0, 1], mirrored[1, 1], nan[0, 2], affine[3, 0] = 1, -510, math.nan, 1
     for arguments, message in [

@@ -36,7 +36,7 @@ def pose(matrix, shift):
     return viewmat
 
 
-def test_bases_are_those_of_the_renderer():
+def test_harmonic_bases_equal_renderer():
     g = torch.Generator().manual_seed(0)
     dirs = torch.nn.functional.normalize(torch.randn(9, 3, generator=g, dtype=torch.float64), dim=-1)
     bases = harmonic_bases(4, dirs)
@@ -48,7 +48,7 @@ def test_bases_are_those_of_the_renderer():
 
 
 @pytest.mark.parametrize("degree", range(5))
-def test_rotated_harmonics_have_the_values_of_the_directions_rotated_back(degree):
+def test_rotated_harmonics_equal_values_at_inverse_rotated_directions(degree):
     g = torch.Generator().manual_seed(1)
     sh = torch.randn(6, (degree + 1) ** 2, 3, generator=g, dtype=torch.float64)
     dirs = torch.nn.functional.normalize(torch.randn(6, 3, generator=g, dtype=torch.float64), dim=-1)
@@ -59,7 +59,7 @@ def test_rotated_harmonics_have_the_values_of_the_directions_rotated_back(degree
 
 @pytest.mark.parametrize("degree", [0, 3, 4])
 @pytest.mark.parametrize("seed", range(3))
-def test_a_rotated_scene_looks_as_from_the_opposite_rotated_camera(degree, seed):
+def test_rotated_collection_equals_view_of_rotated_camera(degree, seed):
     scene, matrix, shift = gaussians(degree=degree), rotation(seed), np.array([0.3, -0.2, 6.0])
     camera = Camera.from_focal(60.0, 64, 48).with_pose(pose(np.eye(3), shift))
     opposite = camera.with_pose(pose(matrix.numpy(), shift))
@@ -69,7 +69,7 @@ def test_a_rotated_scene_looks_as_from_the_opposite_rotated_camera(degree, seed)
         torch.testing.assert_close(mine, wanted, rtol=1e-3, atol=1e-3)
 
 
-def test_a_larger_scene_looks_the_same_from_farther_away():
+def test_scaled_collection_equal_from_proportional_distance():
     scene, edited = gaussians(), GaussianCollection(gaussians())
     camera = Camera.from_focal(60.0, 64, 48).with_pose(pose(np.eye(3), [0, 0, 6.0]))
     edited.transform(scale=2.0, translation=(1.0, 0.0, 0.0))
@@ -77,7 +77,7 @@ def test_a_larger_scene_looks_the_same_from_farther_away():
     torch.testing.assert_close(render(edited.gaussians, farther).image, render(scene, camera).image, rtol=0, atol=1e-4)
 
 
-def test_selections_combine():
+def test_collection_selections_combine():
     scene = GaussianCollection(gaussians(semantics=torch.eye(4).repeat(10, 1)))
     means = scene.gaussians.means
     box = scene.in_box((-1, -1, -1), (1, 1, 0))
@@ -91,7 +91,7 @@ def test_selections_combine():
     assert torch.equal(scene.gaussians.means, means[kept]) and len(scene) == kept.sum()
 
 
-def test_edits_change_the_selected_gaussians_only():
+def test_collection_edits_change_selected_gaussians_only():
     before = replace(gaussians(), right_sh=torch.ones(40, 16, 3))
     scene = GaussianCollection(before)
     chosen = scene.in_sphere((0, 0, 0), 1.2)
@@ -107,7 +107,7 @@ def test_edits_change_the_selected_gaussians_only():
     torch.testing.assert_close(colours[chosen], torch.tensor([1.0, 0.5, 0.0]).expand(int(chosen.sum()), 3))
 
 
-def test_merged_collections_have_the_optional_tensors_of_both():
+def test_collection_merge_keeps_optional_tensors_of_both():
     scene = GaussianCollection(gaussians(4, degree=1, first=torch.ones(4, 2)))
     other = replace(gaussians(3, degree=2, seed=1, second=torch.ones(3)), right_sh=torch.ones(3, 9, 3))
     scene.merge(GaussianCollection(other))
@@ -117,7 +117,7 @@ def test_merged_collections_have_the_optional_tensors_of_both():
     assert (merged.extra["first"][4:] == 0).all() and merged.right_sh[4:].all() and not merged.right_sh[:4].any()
 
 
-def test_wrong_edits_are_refused():
+def test_collection_rejects_invalid_edits():
     scene = GaussianCollection(gaussians())
     for edit, message in [
         (lambda: scene.in_box((1, 0, 0), (0, 1, 1)), "is empty; give the smaller corner first"),
@@ -144,7 +144,7 @@ def test_wrong_edits_are_refused():
 
 
 @pytest.mark.parametrize("name", ["cut.ply", "cut.splat", "cut.spz", "cut"])
-def test_an_edited_collection_is_saved_and_loaded(tmp_path, name):
+def test_edited_collection_save_and_load(tmp_path, name):
     scene = GaussianCollection(gaussians(degree=1))
     scene.delete(scene.in_sphere((0, 0, 0), 1.0))
     save_gaussians(scene.gaussians, tmp_path / name)
@@ -158,7 +158,7 @@ def test_an_edited_collection_is_saved_and_loaded(tmp_path, name):
 
 
 @pytest.mark.parametrize("name", ["a.ply", "a.spz", "a"])
-def test_positions_that_are_not_finite_are_named_and_not_saved(tmp_path, name):
+def test_save_gaussians_rejects_non_finite_positions(tmp_path, name):
     scene = gaussians()
     scene.means[3, 1] = math.nan
     with pytest.raises(ExportError, match="means holds 1 values that are NaN or infinite"):
@@ -166,7 +166,7 @@ def test_positions_that_are_not_finite_are_named_and_not_saved(tmp_path, name):
     assert not any(tmp_path.iterdir())
 
 
-def test_functions_of_gaussians_name_another_argument(tmp_path):
+def test_gaussian_functions_name_wrong_argument_type(tmp_path):
     scene = GaussianCollection(gaussians())
     camera = Camera.from_focal(40, 16, 16)
     for name, call in {
@@ -178,12 +178,12 @@ def test_functions_of_gaussians_name_another_argument(tmp_path):
             call()
 
 
-def test_a_background_that_is_no_tensor_is_named():
+def test_render_names_non_tensor_background():
     with pytest.raises(InvalidInput, match=r"background must be a tensor \[3\], got list"):
         render(gaussians(), Camera.from_focal(40, 16, 16), background=[1, 1, 1])
 
 
-def test_names_without_a_format_of_gaussians_are_refused(tmp_path):
+def test_save_gaussians_rejects_unknown_file_format(tmp_path):
     for name in ("cut.zip", "cut.txt"):
         with pytest.raises(InvalidSetting):
             save_gaussians(gaussians(), tmp_path / name)

@@ -39,7 +39,7 @@ def intrinsics() -> torch.Tensor:
 
 
 @pytest.mark.parametrize("name", COEFFICIENTS)
-def test_pinhole_projection_is_opencvs(name):
+def test_pinhole_distortion_equals_opencv(name):
     lens = Lens.from_opencv(COEFFICIENTS[name], dtype=torch.float64)
     expected, _ = cv2.projectPoints(points()[0].numpy(), np.zeros(3), np.zeros(3), K, np.array(COEFFICIENTS[name]))
     projected = lens.project(points(), intrinsics())
@@ -47,7 +47,7 @@ def test_pinhole_projection_is_opencvs(name):
     np.testing.assert_allclose(projected.points[0].numpy(), expected[:, 0], atol=1e-9)
 
 
-def test_fisheye_projection_is_opencvs():
+def test_fisheye_distortion_equals_opencv():
     lens = Lens.from_opencv(FISHEYE, "fisheye", dtype=torch.float64)
     expected, _ = cv2.fisheye.projectPoints(points().numpy(), np.zeros(3), np.zeros(3), K, np.array(FISHEYE))
     np.testing.assert_allclose(lens.project(points(), intrinsics()).points[0].numpy(), expected[0], atol=1e-9)
@@ -66,7 +66,7 @@ def lenses() -> dict[str, Lens]:
 
 
 @pytest.mark.parametrize("name", lenses())
-def test_rays_invert_the_projection(name):
+def test_lens_rays_invert_projection(name):
     lens = lenses()[name]
     pixels, valid = lens.project(points(), intrinsics())
     rays = lens.rays(pixels, intrinsics())
@@ -77,7 +77,7 @@ def test_rays_invert_the_projection(name):
 
 
 @pytest.mark.parametrize("name", ["thin prism", "fisheye", "ftheta by distance", "ftheta by angle"])
-def test_gradients_of_projection_and_rays(name):
+def test_lens_projection_and_rays_pass_gradcheck(name):
     lens, few = lenses()[name], points(3)
     given = [
         each.clone().requires_grad_() for each in (lens.radial, lens.tangential, lens.thin_prism) if each is not None
@@ -97,7 +97,7 @@ def test_gradients_of_projection_and_rays(name):
     )  # fmt: skip
 
 
-def test_what_folds_over_or_is_behind_is_invalid_and_finite():
+def test_lens_points_folding_over_or_behind_are_invalid_and_finite():
     # r (1 - 0.5 r²) grows up to r = 0.8165.
     lens = Lens.from_opencv([-0.5, 0, 0, 0], dtype=torch.float64)
     at = torch.tensor([[[0.81, 0, 1], [0.82, 0, 1], [2.0, 0, 1], [0.1, 0, -1], [0, 0, 0]]], dtype=torch.float64)
@@ -114,7 +114,7 @@ def test_what_folds_over_or_is_behind_is_invalid_and_finite():
     assert fisheye.project(directions, intrinsics().float()).valid.tolist() == [[True, False]]
 
 
-def test_several_cameras_have_their_own_coefficients():
+def test_lens_coefficients_per_camera():
     radial = torch.zeros(2, 3, 6, dtype=torch.float64)
     radial[..., 0] = torch.arange(6).view(2, 3) * -0.05
     at, Ks = points(4).expand(2, 3, 4, 3), intrinsics().expand(2, 3, 3, 3)
@@ -133,6 +133,6 @@ def test_several_cameras_have_their_own_coefficients():
         ({"ftheta": ftheta(FThetaPolynomialType.ANGLE_TO_PIXELDIST)}, "use camera_model='ftheta'"),
     ],
 )
-def test_coefficients_that_the_model_does_not_have_are_refused(options, words):
+def test_lens_rejects_coefficients_of_other_models(options, words):
     with pytest.raises(InvalidInput, match=words):
         Lens(**options)

@@ -15,24 +15,24 @@ from gsplat_core.scene.frames import DEPTH_ORIGINS, Frame
 IMAGE = np.zeros((4, 6, 3), np.uint8)
 
 
-def test_a_right_camera_of_another_size_is_refused():
+def test_frame_rejects_right_camera_of_different_size():
     with pytest.raises(InvalidInput, match="right camera is 8x4, the image 6x4"):
         Frame(0, 0, IMAGE, right_camera=Camera.from_focal(5, 8, 4))
 
 
-def test_confidence_of_another_size_is_refused():
+def test_frame_rejects_confidence_of_different_size():
     with pytest.raises(InvalidInput, match=r"depth_confidence is \[4, 5\]"):
         Frame(0, 0, IMAGE, depth_confidence=np.ones((4, 5), np.float32))
 
 
 @pytest.mark.parametrize("baseline", [0.0, -1.0, float("nan"), float("inf")])
-def test_eyes_that_are_no_distance_apart_are_refused(baseline):
+def test_right_eye_rejects_invalid_baseline(baseline):
     with pytest.raises(InvalidInput, match="between the eyes"):
         Camera.from_focal(5, 8, 4).right_eye(baseline)
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.5])
-def test_a_point_appears_to_the_right_camera_where_its_disparity_says(tmp_path: Path, scale):
+def test_right_camera_projection_matches_disparity(tmp_path: Path, scale):
     folder = synthesize(tmp_path / "pair", frames=1, width_px=96, height_px=80, stereo=True)
     recording = open_recording(folder, scale=scale)
     frame = next(iter(recording))

@@ -15,7 +15,7 @@ def gaussians(count=5, bases=4, dtype=torch.float32):
     return Gaussians(*(torch.randn(count, *s, generator=g).to(dtype) for s in ((3,), (4,), (3,), (), (bases, 3))))
 
 
-def test_names_and_activations():
+def test_gaussians_names_and_activations():
     it = gaussians()
     assert list(it.tensors()) == ["means", "quats", "log_scales", "logit_opacities", "sh"]
     assert it.count == len(it) == 5
@@ -24,11 +24,11 @@ def test_names_and_activations():
 
 
 @pytest.mark.parametrize(("bases", "degree"), [(1, 0), (4, 1), (9, 2), (16, 3), (25, 4)])
-def test_sh_degree(bases, degree):
+def test_gaussians_sh_degree(bases, degree):
     assert gaussians(bases=bases).sh_degree == degree
 
 
-def test_select_by_mask_indices_and_slice():
+def test_gaussians_select_by_mask_indices_and_slice():
     it = gaussians()
     mask = torch.tensor([True, False, True, False, False])
     for index in (mask, torch.tensor([0, 2]), slice(0, 3, 2)):
@@ -39,7 +39,7 @@ def test_select_by_mask_indices_and_slice():
     assert it.select(torch.zeros(5, dtype=torch.bool)).count == 0
 
 
-def test_append_is_the_inverse_of_select():
+def test_gaussians_append_inverts_select():
     it = gaussians()
     joined = it.select(slice(0, 2)).append(it.select(slice(2, None)))
     for name, tensor in joined.tensors().items():
@@ -50,7 +50,7 @@ def test_append_is_the_inverse_of_select():
         it.append(gaussians(dtype=torch.float64))
 
 
-def test_gradients_flow_and_detach_stops_them():
+def test_gaussians_gradients_and_detach():
     it = gaussians().requires_grad_()
     copy = it.clone()
     (copy.means.sum() + it.to(dtype=torch.float64).sh.sum()).backward()
@@ -72,14 +72,14 @@ def test_gradients_flow_and_detach_stops_them():
         ({"quats": torch.zeros(5, 4).numpy()}, "quats must be a tensor, got ndarray; convert it"),
     ],
 )
-def test_wrong_shapes_are_refused(change, message):
+def test_gaussians_reject_invalid_shapes(change, message):
     with pytest.raises(InvalidInput, match=message):
         Gaussians(**(gaussians().tensors() | change))
     with pytest.raises(InvalidInput, match="floating-point"):
         gaussians().map(lambda tensor: tensor.int())
 
 
-def test_the_right_eye_sees_the_sum():
+def test_gaussians_seen_by_right_adds_right_sh():
     left = gaussians()
     assert left.seen_by_right() is left and len(left.tensors()) == 5
     both = dataclasses.replace(left, right_sh=torch.full_like(left.sh, 0.25))
@@ -89,7 +89,7 @@ def test_the_right_eye_sees_the_sum():
     assert torch.equal(both.select(slice(1, 3)).seen_by_right().sh, right.sh[1:3])
 
 
-def test_appended_gaussians_take_the_eyes_of_the_others():
+def test_gaussians_append_follows_eyes_of_first():
     left = gaussians()
     both = dataclasses.replace(left, right_sh=torch.ones_like(left.sh))
     assert both.append(left).right_sh[:, 0, 0].tolist() == [1] * 5 + [0] * 5
@@ -97,13 +97,13 @@ def test_appended_gaussians_take_the_eyes_of_the_others():
     assert left.with_right().with_right(False).tensors().keys() == left.tensors().keys()
 
 
-def test_colours_of_the_right_eye_have_the_shape_of_the_left_ones():
+def test_gaussians_right_sh_requires_shape_of_sh():
     left = gaussians()
     with pytest.raises(InvalidInput, match="right_sh must be"):
         dataclasses.replace(left, right_sh=left.sh[:, :1, :2])
 
 
-def test_extra_tensors_follow_the_rows():
+def test_gaussians_extra_tensors_follow_rows():
     scene = dataclasses.replace(gaussians(), extra={"semantics": torch.arange(15.0).reshape(5, 3)})
     assert list(scene.tensors())[-1] == "extra.semantics"
     assert torch.equal(scene.select(torch.tensor([3, 1])).extra["semantics"], scene.extra["semantics"][[3, 1]])

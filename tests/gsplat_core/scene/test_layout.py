@@ -21,7 +21,7 @@ def constants():
     return {name: int(found.get(value, value)) for name, value in found.items()}
 
 
-def test_the_kernels_header_has_the_same_columns(constants):
+def test_kernel_header_columns_equal_python(constants):
     assert constants == {
         "kRawColumns": gaussians.RAW_COLUMNS,
         "kRawPosition": gaussians.POSITION.start,
@@ -35,18 +35,18 @@ def test_the_kernels_header_has_the_same_columns(constants):
     }
 
 
-def test_groups_follow_each_other_without_gap_or_overlap():
+def test_parameter_groups_are_contiguous():
     groups = [gaussians.POSITION, gaussians.ROTATION, gaussians.LOG_SCALE, gaussians.COLOUR, gaussians.OPACITY]
     assert [group.start for group in groups] == [0, *(group.stop for group in groups[:-1])]
     assert [gaussians.width_of(group) for group in groups] == [3, 4, 3, 3, 1]
     assert gaussians.width_of(*groups) <= gaussians.RAW_COLUMNS and gaussians.RAW_COLUMNS % 4 == 0
 
 
-def test_the_hexplane_head_has_log_scales_before_the_rotation():
+def test_hexplane_head_column_order():
     assert HEAD_COLUMNS == (0, 1, 2, 7, 8, 9, 3, 4, 5, 6, 13)
 
 
-def test_kernels_spell_no_column_of_the_layout_themselves():
+def test_kernel_sources_do_not_redeclare_layout_columns():
     """Sources that move raw rows include the header and do not declare the numbers again."""
     native = Path(gsplat_core.__file__).parent
     for path in [*native.rglob("*.h"), *native.rglob("*.cu"), *native.rglob("*.cuh"), *native.rglob("*.cpp")]:

@@ -17,12 +17,12 @@ def pivot() -> np.ndarray:
     return np.linalg.inv(START.world_to_camera) @ [0, 0, DISTANCE, 1]
 
 
-def test_without_turn_and_zoom_it_is_where_it_started():
+def test_orbit_without_turn_and_zoom_equals_start():
     np.testing.assert_allclose(Orbit().camera(START, DISTANCE).world_to_camera, POSE, atol=1e-12)
 
 
 @pytest.mark.parametrize("orbit", [Orbit(30, 0), Orbit(0, -40), Orbit(-75, 75, 4), Orbit(10, 20, 0.25)])
-def test_the_middle_stays_in_the_middle_at_its_distance(orbit):
+def test_orbit_keeps_pivot_centred_at_distance(orbit):
     seen = orbit.camera(START, DISTANCE).world_to_camera @ pivot()
     np.testing.assert_allclose(seen[:3], [0, 0, DISTANCE / orbit.zoom], atol=1e-9)
     turn = orbit.camera(START, DISTANCE).world_to_camera[:3, :3]
@@ -30,7 +30,7 @@ def test_the_middle_stays_in_the_middle_at_its_distance(orbit):
     assert np.linalg.det(turn) == pytest.approx(1)
 
 
-def test_azimuth_goes_right_and_elevation_up():
+def test_orbit_azimuth_moves_right_and_elevation_up():
     """Axes are those of the start camera: x to the right, y down."""
 
     def moved(orbit: Orbit) -> np.ndarray:
@@ -44,12 +44,12 @@ def test_azimuth_goes_right_and_elevation_up():
 
 
 @pytest.mark.parametrize("wrong", [(76, 0, 1), (0, -75.1, 1), (0, 0, 0.2), (0, 0, 5), (float("nan"), 0, 1)])
-def test_values_out_of_range_are_refused(wrong):
+def test_orbit_rejects_values_out_of_range(wrong):
     with pytest.raises(InvalidSetting, match="must be from"):
         Orbit(*wrong)
 
 
 @pytest.mark.parametrize("distance", [0.0, -1.0, float("nan"), float("inf")])
-def test_a_distance_that_is_none_is_refused(distance):
+def test_orbit_rejects_invalid_distance(distance):
     with pytest.raises(InvalidInput, match="distance"):
         Orbit().camera(START, distance)

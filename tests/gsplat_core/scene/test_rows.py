@@ -29,7 +29,7 @@ def assert_spare_rows_show_nothing(rows):
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_coming_and_going_in_any_order_is_selecting_and_appending(make_gaussians, seed):
+def test_gaussian_rows_random_changes_equal_select_and_append(make_gaussians, seed):
     chance = torch.Generator().manual_seed(seed)
     expected = make_gaussians(30, seed=seed)
     rows = GaussianRows(expected, 50)
@@ -52,7 +52,7 @@ def test_coming_and_going_in_any_order_is_selecting_and_appending(make_gaussians
 
 
 @pytest.mark.parametrize("removed", [[], [0], [4], [0, 1, 2, 3, 4], [0, 4], [1, 2, 3], [3, 4]])
-def test_gaps_anywhere_are_closed(removed):
+def test_row_moves_close_gaps(removed):
     leaving = torch.zeros(5, dtype=torch.bool)
     leaving[removed] = True
     moves = RowMoves.without(leaving)
@@ -64,7 +64,7 @@ def test_gaps_anywhere_are_closed(removed):
     assert len(moves.to) <= len(removed)
 
 
-def test_another_scene_takes_the_place_of_all(make_gaussians):
+def test_gaussian_rows_replace_scene(make_gaussians):
     rows = GaussianRows(make_gaussians(20), 25)
     at = addresses(rows)
     other = make_gaussians(7, seed=9)
@@ -74,7 +74,7 @@ def test_another_scene_takes_the_place_of_all(make_gaussians):
     assert addresses(rows) == at
 
 
-def test_more_than_fit_are_refused_and_nothing_changes(make_gaussians):
+def test_gaussian_rows_reject_overflow_without_change(make_gaussians):
     rows = GaussianRows(make_gaussians(20), 25)
     with pytest.raises(InvalidInput, match="26 Gaussians do not fit into 25 rows"):
         rows.append(make_gaussians(6))
@@ -83,7 +83,7 @@ def test_more_than_fit_are_refused_and_nothing_changes(make_gaussians):
         GaussianRows(make_gaussians(20), 19)
 
 
-def test_colours_of_the_right_eye_come_and_go_with_their_gaussians(make_gaussians):
+def test_gaussian_rows_right_eye_colours_follow_rows(make_gaussians):
     first = make_gaussians(6)
     rows = GaussianRows(dataclasses.replace(first, right_sh=torch.arange(6.0)[:, None, None].expand_as(first.sh)), 9)
     at = addresses(rows)
