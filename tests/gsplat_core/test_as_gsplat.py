@@ -240,7 +240,7 @@ def test_as_gsplat_provides_version_file_and_extension(installed):
 
 
 def test_as_gsplat_provides_names_imported_by_gsplat_modules(installed):
-    """Programs import some names from modules that only import them."""
+    """Programs import some names from modules that do not define these names."""
     default = importlib.import_module("gsplat.strategy.default")
     assert default.remove is importlib.import_module("gsplat.strategy.ops").remove
     assert importlib.import_module("gsplat.rendering").depth_to_normal is depth_to_normal

@@ -63,7 +63,7 @@ def test_libraries_export_own_names_only(library):
 
 
 def test_native_sources_use_own_check_macros():
-    """torch's macros format through iostreams and let exceptions out; torch_abi.h has what takes their place."""
+    """torch's macros use iostreams and let exceptions escape; torch_abi.h defines replacements."""
     sources = [path for ending in ("cpp", "h", "cu", "cuh") for path in (ROOT / "gsplat_core").rglob(f"*.{ending}")]
     assert len(sources) > 50
     for theirs in ("STD_TORCH_CHECK(", "TORCH_BOX(", "#include <torch/"):

@@ -60,7 +60,7 @@ def test_one_thread_restores_count_after_error():
 
 
 def test_one_thread_does_not_affect_other_threads():
-    """Its LAPACK, too: the last bits of a large system tell how many threads solved it."""
+    """LAPACK is tested too: the last bits of the solution of a large system depend on the number of threads."""
     matrix = torch.randn(400, 400, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     solved = lambda: torch.linalg.inv(matrix).sum(1)
     expected = solved()

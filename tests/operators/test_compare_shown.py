@@ -11,7 +11,7 @@ from tests.operators.conftest import make_rendered, run_once
 
 
 def test_compare_shown_counts_and_names_first_different_picture() -> None:
-    """The session showed frames 1, 2, 4, 5 and 7. Those of 4 and 5 were other pictures."""
+    """The session showed frames 1, 2, 4, 5 and 7; the pictures of 4 and 5 differ."""
 
     def shown(seq: int, offset: int = 2) -> ShownLine:
         digest = sha256(make_rendered(seq, offset).image.tobytes()).hexdigest()

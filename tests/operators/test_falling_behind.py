@@ -169,7 +169,7 @@ def test_moving_scope_picture_is_at_most_1_db_below_previous_frame(steps):
 
 
 def test_guard_renewal_restores_model_within_five_frames():
-    """The rates are far too small for the motion: only a new scene shows the frames after it."""
+    """The learning rates are far too small for the motion, so only a new scene can show later frames."""
     frames = list(journey(3.0, 3.0, 3.0))[:13]
     slow = dict(first_rate=0.01, last_rate=0.01)
     lost, guarded = Stream(1, guarded=False, **slow), Stream(1, **slow)

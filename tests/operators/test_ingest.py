@@ -78,7 +78,7 @@ def test_source_op_emits_every_frame_once_with_metadata(recording):
 
 
 def test_source_op_opens_source_after_threads_are_prepared(camera, frame, monkeypatch):
-    """The frames of a live source arrive from then on, so the first one would wait for the slowest operator."""
+    """Frames of a live source arrive once the source is open, and an earlier frame would wait for the slowest operator."""
     events = []
     source = Scripted([frame(0)], camera)
     monkeypatch.setattr(source, "open", lambda: events.append("source opened"))

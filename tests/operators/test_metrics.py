@@ -195,7 +195,7 @@ def test_next_frame_result_is_none_without_predictions(rendered, compute):
 
 
 def test_previous_frame_baseline_is_independent_of_shown_pictures(frame, rendered, compute):
-    """Kills a baseline from the displayed picture, from an older frame or over another mask."""
+    """Fails for a baseline from the displayed picture, from an older frame or with a different mask."""
     levels = [frame(k, image=np.full((16, 24, 3), 100 + level, np.uint8)) for k, level in enumerate((0, 3, 10))]
     scored = score(MetricsOp(None), compute, [rendered(frame=each, offset=50) for each in levels])
     assert [each.previous_frame_db for each in scored[1:]] == [pytest.approx(_decibels(3)), pytest.approx(_decibels(7))]

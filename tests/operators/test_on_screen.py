@@ -135,7 +135,7 @@ def in_time(pictures):
 
 @pytest.mark.parametrize("worst_at", [25, 30, 39])
 def test_on_screen_worst_frame_excludes_first_second(frame, rendered, compute_queued, worst_at):
-    """The first second is worse still, and one frame is better than all the others."""
+    """The first second has an even lower score, and one frame has a higher score than all others."""
     offsets = {k: 60 for k in range(25)} | {worst_at: 30, 27: 1}
     frames = [frame(k, arrived_ns=k * PERIOD) for k in range(40)]
     pictures = [rendered(k, frame=frames[k], offset=offsets.get(k, 5)) for k in range(40)]

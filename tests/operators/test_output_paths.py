@@ -83,7 +83,7 @@ def test_video_over_own_model_or_into_recording_is_refused(take, tmp_path):
 
 
 def test_output_path_checks_accept_folders_of_own_results(tmp_path, monkeypatch):
-    """A run's folder holds a video, and a rendering may be called images: neither makes the place a recording."""
+    """A run's video and a rendering named images do not make a folder a recording."""
     monkeypatch.chdir("/")
     for name in ("run", "images"):
         with OutputFolder(tmp_path / name, "replay") as output:

@@ -27,7 +27,7 @@ def scene(make_gaussians):
 
 @pytest.fixture
 def captures(monkeypatch):
-    """Counts the graphs that are captured."""
+    """Count the captured graphs."""
     made = []
     original = alpha._capture
     monkeypatch.setattr(alpha, "_capture", lambda *arguments: made.append(1) or original(*arguments))

@@ -162,7 +162,7 @@ def test_compositing_of_thin_huge_and_tiny_splats() -> None:
 
 
 def test_compositing_gradients_of_tiny_splats_keep_single_precision() -> None:
-    """Moments are summed about the middle of 8x8 pixels: what is left after moving them to a tiny splat's mean must be good."""
+    """Moments are summed about the middle of 8x8 pixels; moving them to the mean of a tiny splat must not lose precision."""
     s, random = scene(400, 160, 160, channels=4), torch.Generator().manual_seed(5)
     s.means2d[0] = torch.cartesian_prod(torch.arange(20.0), torch.arange(20.0)) * 8 + 8 * torch.rand(
         400, 2, generator=random

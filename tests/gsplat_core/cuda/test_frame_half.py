@@ -74,7 +74,7 @@ def test_half_frame_of_any_image_size(size: tuple[int, int], background: bool) -
 
 @pytest.mark.parametrize("count", [0, 1, 2, 15, 16, 17, 31, 32, 33, 127, 128, 129, 300])
 def test_half_frame_of_any_number_of_splats_per_pixel(count: int) -> None:
-    """Around what a warp blends at once, stages at once, and keeps for later."""
+    """Counts around the numbers of splats that a warp blends, stages and queues at once."""
     scene = frame_scene(count, 16, 16, median_px=40.0, seed=2)
     scene.logit_opacities[:] -= 3.0
     check(scene)
@@ -118,7 +118,7 @@ def test_half_frame_of_needles_equals_reference() -> None:
 
 
 def test_half_frame_saturated_pixel_ignores_later_splats() -> None:
-    """Opaque splats of every width in front of brighter ones: each pixel closes at another splat of another step."""
+    """Opaque splats of every width in front of brighter ones, so that pixels saturate at different splats and steps."""
     scene = frame_scene(3000, 70, 45, median_px=6.0, seed=7)
     depth = (scene.means @ scene.viewmat[2, :3] + scene.viewmat[2, 3]).argsort()
     scene.logit_opacities[:] = 3.0
@@ -128,7 +128,7 @@ def test_half_frame_saturated_pixel_ignores_later_splats() -> None:
 
 
 def test_half_frame_of_opaque_layers_stops_at_limit() -> None:
-    """The third of 0.982 would pass the limit, and is not drawn."""
+    """The third layer with alpha 0.982 would exceed the transmittance limit and is not drawn."""
     scene = frame_scene(40, 48, 32, median_px=500.0, seed=8)
     scene.logit_opacities[:] = 4.0
     frame = check(scene)
@@ -163,7 +163,7 @@ def test_half_frame_without_minimum_splat_size_close_to_float32(eps2d: float) ->
 
 
 def test_half_frame_clamps_colours_to_largest_half() -> None:
-    """Such a colour is finite within its splat and changes no other pixel."""
+    """A clamped colour is finite within its splat and changes no other pixel."""
     scene = frame_scene(300, deltas=True, seed=12)
     scene.deltas[0, COLOUR] = 1e9
     bright = rendered(scene)

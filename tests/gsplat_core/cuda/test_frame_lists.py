@@ -43,7 +43,7 @@ def test_frame_lists_with_equal_and_adjacent_depths(count: int, far: bool) -> No
 @pytest.mark.parametrize("clump", [1, 2, 11, 12, 13, 100])
 @pytest.mark.parametrize("count", [120, 250, 500, 1000])
 def test_frame_lists_with_clustered_depths(count: int, clump: int) -> None:
-    """Evenly spread depths are sorted by buckets, and others, with too many in one bucket, bitonically."""
+    """Evenly spread depths use the bucket sort; depths with an overfull bucket use the bitonic sort."""
     s = scene(count, 16, 16, seed=18, deltas=False)
     g = torch.Generator().manual_seed(3)
     s.viewmat[:] = torch.eye(4)

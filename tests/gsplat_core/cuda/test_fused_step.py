@@ -44,7 +44,7 @@ def camera() -> Camera:
 
 @pytest.fixture
 def observation(make_gaussians, camera) -> Observation:
-    """A picture of other Gaussians, with a tool in one corner and depth."""
+    """Return an observation of other Gaussians with depth and a tool in one corner."""
     with torch.no_grad():
         seen = render(make_gaussians(600, seed=4), camera)
     mask = torch.ones(camera.height_px, camera.width_px, dtype=torch.uint8)
@@ -102,7 +102,7 @@ def test_fused_step_alternates_colour_correction_and_training(make_gaussians, ob
 
 
 def test_fused_step_colour_correction_ignores_depth(make_gaussians, observation):
-    """Two graphs, each captured once: depth and colours take turns in one step's memory."""
+    """Steps with depth and steps with colour correction alternate in one memory, with one captured graph for each."""
     start, rates, depths = make_gaussians(600, sh_degree=0), RATES | {"sh": 0.0}, {}
     seen = dataclasses.replace(observation, depth=1.5 * observation.depth)
     for with_depth in (True, False):
@@ -128,7 +128,7 @@ def test_fused_step_colour_correction_ignores_depth(make_gaussians, observation)
 
 @pytest.mark.parametrize("relaxation", [0.0, 1.5])
 def test_fused_step_right_eye_colours_equal_cpu(make_gaussians, observation, relaxation):
-    """Several steps of both eyes by turns, whose pictures differ in colour: the same as without a captured graph."""
+    """Alternating steps of both eyes with differently coloured pictures equal steps without a captured graph."""
     from gsplat_core.training.steps.photometric import loss_and_gradients, with_eye
 
     left = dataclasses.replace(observation, depth=None)
@@ -155,7 +155,7 @@ def test_fused_step_right_eye_colours_equal_cpu(make_gaussians, observation, rel
 
 
 def test_fused_step_serves_alternating_cameras(make_gaussians, observation):
-    """Pose and intrinsics of each observation are those that its step renders with: the same as two eyes trained on the CPU."""
+    """Each step renders with the pose and intrinsics of its observation, and equals training of both eyes on the CPU."""
     from gsplat_core.training.steps.photometric import loss_and_gradients
 
     left = dataclasses.replace(observation, depth=None)
@@ -288,7 +288,7 @@ def slanted_wall(slope: float, distance: float) -> Gaussians:
 
 @pytest.mark.parametrize("relaxation", [0.0, 1.5])
 def test_fused_step_ray_losses_equal_cpu(wall_seen, relaxation):
-    """Steps with and without rays by turns, one of them with colour correction, on a deformed scene."""
+    """Alternating steps with and without rays on a deformed scene, with and without colour correction."""
     from gsplat_core.training.losses import LossContext
     from gsplat_core.training.steps.photometric import loss_and_gradients, with_losses
 
@@ -318,7 +318,7 @@ def test_fused_step_ray_losses_equal_cpu(wall_seen, relaxation):
 
 
 def test_fused_step_ray_losses_read_camera_and_depth_of_observation(wall_seen):
-    """One graph for two cameras: the loss of each is that of a step captured for it alone."""
+    """With one graph for two cameras, each loss equals that of a step captured for this camera alone."""
     other_camera = dataclasses.replace(wall_seen.camera, K=wall_seen.camera.K * [[1.1], [1.1], [1.0]])
     other = dataclasses.replace(wall_seen, camera=other_camera, depth=1.2 * wall_seen.depth)
     still = dict.fromkeys(RATES, 0.0)

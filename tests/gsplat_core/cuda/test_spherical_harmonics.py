@@ -34,7 +34,7 @@ def test_spherical_harmonics_values_and_gradients_equal_reference(gpu, assert_ne
 @pytest.mark.parametrize("bases", ["all", "more"])
 @pytest.mark.parametrize("rows", [1, 3])
 def test_spherical_harmonics_of_any_set_count_and_alignment(gpu, assert_near, degree, bases, rows):
-    """Sets per warp and block that are not full, coefficients that are not used, and tensors that start anywhere."""
+    """Partially filled warps and blocks, unused coefficients, and misaligned tensors."""
     generator = torch.Generator().manual_seed(degree)
     count = (degree + 1) ** 2 + (2 if bases == "more" else 0)
     for sets in (31, 33, 128, 130):

@@ -119,7 +119,7 @@ def test_cut_detector_accepts_frame_similar_to_kept_view():
 
 
 def test_cut_detector_compares_confirming_frame_with_two_frames_only(monkeypatch):
-    """It is displayed, and comparing it with all kept views would delay its picture."""
+    """The confirming frame is displayed, and a comparison with all kept views would delay its picture."""
     detector = CutDetector()
     for k, image in enumerate([*texture(1, 80, 64, 48), texture(2, 2, 64, 48)[0]]):
         detector.observe(image, k, k * FRAME_NS)
@@ -247,7 +247,7 @@ def test_colours_returns_share_of_pixels_with_equal_hue():
 
 
 def test_structure_matches_blocks_shifted_by_up_to_eight_pixels():
-    """Blocks of a shifted picture are found again, those of other tissue are not, and a flat picture has none."""
+    """Blocks of a shifted picture are matched, blocks of other tissue are not, and a flat picture has no structure."""
     image = texture(1, 1, 200, 160)[0]
     one, shifted = image[:128, :160], image[4:132, 6:166]
     other = texture(2, 1)[0]

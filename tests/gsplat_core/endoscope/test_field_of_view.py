@@ -87,7 +87,7 @@ def test_field_of_view_ignores_dark_cavity_in_full_frame(centre):
 @pytest.mark.parametrize("turned", range(4))
 @pytest.mark.parametrize("width", [60, 120, 200])
 def test_field_of_view_keeps_lit_tissue_beside_black_corner(turned, width):
-    """A black corner and one that is cut off by a curve: an ellipse through both rims would leave out half of a lit picture."""
+    """With a straight and a curved black corner, an ellipse through both rims would exclude half of a lit picture."""
     y, x = np.mgrid[:HEIGHT, :WIDTH]
     black = x / WIDTH - y / HEIGHT > 1 - width / WIDTH
     black |= (x - WIDTH / 2) ** 2 + (y + 900) ** 2 > 1170**2
@@ -351,7 +351,7 @@ def test_field_of_view_margin_is_hundredth_of_longer_side_except_at_border(monke
 
 
 def test_seen_in_recording_is_union_of_all_windows():
-    """A field found in the first picture alone does not count once there is a whole window."""
+    """A field of view found in the first picture only is ignored once there is a complete window."""
     small, large = disc(radius=80), disc(radius=120)
     pictures = seen_through(small, count=1) + seen_through(large, count=40)
     assert overlap(seen_in_recording(iter(pictures)), large) > 0.92

@@ -104,7 +104,7 @@ def test_onnx_finder_reads_normalisation_from_metadata_or_sidecar_file(tmp_path,
 
 
 def test_onnx_finder_uses_declared_size_for_dynamic_input(tmp_path):
-    """The mask is as coarse as the size, which is how it shows."""
+    """The used size is visible from the resolution of the mask."""
     finder = OnnxToolFinder(grey_network(tmp_path / "net.onnx", size=("h", "w"), metadata={"size": [16, 16]}))
     image = np.full((160, 160, 3), (200, 60, 50), np.uint8)
     image[100:102, 100:102] = 128  # too small to be seen in a sixteenth

@@ -14,7 +14,7 @@ FRAME_NS = 33_000_000
 
 @pytest.fixture
 def stream(rng):
-    """Pictures of something uneven that moves a little and evenly."""
+    """Return pictures of a textured surface that moves slowly and uniformly."""
     patches = cv2.resize(
         rng.uniform(40, 200, (12, 16, 3)).astype(np.float32), (320, 256), interpolation=cv2.INTER_CUBIC
     )
@@ -85,7 +85,7 @@ def test_is_ordinary_accepts_images_of_any_size(rng, size):
 
 
 def test_is_ordinary_renews_reference_every_0_2_seconds(monkeypatch):
-    """Ordinary frames are compared with the last look, which is renewed at 0.2 s and not before."""
+    """Ordinary frames are compared with a reference that is renewed after 0.2 s and not before."""
     watch, colours = OrdinaryPictures(), iter(range(1000))
     small = np.zeros((32, 32, 3), np.uint8)
     noisy = [np.full_like(small, level) for level in (100, 103)]

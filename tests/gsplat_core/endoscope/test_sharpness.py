@@ -22,7 +22,7 @@ def faults(images, kept=None, fps=30.0):
 
 
 def longest(found, fps=30.0):
-    """Seconds between two good frames, at most."""
+    """Return the longest interval between two accepted frames in seconds."""
     good = [k for k, fault in enumerate(found) if fault is None]
     return max(b - a for a, b in pairwise([*good, len(found)])) / fps
 
@@ -38,7 +38,7 @@ def moved(image, down=False):
 
 
 def smoky(image, density=0.45, seed=0):
-    """Behind a cloud of pale smoke with thicker and thinner places."""
+    """Add pale smoke of varying density to a picture."""
     coarse = np.random.default_rng(seed).random((5, 6)).astype(np.float32)
     cloud = cv2.resize(coarse, image.shape[1::-1], interpolation=cv2.INTER_CUBIC)
     share = np.clip(density * (0.6 + 0.8 * cloud), 0, 1)[..., None]
@@ -173,7 +173,7 @@ def test_sharpness_gate_unmeasurable_frames_keep_fault_briefly():
 
 
 def test_sharpness_gate_usual_sharpness_window_is_time_not_frames():
-    """Ordinary frames are examined a few times a second, all others each: the window is of time, not of frames."""
+    """Ordinary frames are examined a few times per second and all others always, so the window is measured in time, not in frames."""
     images = texture(7, 80, 320, 256)
     gate = SharpnessGate()
     for k in range(0, 30, 6):
@@ -227,7 +227,7 @@ def test_sharpness_gate_accepts_images_of_any_size(height, width, seed):
     ],
 )  # fmt: skip
 def test_sharpness_gate_blur_and_smoke_thresholds(before, sharpness, clear, said):
-    """Usual are a contrast of 1, a saturation of 0.5 and a haze of 20 levels."""
+    """The usual values are a contrast of 1, a saturation of 0.5 and a haze of 20 levels."""
     gate = SharpnessGate()
     gate._clear[:5] = np.array([[0.2, 0.1, 1], [0.9, 0.45, 10], [1, 0.5, 20], [1.5, 0.8, 30], [2, 0.9, 90]])
     gate._clear_count, gate._fault = 5, before
@@ -235,7 +235,7 @@ def test_sharpness_gate_blur_and_smoke_thresholds(before, sharpness, clear, said
 
 
 def gate_of(monkeypatch, seen):
-    """A gate to which every frame looks like what `seen` gives next."""
+    """Return a gate for which each frame has the next appearance of `seen`."""
     looks = iter(seen)
     monkeypatch.setattr(changes, "appearance", lambda image, kept: next(looks))
     return SharpnessGate()

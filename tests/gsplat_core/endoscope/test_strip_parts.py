@@ -179,7 +179,7 @@ def below(first: int, columns: slice) -> np.ndarray:
     ids=str,
 )  # fmt: skip
 def test_band_strip_requires_unbroken_edge(edge: Any, columns: slice) -> None:
-    """One pixel more, because edges may be tilted by a pixel."""
+    """The strip includes one more row, because edges may be tilted by a pixel."""
     np.testing.assert_array_equal(_Band(0, 20)._strips(*edge), below(11, columns))
 
 

@@ -41,7 +41,7 @@ def test_valley_without_two_peaks_returns_default():
 
 
 def test_valley_prefers_candidate_nearest_to_expected():
-    """Between three equal peaks at equal distances."""
+    """The distribution has three equal peaks at equal distances."""
     bell = lambda centre: np.exp(-0.5 * ((BIN_CENTRES - centre) / 0.02) ** 2)
     histogram = bell(-0.15) + bell(0.05) + bell(0.25)
     threshold, found = valley(histogram / histogram.sum())
@@ -72,7 +72,7 @@ def test_histogram_with_stretch_equals_histogram_of_stretched_values(stretch):
 
 
 def test_redness_is_logarithm_of_red_over_green_and_blue():
-    """Half against the mean of green and blue, half against the smaller of them, with an offset for dark pixels."""
+    """Red is compared half with the mean and half with the minimum of green and blue, with an offset for dark pixels."""
     red, green, blue = 200, 80, 120
     view = view_of(np.full((60, 80, 3), (red, green, blue), np.uint8))
     floor = 0.06 * 200

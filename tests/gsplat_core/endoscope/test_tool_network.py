@@ -87,7 +87,7 @@ def test_round_view_requires_four_dark_corners():
 
 
 def test_network_finder_uses_separate_network_for_round_view(finder):
-    """It finds the instrument inside of the view, and differs from the other network."""
+    """The network for round views finds the instrument inside the view and differs from the other network."""
     image, rod = with_rod(256, 320)
     image, inside = in_round_view(image)
     found = finder.find(image) == 0

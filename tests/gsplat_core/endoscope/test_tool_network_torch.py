@@ -130,7 +130,7 @@ def test_torch_network_rejects_input_of_different_size():
 
 
 def test_torch_network_calls_no_torch_convolution():
-    """They would load cuDNN on a GPU."""
+    """Torch's convolutions would load cuDNN on a GPU."""
     called = []
 
     class Recorded(TorchDispatchMode):
@@ -181,7 +181,7 @@ def test_conv_operator_rejects_asymmetric_padding():
 
 
 def changed(tmp_path, change):
-    """The network with a change of its graph."""
+    """Return the path of a copy of the network with a changed graph."""
     model = onnx.load(NETWORK)
     change(model.graph)
     path = tmp_path / "changed.onnx"
@@ -204,7 +204,7 @@ def attribute_of(node, name):
 
 
 def test_torch_network_unchanged_by_rewriting_file(tmp_path):
-    """Refused files below are refused for their changes."""
+    """Shows that the files of the tests below are rejected because of their changes, not because of rewriting."""
     planes = noise(NETWORK)
     path = changed(tmp_path, lambda graph: None)
     np.testing.assert_array_equal(TorchToolNetwork(path, CPU).logits(planes), in_torch(NETWORK).logits(planes))

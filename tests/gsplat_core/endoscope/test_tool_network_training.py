@@ -42,7 +42,7 @@ def test_store_replaces_oldest_images():
 
 
 def test_altered_transforms_masks_with_images():
-    """A picture that is bright exactly where the tool is stays so."""
+    """A picture that is bright exactly at the tool stays bright at the transformed tool mask."""
     plain = torch.zeros((8, *INPUT_PX, 4))
     plain[:, 20:60, 30:80] = 1
     pictures, cover = altered(plain.permute(0, 3, 1, 2), torch.Generator().manual_seed(0))
@@ -52,7 +52,7 @@ def test_altered_transforms_masks_with_images():
 
 
 def test_product_features_equal_training_features():
-    """Also of a picture with a black surround, which the means leave out."""
+    """The picture has a black surround, which is excluded from the means."""
     picture = np.random.default_rng(0).integers(0, 256, (*INPUT_PX, 3)).astype(np.uint8)
     picture[:, :40] = 3
     planes = torch.from_numpy(picture.transpose(2, 0, 1)[None].astype(np.float32) / 255)

@@ -88,7 +88,7 @@ def test_baselines_copies_of_several_ages_with_masks():
 
 
 def test_baselines_ignore_pixels_outside_round_view():
-    """They equal those of other frames, so the baselines would score higher."""
+    """Pixels outside the view are equal in all frames and would raise the scores of the baselines."""
     inside = np.array([[1, 1, 0], [1, 0, 0]], np.uint8)
 
     def seen(seq, level):
@@ -150,7 +150,7 @@ def test_baselines_count_withheld_frames_and_exclude_them_from_mean():
 
 @pytest.mark.parametrize(("withheld", "previous", "after"), [("black", 100, 130), ("blur", 40, 130)])
 def test_baselines_undisplayable_image_is_not_neighbour(withheld, previous, after):
-    """The display keeps the picture before it, and so does the baseline."""
+    """The display keeps the previous picture instead of an undisplayable one, and so does the baseline."""
     odd = Frame(seq=8, pts_ns=8, image=np.full((2, 3, 3), 40, np.uint8), withheld=withheld)
     measured = measure_baselines([frame(7, 100), odd, frame(9, 120), frame(10, 130)])
     assert measured.left_out == {"withheld": 1} and measured.copies[1].frames == 2

@@ -135,7 +135,7 @@ def test_geometry_is_deterministic(folder: Path, right: Geometry) -> None:
 
 
 def test_geometry_without_ground_truth_is_none(tmp_path: Path) -> None:
-    """A recording with pictures alone has no figure, and no made-up one."""
+    """A recording without ground truth has no figures."""
     folder = synthesize(tmp_path / "plain", frames=2, fps=2, width_px=48, height_px=40, stereo=False)
     recording = open_recording(folder)
     bare = [frame.with_fields(depth=None, depth_origin=None) for frame in recording]

@@ -73,7 +73,7 @@ def test_part_shares_split_joint_change() -> None:
 
 
 def test_part_shares_do_not_count_recolouring_as_motion() -> None:
-    """A model that changes colours where the world moves explains little, and none of it is called motion."""
+    """A model that changes colours where the scene moves explains little, and no share of it is motion."""
     shares = _shares(("means",), ("sh",))
     assert shares is not None and shares.motion == pytest.approx(0, abs=1e-9) and shares.explained < 0.2
 

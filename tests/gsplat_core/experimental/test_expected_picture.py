@@ -96,7 +96,7 @@ def test_expected_picture_learns_mean_of_two_alternative_motions() -> None:
 
 
 def test_expected_picture_does_not_learn_from_masked_pixels() -> None:
-    """The right side is noise, of which nothing stays; that is learned for the whole picture where it is not masked."""
+    """The right side is noise. Without a mask, its low shares are learned for the whole picture."""
     changed = []
     for masked in (True, False):
         expected, mask, noise = ExpectedPicture(), np.ones(SIZE, np.uint8), np.random.default_rng(0)

@@ -193,7 +193,7 @@ def test_learned_prior_expected_image_scaled_to_1_and_weighted_by_tissue(monkeyp
 
 
 def test_learned_prior_without_usable_motion_predicts_nothing(monkeypatch):
-    """After a cut, say, where the expectation is that of the scene before."""
+    """For example after a cut, where the expected motion belongs to the previous scene."""
     prior = prior_of(1 / 30)
     prior._expected = object()
     monkeypatch.setattr(LearnedPrior, "_usable_motion", lambda self: None)

@@ -239,7 +239,7 @@ def test_reliefs_average_follows_changes_within_window(averaged):
 
 
 def test_reliefs_of_new_window_weighted_by_count_and_at_least_fifth(averaged):
-    """The second window begins with another relief, and without the picture before it."""
+    """The second window starts with a different relief and without the previous picture."""
     found, windows = averaged([1.0, 1.0, 4.0, 6.0], refuse=2)
     # The third picture has no relation to the second: a third of 204 and two of 101, and then its change by 2.
     expected = 101 + (204 - 101) / 3

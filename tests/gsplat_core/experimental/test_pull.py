@@ -63,7 +63,7 @@ def test_pull_along_line_of_sight_has_sign_of_motion() -> None:
 
 
 def test_pull_direction_robust_to_wrong_tracks() -> None:
-    """Some points seem to move in another direction altogether, and farther than the tissue does."""
+    """Wrongly tracked points move in a different direction and farther than the tissue."""
     rays, off, _ = pulled(6.0, 3)
     random = np.random.default_rng(8)
     wrong = random.choice(len(rays), 12, replace=False)

@@ -141,7 +141,7 @@ def test_equations_step_equals_joint_least_squares():
 
 
 def test_relief_fit_of_noise_stays_small():
-    """Noise far above the brightness of any relief: the prior keeps the relief near the plane."""
+    """With noise far above the brightness of any relief, the prior keeps the relief near the plane."""
     noise = np.random.default_rng(9).normal(0, 1.0, (32, 40))
     found = find_reliefs(GRID, [Shading(noise, ONES, 1.0, NOTHING, NOTHING)], [None]).key
     assert np.std(PLACES.value @ found) < 0.25

@@ -29,7 +29,7 @@ def test_similar_moments_empty_before_first_comparison() -> None:
 @pytest.mark.parametrize("period", [11, 17.5])
 @pytest.mark.parametrize("frames", [60, REMEMBERED + 90])
 def test_similar_moments_forecast_periodic_motion(period: float, frames: int) -> None:
-    """Far better than by the last motion, within the ring and after it was written over."""
+    """The forecast is far better than the last motion, before and after the ring buffer is overwritten."""
     moments = SimilarMoments()
     for frame in range(frames):
         moments.take(motion(frame / period))

@@ -64,7 +64,7 @@ def test_placed_agrees_with_place_cameras():
 
 
 def test_placed_returns_orthogonal_rotation():
-    """Products of many poses are no rotations any more; what is placed is one."""
+    """Products of many poses lose orthogonality; the placed pose is orthogonal."""
     points, pose, rays = scene()
     crooked = pose.copy()
     crooked[:3, :3] += 1e-3

@@ -194,7 +194,7 @@ def test_isect_tiles_independent_of_thread_count() -> None:
 @pytest.mark.parametrize("image_dims", [(1,), (), (2, 3)])
 @pytest.mark.parametrize("share", [1.3, 1.0, 0.6, 0.001, 0.0])
 def test_bin_splats_with_capacity_equals_reference(image_dims: tuple[int, ...], share: float) -> None:
-    """Unused entries in front; what does not fit is what is farthest, whole splats at a time."""
+    """Unused entries come first; on overflow the farthest splats are dropped completely."""
     here = splats(400, image_dims, median_px=8.0)[:3]
     exact = bin_splats(*here, grid(16))
     total = exact[1].numel()

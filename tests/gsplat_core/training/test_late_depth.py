@@ -62,7 +62,7 @@ def test_first_late_depth_places_scene_and_keeps_picture() -> None:
 
 @pytest.mark.slow
 def test_rehearsal_trains_on_late_depth() -> None:
-    """The slope is what placing does not give: all of the depth but the first is left to the loss."""
+    """Placing does not provide the slope: only the loss applies all depth after the first."""
     slope = np.linspace(70, 90, WIDTH, dtype=np.float32)[None, :]
 
     def error(late: bool) -> float:

@@ -175,7 +175,7 @@ def test_colour_relaxation_with_sh_is_refused_on_cuda():
 
 
 def test_colour_relaxation_follows_changing_light_with_one_step():
-    """Trained colours move by their rate, whatever the picture asks for."""
+    """Trained colours change by their learning rate, independently of the residual."""
 
     def shown_db(relaxation):
         config = ReconstructorConfig(gaussians=400, max_gaussians=400, squared_error=True)
@@ -191,7 +191,7 @@ def test_colour_relaxation_follows_changing_light_with_one_step():
 
 
 def test_published_model_at_trained_frame_equals_training_state():
-    """The motion prior does not look at every frame, and says nothing about one that it has not seen."""
+    """The motion prior does not examine every frame and predicts nothing for unexamined frames."""
     config = ReconstructorConfig(gaussians=120, max_gaussians=240, motion_prior="flow")
     made = Reconstructor(config, Camera.from_focal(40.0, WIDTH, HEIGHT), live=LiveTraining())
     for k in range(4):
@@ -305,7 +305,7 @@ def test_take_depth_accepts_newest_30_frames(newer, is_taken):
 
 
 def test_left_scene_excludes_training_on_doubtful_frame():
-    """The next scene is not taken for the left one, although the left scene was trained on its first frame."""
+    """The next scene is not mistaken for the left one, although the left scene was trained on the first frame of the next."""
     left = reconstructor()
     other = Frame(1, 33_000_000, np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8))
     left.observe(frame_at(0), budget=Budget.of_steps(10))

@@ -201,7 +201,7 @@ def test_config_selects_motion_prior() -> None:
 
 
 def test_published_snapshots_keep_own_continuation(device: str) -> None:
-    """Slots and captured frames read it where it lies, frame after frame, and show what a model of the same state computes."""
+    """Slots and captured frames read the continuation in place and show the same as a model of the same state."""
     config = ReconstructorConfig(
         gaussians=700, max_gaussians=900, motion_prior="flow", start_from_motion=True, history_s=1.0, preallocate=True
     )

@@ -205,7 +205,7 @@ def test_visibility_is_tested_every_eighth_frame_or_each_without_capacity(capaci
 
 
 def test_make_room_archives_gaussians_a_tenth_width_outside_picture(monkeypatch):
-    """Only as many as are wanted, and only after the given time."""
+    """Only the requested number of Gaussians is archived, and only after the given time."""
     camera = Camera.from_focal(100.0, 100, 80)
     pixels = torch.tensor(
         [[50.0, 40.0], [-9.0, 40.0], [-11.0, 40.0], [109.0, 40.0], [111.0, 40.0], [50.0, -9.0], [50.0, 91.0]]
@@ -316,7 +316,7 @@ def test_gaussians_without_room_stay_in_archive():
 
 @pytest.mark.parametrize("room", [0, 3, 500])
 def test_fill_new_tissue_is_limited_by_capacity(monkeypatch, room):
-    """From the archive first, if there is one."""
+    """Gaussians are taken from the archive first, if there is one."""
     calls = []
     observation, frame = seen_from(0, 2.0), frame_at(0, 0, time_s=2.0)
     wanted = torch.arange(7)

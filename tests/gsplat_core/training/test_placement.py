@@ -122,7 +122,7 @@ def test_scene_is_placed_by_second_depth_if_first_is_unusable() -> None:
 
 
 def test_live_recorded_depth_moves_scene_at_grow() -> None:
-    """The first one starts the scene; those after it wait for `grow`, so that no picture waits for them."""
+    """The first depth starts the scene; later depths wait for `grow`, so that no picture is delayed."""
     config = ReconstructorConfig(gaussians=1500, max_gaussians=2000, squared_error=True)
     reconstructor, frames = Reconstructor(config, FIRST, live=LiveTraining()), stream(1)
     reconstructor.observe(with_depth(frames[0], DEPTH_ORIGINS["measured"]), steps=8)

@@ -320,7 +320,7 @@ def test_stereo_depth_weight_is_larger_offline(monkeypatch, make_frame, camera):
 
 
 def test_queued_steps_are_settled_before_scene_is_read_or_left(make_frame, camera, monkeypatch):
-    """On a GPU they may have to be repeated."""
+    """Queued steps may have to be repeated on a GPU."""
     learning = learn([make_frame(0)], camera)
     step, settled = learning._step, []
     monkeypatch.setattr(learning._schedule, "settle", settled.append)

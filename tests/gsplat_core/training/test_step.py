@@ -15,7 +15,7 @@ from gsplat_core.training.steps.step import TrainingStep
 
 
 def still(field, **learning):
-    """Rates of 0 for Gaussians and field, but those of the field that are given."""
+    """Return rates of 0 for Gaussians and field, except for the given rates of the field."""
     none = type(FIELDS[field].rates)(**dict.fromkeys(vars(FIELDS[field].rates), 0.0))
     return LearningRates(0.0, 0.0, 0.0, 0.0, 0.0, field=dataclasses.replace(none, **learning))
 

@@ -86,7 +86,7 @@ def test_upkeep_relaxes_only_visible_gaussians(make_frame, camera):
 
 @pytest.mark.parametrize("every", [128, 400])
 def test_upkeep_relaxation_time_is_3600_steps(make_frame, camera, every):
-    """The pace is one per step, however often the scene is looked after."""
+    """The rate is one per step, independent of the number of upkeep rounds."""
     step, observation = trained(make_frame, camera)
     scene = step.gaussians
     usual = math.log(SIGMA_IN_SPACINGS * SPACING_PX * step.distance(camera) / float(camera.K[0, 0]))

@@ -91,7 +91,7 @@ def test_parallax_depth_skips_heldout_frames(settings, parallax_frames):
 
 @pytest.mark.slow
 def test_offline_reconstruction_skips_live_parallax_depth(settings, parallax_frames):
-    """Offline, training has found it before, in all frames at once."""
+    """Offline training estimates depth by parallax in all frames before the run."""
     outcome = reconstruct(settings, steps=2)
     assert depth_of(outcome).frames == {} and not any("interrupted" in note for note in outcome.notes)
     assert parallax_frames == []

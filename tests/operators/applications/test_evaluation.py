@@ -115,7 +115,7 @@ def test_interrupted_evaluation_keeps_measured_protocols(
 def test_unmeasurable_protocol_is_refused_if_requested_and_noted_otherwise(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, given: dict[str, Any], reason: str | None
 ) -> None:
-    """They are refused if asked for, noted if usual, and passed over silently for a recording with one eye."""
+    """Requested protocols are rejected, default protocols are noted, and stereo protocols of a monocular recording are skipped silently."""
     run = given["run"] if "run" in given else run_of(tmp_path, heldout=given.get("heldout", True))
     monkeypatch.setattr(evaluate, "is_live_log", lambda path: given.get("is_live", True))
     for asked in (True, False):

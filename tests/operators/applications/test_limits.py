@@ -89,7 +89,7 @@ def test_frames_to_render_refuses_more_than_a_million_frames():
 
 
 def test_replay_bytes_sums_frames_gaussians_and_field():
-    """Frames, Gaussians and the field: each of them counts, and only up to the window except offline."""
+    """Frames, Gaussians and the field are summed, limited to the window except offline."""
     size = {"width_px": 640, "height_px": 512}
     config = ReconstructorConfig(gaussians=10_000, max_gaussians=30_000, window_frames=60, motion_spacing_s=0.1)
 

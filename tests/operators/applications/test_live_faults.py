@@ -117,7 +117,7 @@ def test_live_withholds_black_frozen_torn_and_damaged_frames(watched):
 
 @pytest.mark.slow
 def test_live_keeps_model_time_monotonic_on_late_frames_and_clock_jumps(watched):
-    """Forwards by an hour, backwards by two: the model's time goes on as it did."""
+    """The clock jumps forward by one hour and back by two; the model's time continues unchanged."""
     script = Script()
     script.good(20)
     script.fault(*[{"pts_ns": script.pts_ns - late * INTERVAL_NS} for late in (6, 9)])
@@ -142,7 +142,7 @@ def test_live_keeps_model_time_monotonic_on_late_frames_and_clock_jumps(watched)
 
 @pytest.mark.slow
 def test_live_drops_duplicate_and_out_of_order_sequence_numbers(watched):
-    """Numbers that come twice, late, or begin anew are put right or dropped where the frames come in."""
+    """Duplicate, late and restarted sequence numbers are corrected or dropped at the input."""
     script = Script()
     script.good(20)
     twice = script.newest
@@ -162,7 +162,7 @@ def test_live_drops_duplicate_and_out_of_order_sequence_numbers(watched):
 
 @pytest.mark.slow
 def test_live_starts_new_scene_at_each_frame_size_change(watched):
-    """Each size begins a new scene, also where its first pictures are black."""
+    """Each size starts a new scene, even if its first pictures are black."""
     script = Script()
     script.good(20)
     sizes = (80, 64), (WIDTH, HEIGHT), (48, 72)
@@ -186,7 +186,7 @@ def test_live_starts_new_scene_at_each_frame_size_change(watched):
 
 @pytest.mark.slow
 def test_live_rejects_impossible_masks_and_unusable_depth(watched):
-    """A mask that is all tool, for a moment and for a second; one that is all tissue at once; depth of NaN, infinity and nonsense."""
+    """Masks of tool only (briefly and for a second) and of tissue only; depth of NaN, infinity and implausible values."""
     tool = np.ones((HEIGHT, WIDTH), np.uint8)
     tool[:, : WIDTH // 4] = 0
     plane = np.full((HEIGHT, WIDTH), 60.0, np.float32)
@@ -266,7 +266,7 @@ def test_live_neither_trains_on_nor_shows_out_of_body_frames(watched):
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.slow
 def test_live_recovers_from_random_mixture_of_faults(watched, seed):
-    """Any mixture, from the first frame on."""
+    """Random faults start at the first frame."""
     rng = np.random.default_rng(seed)
     script = Script(mask=lambda seq: None, depth=lambda seq: None)
     small = np.zeros((32, 40, 3), np.uint8)

@@ -176,7 +176,7 @@ def test_session_replay_reproduces_late_depth(tmp_path, depth_found):
 
 @pytest.mark.slow
 def test_session_replay_without_one_late_depth_differs_and_notes_frame(tmp_path, depth_found):
-    """The comparison can fail: without one of the depths it does, and the replay says which is not there."""
+    """Without one of the depths the comparison fails, and the replay names the missing depth."""
     assert record(tmp_path, of_two_eyes, waits_for=depth_found).find(TakenDepth).frames >= 2
     log = next((tmp_path / "session/segments").glob("*/log.jsonl"))
     first = re.search(r'"event":"take_depth","seq":(\d+),[^\n]*"tracks":(\{[^}]*\})', log.read_text())
@@ -221,7 +221,7 @@ def test_session_replay_with_ignore_schedule_differs(session):
 
 @pytest.mark.slow
 def test_session_replay_with_changed_schedule_reports_first_different_frame(session):
-    """The comparison can fail: one step more in one call, and it does."""
+    """With one additional step in one call the comparison fails."""
     logs = sorted((session / "session/segments").glob("*/log.jsonl"))
     log = next(path for path in logs if '"event":"observe"' in path.read_text())
     before, steps, after = re.split(r'("event":"observe","seq":\d+,"steps":)', log.read_text(), maxsplit=1)

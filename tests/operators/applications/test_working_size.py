@@ -129,7 +129,7 @@ def test_working_size_of_slow_machine_is_smallest_with_note_about_skipped_frames
     "times", [[0.040, 0.060, 0.020, 0.035, 0.030, 0.050], [0.02] * 6, [0.5, 0.001, 0.5, 0.001, 0.5, 0.001]]
 )
 def test_working_size_is_valid_for_inconsistent_measurements(times):
-    """Under other load a smaller picture may take longer."""
+    """A smaller picture may take longer under a different load."""
     left, asked = iter(times), []
 
     def measure(scale):

@@ -240,7 +240,7 @@ def test_interlacing_stage_repairs_both_eyes():
 
 
 def test_sharpness_stage_does_not_report_deinterlaced_frames_as_blur():
-    """The pictures without combs are compared with each other, not with the sharper ones from before combs were found."""
+    """Deinterlaced pictures are compared with each other, not with the sharper ones before deinterlacing."""
     images = [np.roll(image, 6 * k, axis=1) for k, image in enumerate(texture(1, 30, 320, 256))]
     for image, later in itertools.pairwise(images):
         image[1::2] = later[1::2]

@@ -40,7 +40,7 @@ def test_edge_counts_dropped_messages_by_policy(kit, runner, policy, received):
 
 
 def test_drop_oldest_edge_does_not_block_producer(kit, runner):
-    """A viewer never slows the graph: the source goes on while the viewer's frame is unseen."""
+    """The source continues while the consumer has not read its frame."""
     seen = threading.Event()
 
     def wire(app):

@@ -259,7 +259,7 @@ def test_sigterm_still_ends_the_process_after_a_run(runner):
     assert done.returncode == -signal.SIGTERM, done.stderr
 
 
-def test_a_greedy_scheduler_waits_until_an_operator_is_due(monkeypatch):
+def test_greedy_scheduler_waits_until_operator_is_due(monkeypatch):
     waits = []
     monkeypatch.setattr(schedulers, "interruptible_wait", lambda woken, seconds=None: waits.append(seconds))
     scheduler = GreedyScheduler(clock=SimpleNamespace(timestamp=lambda: 3_000_000_000))

@@ -67,7 +67,7 @@ def test_address_refuses_duplicate_option(query):
         ("choice", "green", None),
     ],
 )
-def test_each_kind_of_option_has_its_values(kind, text, value):
+def test_address_option_values_and_defaults_by_kind(kind, text, value):
     address = Address("cam", "0", {} if text is None else {"it": text})
     read = {
         "number": lambda: address.number("it", 3.5, 2, 9),
