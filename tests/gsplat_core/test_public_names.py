@@ -1,4 +1,4 @@
-"""The names that others may import; a change here is a change for them."""
+"""Public names and signatures; a change here breaks users."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Frames get the depth that was asked for, and the report says where it comes from."""
+"""Frames get the requested depth, and the report states its source."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A model that does not follow the pictures is noticed, shown as such, and started anew within five frames."""
+"""A model that falls behind the stream is detected, displayed as such, and restarted within five frames."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The log of displayed frames: whole lines whatever happens, and a series of bounded length."""
+"""The log of displayed frames: complete lines in any case, and a series of bounded length."""
 
 from __future__ import annotations
 

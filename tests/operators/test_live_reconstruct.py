@@ -1,4 +1,4 @@
-"""Live training: what is shown, what begins another scene though its first frame was missed, and what is done though time is short."""
+"""Live training: displayed frames, scene changes after missed frames, and work that is done despite little time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Messages refuse what would be wrong further down the graph."""
+"""Messages reject values that would fail further down the graph."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Frames get the pose that their pictures tell, and the report says how far it is to be believed."""
+"""Frames get poses estimated from their pictures, and the report states their reliability."""
 
 from __future__ import annotations
 

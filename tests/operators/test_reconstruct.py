@@ -1,4 +1,4 @@
-"""The model that a frame is shown with is the one right after that frame's own steps."""
+"""A frame is displayed with the model right after its own training steps."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A full disk is said in words, and files are whole or not there."""
+"""A full disk is reported in a sentence, and files are complete or absent."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Masks are recorded, found or left out; what a frame came with and what was done is said."""
+"""Masks are taken from the recording, found or omitted, and the report states which."""
 
 from __future__ import annotations
 

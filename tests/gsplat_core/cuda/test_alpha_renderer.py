@@ -1,4 +1,4 @@
-"""Alpha blending of published snapshots on a GPU: captured once for a slot, and always the picture of the plain way."""
+"""Alpha blending of published snapshots on a GPU: one captured graph per slot, with the result of uncaptured rendering."""
 
 from __future__ import annotations
 

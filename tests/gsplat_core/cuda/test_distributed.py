@@ -1,4 +1,4 @@
-"""Gaussians shared out over GPUs with NCCL: one GPU's pictures and gradients."""
+"""Gaussians distributed over GPUs with NCCL: equal to pictures and gradients of one GPU."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The captured training step on its own: what it learns, what a frame without room leaves alone, new tensors."""
+"""The captured training step: learning, frames that exceed the capacity, and replaced tensors."""
 
 from __future__ import annotations
 

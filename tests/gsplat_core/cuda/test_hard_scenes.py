@@ -1,4 +1,4 @@
-"""`rasterization` on CUDA in scenes that are hard on it, against the reference in float64: image, alpha and all gradients."""
+"""`rasterization` on CUDA in difficult scenes, against the reference in float64: image, alpha and all gradients."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Projection on CUDA against the reference in float64, on scenes that are ordinary and on scenes that are not."""
+"""Projection on CUDA against the reference in float64, for ordinary and invalid scenes."""
 
 from dataclasses import fields, replace
 

@@ -1,4 +1,4 @@
-"""`render` on CUDA: the frame path where no gradient is wanted, the plain ops where one is; the same picture."""
+"""`render` on CUDA: the frame path without gradients and the plain ops with gradients give the same picture."""
 
 import pytest
 import torch

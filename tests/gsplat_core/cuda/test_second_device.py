@@ -1,4 +1,4 @@
-"""A scene on the second GPU while the first one is current: the same bits as on the first, and nothing of it there."""
+"""Work on the second GPU while the first one is current: identical results, without allocations on the first."""
 
 from __future__ import annotations
 

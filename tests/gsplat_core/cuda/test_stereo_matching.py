@@ -1,4 +1,4 @@
-"""Semi-global matching on the GPU: what the CPU finds, to the bit, on any stream and in a CUDA graph."""
+"""Semi-global matching on the GPU: bit-identical to the CPU, on any stream and in a CUDA graph."""
 
 from __future__ import annotations
 

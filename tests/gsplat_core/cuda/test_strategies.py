@@ -1,4 +1,4 @@
-"""Strategies, `SelectiveAdam` and `fused_ssim` on the GPU: the CPU's values, and the same bits twice."""
+"""Strategies, `SelectiveAdam` and `fused_ssim` on the GPU: equal to the CPU, and deterministic."""
 
 import copy
 

@@ -1,4 +1,4 @@
-"""Streams and events that the library makes for a thread end with it."""
+"""CUDA streams and events that the library creates for a thread are released with the thread."""
 
 import ctypes
 import itertools

@@ -1,4 +1,4 @@
-"""The tool networks on a GPU give the CPU's masks, beside any other work."""
+"""The tool networks on a GPU give the masks of the CPU, independent of concurrent work."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A basis field that discards its past in place, compared with one that keeps everything."""
+"""A basis field that discards its history in place, compared with a field that keeps everything."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Another scene is found with its second frame; what happens within one scene is never another one."""
+"""`CutDetector`: a new scene is detected with its second frame; events within a scene are not reported as cuts."""
 
 from __future__ import annotations
 

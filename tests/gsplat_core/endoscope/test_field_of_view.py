@@ -1,4 +1,4 @@
-"""The field of view is found where there is one, stays as it is, and is found again when it changes."""
+"""`FieldOfView`: detection, stability and update of a limited field of view."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reflections are left out, and nothing that is merely bright."""
+"""`without_highlights`: reflections are excluded; merely bright tissue is kept."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Interlaced video is found and repaired; progressive video is never touched."""
+"""`Deinterlacer`: interlaced video is detected and repaired; progressive video is unchanged."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Masks that cannot be one are found; depth that is none is taken out, and the rest is kept."""
+"""`MaskCheck` and `DepthCheck`: implausible masks are reported; invalid depth is removed and the rest is kept."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A model from elsewhere makes the program open no other file, load no library and read without bound."""
+"""Untrusted ONNX files: no access to other files, no custom libraries, and bounded reading."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A user's network finds tools whatever form its output has; what does not fit is refused with a sentence, and NaN is tool."""
+"""`OnnxToolFinder`: output formats of user networks, error messages for unsupported models, and NaN treated as tool."""
 
 from __future__ import annotations
 

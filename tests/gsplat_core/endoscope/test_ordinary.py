@@ -1,4 +1,4 @@
-"""Fast detection of ordinary pictures by a few numbers, without passing any picture that the full check rejects."""
+"""`OrdinaryPictures`: a fast check that never accepts a picture that the full check rejects."""
 
 from __future__ import annotations
 

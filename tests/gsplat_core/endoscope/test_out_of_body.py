@@ -1,4 +1,4 @@
-"""The out-of-body gate withholds pictures for evidence of the outside, and never for a lack of evidence of the inside."""
+"""The out-of-body gate withholds pictures with evidence of the outside, not those without evidence of the inside."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures that are none, or not new, are found; ordinary video never is one of them."""
+"""`SequenceCheck`: black, torn, noisy and repeated pictures are reported; ordinary video never is."""
 
 from __future__ import annotations
 

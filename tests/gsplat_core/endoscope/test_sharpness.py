@@ -1,4 +1,4 @@
-"""Sudden blur and smoke are found; what is usual in a stream never is withheld, and no stretch is withheld for seconds."""
+"""`SharpnessGate`: sudden blur and smoke are reported; usual appearance is accepted, and no interval without frames lasts seconds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Times go forward: late frames are said to be late, jumps of the clock are taken out, true gaps stay."""
+"""`StreamClock`: monotonic times; late frames are reported, clock jumps removed, and true gaps kept."""
 
 from __future__ import annotations
 

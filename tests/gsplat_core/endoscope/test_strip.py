@@ -1,4 +1,4 @@
-"""Strips and text at the borders are found because they do not move; tissue is not taken for one."""
+"""`StripDetector`: static strips and text at the borders are found; tissue is not."""
 
 from __future__ import annotations
 

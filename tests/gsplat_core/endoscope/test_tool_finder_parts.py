@@ -1,4 +1,4 @@
-"""Redness, its distribution and threshold, the field of view, and tools that are held, in closed form."""
+"""Redness, its histogram and threshold, field of view, and held tools of `ToolFinder`, in closed form."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The trained network finds drawn instruments, in any size and on any of them, and nothing where there is none."""
+"""`NetworkToolFinder` finds drawn instruments in pictures of any size, and nothing on plain tissue."""
 
 from __future__ import annotations
 

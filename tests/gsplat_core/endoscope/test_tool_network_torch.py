@@ -1,4 +1,4 @@
-"""Torch runs the tool networks as OpenCV does, and refuses what it does not know."""
+"""`TorchToolNetwork` equals OpenCV, and rejects unknown operators, attributes and tensors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tools are found in pictures whose tint, brightness, size and orientation are anything, and few where there are none."""
+"""`ToolFinder` finds tools at any tint, brightness, size and orientation, with few false detections."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Retention: the last seconds again, and places that were seen twice."""
+"""Retention protocol: the last seconds, and places that were visited twice."""
 
 from __future__ import annotations
 

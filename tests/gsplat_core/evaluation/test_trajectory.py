@@ -1,4 +1,4 @@
-"""The trajectory error of ways that are known."""
+"""The trajectory error of known trajectories."""
 
 from __future__ import annotations
 

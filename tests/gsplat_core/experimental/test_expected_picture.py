@@ -1,4 +1,4 @@
-"""The picture that is expected next."""
+"""`ExpectedPicture`: prediction of the next picture."""
 
 from __future__ import annotations
 

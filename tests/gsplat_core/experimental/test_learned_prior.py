@@ -1,4 +1,4 @@
-"""The prior that learns how a stream goes on, on made-up streams."""
+"""`LearnedPrior`: prediction of the next motion on synthetic streams."""
 
 from __future__ import annotations
 

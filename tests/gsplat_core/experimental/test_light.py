@@ -1,4 +1,4 @@
-"""Depth by the scope's own light: a known surface is found, and what only looks like one is not made up."""
+"""`LightDepth`: depth of a known surface is recovered, and no relief is invented from texture."""
 
 from __future__ import annotations
 

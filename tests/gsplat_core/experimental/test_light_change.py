@@ -1,4 +1,4 @@
-"""Tissue that is followed: how its light changed is found, whatever pigment and reflections it has."""
+"""Change of illumination of tracked tissue, independent of pigment and reflections."""
 
 from __future__ import annotations
 

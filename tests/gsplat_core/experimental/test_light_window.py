@@ -1,4 +1,4 @@
-"""Pictures by the same light: which are taken, and when the relief is found anew."""
+"""`LightWindow`: which pictures are accepted, and when the relief is solved again."""
 
 from __future__ import annotations
 

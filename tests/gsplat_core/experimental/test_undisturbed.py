@@ -1,4 +1,4 @@
-"""Tissue that breathes and is pulled for a while: the pull takes no part in the motion that repeats itself."""
+"""`fitted_undisturbed`: a temporary pull does not affect the periodic motion of breathing tissue."""
 
 from __future__ import annotations
 

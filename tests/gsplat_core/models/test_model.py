@@ -1,4 +1,4 @@
-"""A published model: what it is at a time, its digest and its pictures."""
+"""`Model`: state at a time, digest and rendering."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""Slots hold a scene's published states: exact, never overwritten while held, at the same addresses while the scene grows."""
+"""`SnapshotSlots`: published states are exact, not overwritten while held, and keep their addresses while the scene grows."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Gaussians shared out over processes: one process's pictures and gradients."""
+"""Gaussians distributed over processes: equal to pictures and gradients of one process."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Faults of a real scope in the middle of a live stream: it goes on, says so, recovers by itself, and learns nothing from garbage."""
+"""Faults of a real scope in a live stream: the run continues, reports them, recovers, and does not train on faulty frames."""
 
 from __future__ import annotations
 

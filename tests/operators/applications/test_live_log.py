@@ -1,4 +1,4 @@
-"""Live figures from a run's log, and logs that are none."""
+"""Live figures from the log of a run, and invalid logs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A live session is recorded and replayed: with the recorded calls every picture comes out again, to the byte."""
+"""Replay of a recorded live session: with the recorded calls every picture is byte-identical."""
 
 from __future__ import annotations
 

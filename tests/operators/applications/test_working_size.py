@@ -1,4 +1,4 @@
-"""The size that a live run on a CPU works at is the largest that keeps up, by what is measured, and the report says so."""
+"""A live run on a CPU works at the largest size that keeps up with the stream, and reports it."""
 
 from __future__ import annotations
 

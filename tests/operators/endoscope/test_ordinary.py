@@ -1,4 +1,4 @@
-"""Frames that are not looked at closely are treated as the last one that was, and no fault gets through for it."""
+"""Frames that are not examined are treated like the last examined one, without missing faults."""
 
 from __future__ import annotations
 

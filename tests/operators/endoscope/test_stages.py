@@ -1,4 +1,4 @@
-"""Stages add fields, count by reason, and leave good video as it is; frames that are withheld teach them nothing."""
+"""Stages add fields, count by reason, and leave good video unchanged; withheld frames do not change their state."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Metadata of several messages of one compute come together by policy."""
+"""Metadata of several messages of one compute are merged by policy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Colours that mean something: error, depth, tools."""
+"""False colours of error, depth and tools."""
 
 from __future__ import annotations
 

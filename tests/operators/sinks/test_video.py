@@ -1,4 +1,4 @@
-"""The video of a run: playable or not there."""
+"""The video of a run is either playable or absent."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The video that a run leaves: complete or not there, in real time, close to what was shown."""
+"""The video file of a run: complete or absent, in real time, and close to the displayed pictures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Numbers and times of senders that are in disorder."""
+"""Sequence numbers and times of senders out of order."""
 
 from __future__ import annotations
 
