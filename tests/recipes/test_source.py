@@ -78,7 +78,7 @@ def test_options_reach_a_source_that_can_be_read_again(tmp_path):
     assert outcome.find(QualityResult).previous_frame_db > 20
 
 
-def test_the_same_frames_give_the_same_bytes(tmp_path):
+def test_same_frames_give_same_bytes(tmp_path):
     digests = {
         replay(ReplaySettings("pattern://64x48", tmp_path / name, steps_per_frame=1, max_frames=4))
         .find(QualityResult)

@@ -63,7 +63,7 @@ def test_wrong_relief_disagrees() -> None:
     assert disagreement(reduced_depth(CAMERA), reduced_depth(other, flat)) == np.inf
 
 
-def test_noise_counts_as_much_as_it_is_beside_the_relief() -> None:
+def test_disagreement_by_noise_is_relative_to_relief() -> None:
     other, random = moved_by(4.0, 0.0, 0.0), np.random.default_rng(2)
     noise = lambda share: np.exp(share * random.standard_normal((HEIGHT, WIDTH))).astype(np.float32)
     found = [
@@ -99,7 +99,7 @@ def breathing():
     return render_recording(RenderSettings(18, 160, 128, seed=0, camera="moving"))
 
 
-def test_breathing_tissue_gets_no_depth_by_parallax_in_a_stream(breathing) -> None:
+def test_stream_of_breathing_tissue_gets_no_parallax_depth(breathing) -> None:
     estimator, found = ParallaxDepth(), []
     for frame in breathing:
         bare = frame.with_fields(depth=None, depth_origin=None)
@@ -128,7 +128,7 @@ def test_offline_keeps_all_depth_if_most_maps_are_confirmed(factors: tuple[float
 
 
 @pytest.mark.parametrize("factor", [0.9, 1.05, 1.5])
-def test_disagreement_is_the_logarithm_of_a_wrong_scale_over_the_spread_of_the_relief(factor: float) -> None:
+def test_disagreement_is_log_of_scale_error_over_spread_of_relief(factor: float) -> None:
     depth = true_depth(CAMERA).astype(np.float64)
     spread = np.median(np.abs(np.log(depth) - np.median(np.log(depth))))
     found = disagreement(reduced_depth(CAMERA), reduced_depth(CAMERA, (factor * depth).astype(np.float32)))

@@ -35,12 +35,12 @@ def median_depth(found: DepthMap | None) -> float:
     return float(np.median(found.depth[found.confidence >= BELIEVED]))
 
 
-def test_it_is_found_by_name() -> None:
+def test_parallax_estimator_is_registered_by_name() -> None:
     assert isinstance(DEPTHS["parallax"](), ParallaxDepth)
 
 
 @pytest.mark.slow
-def test_depth_comes_as_soon_as_a_second_look_confirms_the_first_and_then_from_time_to_time() -> None:
+def test_stream_depth_starts_with_second_agreeing_map_then_periodically() -> None:
     found = answers(ParallaxDepth(), stream(20))
     known = [number for number, each in enumerate(found) if each is not None and each.doubt is None]
     assert found[0] is None
@@ -51,7 +51,7 @@ def test_depth_comes_as_soon_as_a_second_look_confirms_the_first_and_then_from_t
 
 
 @pytest.mark.slow
-def test_memory_does_not_grow() -> None:
+def test_key_frames_of_stream_are_bounded() -> None:
     estimator = ParallaxDepth()
     answers(estimator, stream(30, (0.006, 0.0, 0.0)))
     assert len(estimator._kept) == MOST_KEY_FRAMES
@@ -59,7 +59,7 @@ def test_memory_does_not_grow() -> None:
     assert places[-1] - places[0] > 0.1
 
 
-def test_what_is_old_leaves() -> None:
+def test_old_key_frames_are_dropped() -> None:
     estimator = ParallaxDepth()
     frames = stream(4)
     answers(estimator, frames)
@@ -68,7 +68,7 @@ def test_what_is_old_leaves() -> None:
     assert len(estimator._kept) == 1
 
 
-def test_a_new_scene_begins_anew() -> None:
+def test_new_scene_drops_key_frames() -> None:
     estimator = ParallaxDepth()
     frames = stream(6)
     answers(estimator, frames[:5])
@@ -76,7 +76,7 @@ def test_a_new_scene_begins_anew() -> None:
     assert len(estimator._kept) == 1
 
 
-def test_frames_without_poses_or_of_other_projections_have_none() -> None:
+def test_frames_without_pose_or_of_other_projection_get_no_depth() -> None:
     frames = stream(4)
     assert answers(ParallaxDepth(), [frame.with_fields(pose=None) for frame in frames]) == [None] * 4
     fisheye = Camera(FIRST.K, WIDTH, HEIGHT, model="fisheye")
@@ -84,12 +84,12 @@ def test_frames_without_poses_or_of_other_projections_have_none() -> None:
     assert [estimator.estimate(frame, fisheye) for frame in frames] == [None] * 4
 
 
-def test_a_still_scope_has_none() -> None:
+def test_still_scope_gets_no_depth() -> None:
     still = [frame.with_fields(pose=np.eye(4)) for frame in stream(5, (0.0, 0.0, 0.0))]
     assert answers(ParallaxDepth(), still) == [None] * 5
 
 
-def test_poses_that_are_wrong_are_doubted() -> None:
+def test_depth_by_wrong_poses_is_doubted() -> None:
     def across(pose: NDArray[np.float64] | None) -> NDArray[np.float64]:
         assert pose is not None
         turned = pose.copy()
@@ -101,6 +101,6 @@ def test_poses_that_are_wrong_are_doubted() -> None:
     assert all(each is None or each.doubt is not None for each in found)
 
 
-def test_the_same_stream_gives_the_same_bytes() -> None:
+def test_same_stream_gives_same_bytes() -> None:
     first, again = (answers(ParallaxDepth(), stream(8)) for _ in range(2))
     assert [each and each.depth.tobytes() for each in first] == [each and each.depth.tobytes() for each in again]

@@ -46,7 +46,7 @@ def errors(found: DepthMap) -> NDArray[np.float64]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("step", [SIDEWAYS, (0.0, 0.02, 0.0), (0.015, 0.01, 0.01)])
-def test_a_slanted_surface_is_found(step: tuple[float, float, float]) -> None:
+def test_depth_of_slanted_surface_is_accurate(step: tuple[float, float, float]) -> None:
     found = found_in(*video(8, step))
     assert found.depth.shape == found.confidence.shape == (HEIGHT, WIDTH)
     assert found.origin is DEPTH_ORIGINS["parallax"]
@@ -57,19 +57,19 @@ def test_a_slanted_surface_is_found(step: tuple[float, float, float]) -> None:
     assert np.percentile(wrong, 95) < 0.05
 
 
-def test_the_unit_is_that_of_the_poses() -> None:
+def test_depth_has_unit_of_poses() -> None:
     frames, cameras = video(8, SIDEWAYS)
     larger = [camera_at(tuple(1000 * camera.position)) for camera in cameras]  # type: ignore[arg-type]
     np.testing.assert_allclose(found_in(frames, larger).depth, 1000 * found_in(frames, cameras).depth, rtol=1e-3)
 
 
-def test_the_same_frames_give_the_same_bytes() -> None:
+def test_same_frames_give_same_bytes() -> None:
     first, again = (found_in(*video(6, SIDEWAYS)) for _ in range(2))
     assert first.depth.tobytes() == again.depth.tobytes()
     assert first.confidence.tobytes() == again.confidence.tobytes()
 
 
-def test_tools_are_not_asked() -> None:
+def test_tool_pixels_are_not_compared() -> None:
     frames, cameras = video(8, SIDEWAYS)
     mask = np.ones((HEIGHT, WIDTH), np.uint8)
     mask[40:80, 60:110] = 0
@@ -84,7 +84,7 @@ def test_tools_are_not_asked() -> None:
     assert found.confidence[42:78, 62:108].max() < BELIEVED
 
 
-def test_what_moves_by_itself_is_not_believed() -> None:
+def test_moving_object_gets_no_confident_depth() -> None:
     frames, cameras = video(8, SIDEWAYS)
     pattern = np.random.default_rng(1).integers(0, 255, (40, 40, 3), dtype=np.uint8)
     moved = []
@@ -97,7 +97,7 @@ def test_what_moves_by_itself_is_not_believed() -> None:
     assert np.median(errors(found)) < 0.02
 
 
-def test_tissue_that_moves_as_a_whole_beside_the_scope_is_believed_nowhere() -> None:
+def test_moving_tissue_gets_no_confident_depth() -> None:
     found = found_in(*video(8, (0.0, 0.02, 0.0), tissue_px=0.3))
     assert found.doubt is None
     assert found.confidence.max() < BELIEVED
@@ -105,7 +105,7 @@ def test_tissue_that_moves_as_a_whole_beside_the_scope_is_believed_nowhere() -> 
     assert np.median(found.depth) == pytest.approx(np.median(depth_of_surface()), rel=0.2)
 
 
-def test_tissue_without_texture_is_not_believed() -> None:
+def test_tissue_without_texture_gets_no_confident_depth() -> None:
     frames, cameras = video(8, SIDEWAYS)
     random = np.random.default_rng(2)
     bare = []
@@ -118,7 +118,7 @@ def test_tissue_without_texture_is_not_believed() -> None:
     assert (found.confidence[:, 90:] >= BELIEVED).mean() < 0.05
 
 
-def test_a_still_scope_that_claims_to_move() -> None:
+def test_moving_poses_of_still_pictures_are_rejected() -> None:
     still, _ = video(8, (0.0, 0.0, 0.0))
     found = found_in(still, [camera_at((0.02 * number, 0.0, 0.0)) for number in range(8)])
     assert found.doubt is not None
@@ -126,7 +126,7 @@ def test_a_still_scope_that_claims_to_move() -> None:
     assert not found.confidence.any()
 
 
-def test_a_scope_that_stands_still_or_only_turns() -> None:
+def test_scope_without_translation_gives_no_depth() -> None:
     frames, _ = video(6, SIDEWAYS)
     turned = np.eye(4)
     turned[:2, :2] = [[0.999, -0.0447], [0.0447, 0.999]]
@@ -135,7 +135,7 @@ def test_a_scope_that_stands_still_or_only_turns() -> None:
         assert found.doubt == "the scope does not move"
 
 
-def test_one_pose_that_is_an_outlier_is_left_out() -> None:
+def test_view_with_outlier_pose_is_left_out() -> None:
     frames, cameras = video(8, SIDEWAYS)
     cameras[4] = camera_at((0.02 * 4, 0.1, -0.1))
     assert np.median(errors(found_in(frames, cameras))) < 0.02
@@ -160,7 +160,7 @@ def test_wrong_poses_give_no_depth(wrong: str) -> None:
     assert not found.confidence.any()
 
 
-def test_nothing_that_can_be_followed() -> None:
+def test_pictures_without_corners_give_no_depth() -> None:
     frames, cameras = video(4, SIDEWAYS)
     nothing = np.zeros((HEIGHT, WIDTH), np.uint8)
     for blind in ({"mask": nothing}, {"loss_mask": nothing}, {"image": np.full((HEIGHT, WIDTH, 3), 90, np.uint8)}):
@@ -170,9 +170,7 @@ def test_nothing_that_can_be_followed() -> None:
 
 @pytest.mark.parametrize("upright", [False, True])
 @pytest.mark.parametrize(("width_px", "are_tracked"), [(8, False), (14, True)])
-def test_strips_of_tissue_are_tracked_from_four_pixels_within_their_edges_on(
-    width_px: int, are_tracked: bool, upright: bool
-) -> None:
+def test_corners_are_tracked_four_pixels_inside_tissue_edges(width_px: int, are_tracked: bool, upright: bool) -> None:
     frames, cameras = video(3, SIDEWAYS)
     tissue = np.zeros((HEIGHT, WIDTH), np.uint8)
     across = tissue.T if upright else tissue
@@ -182,7 +180,7 @@ def test_strips_of_tissue_are_tracked_from_four_pixels_within_their_edges_on(
     assert isinstance(explained_by_poses(views[0], views[1:]), Parallax) is are_tracked
 
 
-def test_views_are_spread_over_the_baselines() -> None:
+def test_chosen_views_are_spread_over_baselines() -> None:
     frames, cameras = video(40, (0.01, 0.0, 0.0))
     views = [view_of(frame, camera) for frame, camera in zip(frames, cameras, strict=True)]
     chosen = chosen_views(views[0], views)

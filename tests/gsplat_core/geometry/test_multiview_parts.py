@@ -27,18 +27,18 @@ def view(x, turn=0.0):
         (list(range(1, 12)), [2, 4, 6, 7, 9, 11]),
     ],
 )  # fmt: skip
-def test_six_views_from_a_tenth_of_the_longest_baseline_on(at, chosen):
+def test_chosen_views_are_six_with_at_least_tenth_of_longest_baseline(at, chosen):
     found = [each.x for each in chosen_views(view(0.0), [view(float(x)) for x in at])]
     assert found == chosen
 
 
 @pytest.mark.parametrize(("cosine", "is_taken"), [(0.71, True), (0.69, False), (-1.0, False)])
-def test_views_that_look_elsewhere_are_left_out(cosine, is_taken):
+def test_views_facing_elsewhere_are_left_out(cosine, is_taken):
     assert len(chosen_views(view(0.0), [view(5.0, np.arccos(cosine))])) == is_taken
 
 
 @pytest.mark.parametrize(("parallax_px", "count"), [(1.0, 24), (30.0, 66), (500.0, 96)])
-def test_distances_are_three_quarters_of_a_pixel_apart(parallax_px, count):
+def test_swept_distances_are_three_quarters_of_pixel_apart(parallax_px, count):
     """Expected value between corners at 1/50 and 1/100, 1.6 times farther and nearer: 0.032 - 0.00625 = 0.02575."""
     found = SimpleNamespace(inverse_depths=np.repeat([0.01, 0.02], 50), parallax_px=parallax_px, plane=0.0156)
     inverse = multiview._distances(found)
@@ -47,7 +47,7 @@ def test_distances_are_three_quarters_of_a_pixel_apart(parallax_px, count):
     np.testing.assert_allclose(np.diff(inverse), (0.032 - 0.00625) / (count - 1))
 
 
-def test_what_is_not_believed_continues_what_is_and_is_believed_by_a_fifth_at_most():
+def test_unconfident_depth_continues_confident_depth_with_confidence_at_most_a_fifth():
     inverse, confidence = np.full((40, 60), 0.5, np.float32), np.full((40, 60), 0.4, np.float32)
     inverse[:, :30], confidence[:, :30] = 0.02, 0.9
     confidence[:, 50:] = 0.1
@@ -59,7 +59,7 @@ def test_what_is_not_believed_continues_what_is_and_is_believed_by_a_fifth_at_mo
 
 
 @pytest.mark.parametrize(("side", "is_kept"), [(2, False), (3, True)])
-def test_patches_below_fourteen_of_ten_thousand_pixels_are_speckles(side, is_kept):
+def test_patches_below_fourteen_per_ten_thousand_pixels_are_speckles(side, is_kept):
     """In a picture of 5,000 pixels the limit is 7 pixels."""
     labels, confidence = np.full((50, 100), 10.0, np.float32), np.zeros((50, 100), np.float32)
     labels[20 : 20 + side, 20 : 20 + side], confidence[20 : 20 + side, 20 : 20 + side] = 14.0, 0.9
@@ -68,7 +68,7 @@ def test_patches_below_fourteen_of_ten_thousand_pixels_are_speckles(side, is_kep
 
 
 @pytest.mark.parametrize(("step", "is_kept"), [(1, True), (2, False), (-1, True), (-2, False)])
-def test_a_patch_one_and_a_half_labels_from_its_surroundings_is_no_speckle(step, is_kept):
+def test_patch_within_one_and_a_half_labels_of_surroundings_is_no_speckle(step, is_kept):
     labels, confidence = np.full((50, 100), 10.0, np.float32), np.full((50, 100), 0.8, np.float32)
     labels[20:22, 20:22] += step
     found = multiview._without_speckles(labels, confidence)
@@ -76,7 +76,7 @@ def test_a_patch_one_and_a_half_labels_from_its_surroundings_is_no_speckle(step,
 
 
 @pytest.mark.parametrize("is_right", [True, False])
-def test_the_first_depth_of_a_stream_waits_for_a_second_that_agrees(monkeypatch, is_right):
+def test_first_depth_of_stream_waits_for_agreeing_second(monkeypatch, is_right):
     """The scope slides by 1 per frame before waves. A second depth that is deep where the first is high contradicts it."""
     waves = 60 + 15 * np.sin(np.arange(64, dtype=np.float32) / 6)
     seen = iter([waves, waves if is_right else 120 - waves])
@@ -97,7 +97,7 @@ def test_the_first_depth_of_a_stream_waits_for_a_second_that_agrees(monkeypatch,
 
 
 @pytest.mark.parametrize("doubt", [None, "too dark"])
-def test_depth_without_confidence_is_doubted_and_a_doubt_stays(monkeypatch, doubt):
+def test_stream_depth_without_confident_pixels_is_doubted(monkeypatch, doubt):
     def depth_of_view(view, others, size):
         return DepthMap(np.full(size, 60, np.float32), np.zeros(size, np.float32), PARALLAX, metric=False, doubt=doubt)
 
@@ -112,7 +112,7 @@ def test_depth_without_confidence_is_doubted_and_a_doubt_stays(monkeypatch, doub
 
 
 @pytest.mark.parametrize(("size", "small"), [((80, 60), (80, 60)), ((200, 100), (100, 50)), ((100, 200), (50, 100))])
-def test_a_view_is_reduced_to_its_longest_side_and_without_what_is_no_tissue(size, small):
+def test_view_is_reduced_to_longest_side_and_masked_to_tissue(size, small):
     width, height = size
     mask, inside = np.ones((2, height, width), np.uint8)
     mask[: height // 2], inside[:, : width // 2] = 0, 0

@@ -34,7 +34,7 @@ def sweep(reference: View, others: list[View], inverse_depths: np.ndarray) -> tu
     return costs.numpy() / COST_STEPS, votes.numpy()
 
 
-def test_costs_are_least_at_the_distance_by_which_a_view_is_shifted():
+def test_costs_are_least_at_distance_of_shifted_view():
     """A wall 20 away shifts by 6 pixels for a baseline of 2, and in brighter light."""
     grey = noise()
     reference = View(grey, TISSUE, camera())
@@ -49,7 +49,7 @@ def test_costs_are_least_at_the_distance_by_which_a_view_is_shifted():
 
 
 @pytest.mark.parametrize(("deviation", "cost"), [(2.0, 0.25), (6.0, 0.05), (1.0, 0.4)])
-def test_contrast_of_two_grey_levels_correlates_by_half(deviation, cost):
+def test_contrast_of_two_grey_levels_has_half_correlation(deviation, cost):
     """Two equal pictures of variance v have the correlation v / (v + 4)."""
     checks = np.float32(100) + np.float32(deviation) * (2 * (np.indices((HEIGHT, WIDTH)).sum(0) % 2) - 1)
     view = View(checks.astype(np.uint8), TISSUE, camera())
@@ -58,7 +58,7 @@ def test_contrast_of_two_grey_levels_correlates_by_half(deviation, cost):
     assert (votes[8:-8, 8:-8, 0] == (cost < 0.2)).all()
 
 
-def test_views_do_not_count_where_three_pixels_around_are_not_all_tissue():
+def test_views_do_not_count_within_three_pixels_of_masked_pixels():
     grey, hidden = noise(), TISSUE.copy()
     hidden[:, :20] = 0
     view, masked = View(grey, TISSUE, camera()), View(grey, hidden, camera())
@@ -105,7 +105,7 @@ def track(view: Camera, off_px: np.ndarray | float = 0.0, count: int = 40, depth
 RIGHT, LEFT, TURNED = camera(2.0), camera(-1.0), camera(1.5, 0.1)
 
 
-def test_corners_get_their_depth_from_all_views(explained):
+def test_corner_depth_uses_all_views(explained):
     found = explained(track(RIGHT), track(LEFT), track(TURNED))
     np.testing.assert_allclose(1 / found.inverse_depths, DEPTHS, rtol=0.01)
     assert found.views == (0, 1, 2) and found.own_motion == 0
@@ -113,7 +113,7 @@ def test_corners_get_their_depth_from_all_views(explained):
     assert found.parallax_px == pytest.approx(FOCAL_PX * 2 / 20, rel=0.05), "in the view in which it is largest"
 
 
-def test_a_view_whose_pose_is_wrong_is_left_out_and_three_of_five_must_agree(explained):
+def test_view_with_wrong_pose_is_left_out_and_three_of_five_must_agree(explained):
     aside = np.array([0.0, 4.0])
     found = explained(track(RIGHT), track(LEFT, aside), track(TURNED))
     assert found.views == (0, 2)
@@ -125,14 +125,14 @@ def test_a_view_whose_pose_is_wrong_is_left_out_and_three_of_five_must_agree(exp
 
 
 @pytest.mark.parametrize(("count", "used"), [(23, (0,)), (24, (0, 1))])
-def test_two_dozen_corners_must_be_found_in_a_view(explained, count, used):
+def test_view_needs_two_dozen_tracked_corners(explained, count, used):
     assert explained(track(RIGHT), track(LEFT, count=count)).views == used
     if count == 23:
         assert explained(track(RIGHT, count=23)) == "too few points of the tissue can be tracked"
 
 
 @pytest.mark.parametrize(("baseline", "enough"), [(0.4, False), (0.6, True)])
-def test_a_parallax_of_one_and_a_half_pixels_is_enough(explained, baseline, enough):
+def test_parallax_of_one_and_a_half_pixels_is_sufficient(explained, baseline, enough):
     found = explained(track(camera(baseline)))
     assert (found if isinstance(found, str) else "") == (
         "" if enough else "the poses move but the pictures hardly do: there is no parallax to estimate depth from"
@@ -140,7 +140,7 @@ def test_a_parallax_of_one_and_a_half_pixels_is_enough(explained, baseline, enou
 
 
 @pytest.mark.parametrize(("off_px", "share"), [(0.55, 0.0), (1.0, 0.8 / 6.0), (1.4, 1.265 / 6.0)])
-def test_what_no_depth_explains_beyond_errors_of_poses_is_the_tissues_own_motion(explained, off_px, share):
+def test_own_motion_is_residual_beyond_pose_errors(explained, off_px, share):
     """Corners move up or down by turns, across the parallax of 6 pixels. 0.6 pixels are errors of poses and tracks."""
     up_and_down = off_px * np.stack([np.zeros(40), np.where(np.arange(40) % 2, 1, -1)], 1)
     found = explained(track(RIGHT, up_and_down))
@@ -148,13 +148,13 @@ def test_what_no_depth_explains_beyond_errors_of_poses_is_the_tissues_own_motion
 
 
 @pytest.mark.parametrize(("off_px", "explains"), [(1.35, True), (1.75, False)])
-def test_a_view_may_leave_a_quarter_of_its_parallax(explained, off_px, explains):
+def test_view_agrees_with_residual_up_to_quarter_of_parallax(explained, off_px, explains):
     up_and_down = off_px * np.stack([np.zeros(40), np.where(np.arange(40) % 2, 1, -1)], 1)
     found = explained(track(RIGHT, up_and_down))
     assert (found != multiview.CONTRADICTED) == explains
 
 
-def test_a_corner_on_something_that_moves_by_itself_is_left_out(explained):
+def test_corner_on_moving_object_is_left_out(explained):
     off_px = np.zeros((40, 2))
     off_px[:5] = [0, 3.2]
     off_px[5:8] = [0, 2.8]
@@ -162,7 +162,7 @@ def test_a_corner_on_something_that_moves_by_itself_is_left_out(explained):
     assert len(found.inverse_depths) == 35
 
 
-def test_a_corner_stays_within_a_quarter_and_four_times_the_distance_of_the_others(explained):
+def test_corner_distance_is_within_quarter_to_four_times_plane_distance(explained):
     depths = DEPTHS.copy()
     depths[:2] = 400.0, 2.0
     found = explained(track(RIGHT, depths=depths), track(LEFT, depths=depths))
@@ -195,7 +195,7 @@ def streamed(estimator: ParallaxDepth, time_s: float, x: float, **fields):
     return estimator.estimate(frame, camera(x))
 
 
-def test_depth_of_a_stream_is_estimated_five_times_per_second(compared):
+def test_stream_depth_is_estimated_five_times_per_second(compared):
     estimator = ParallaxDepth()
     for number in range(9):
         streamed(estimator, 0.09 * number, number)
@@ -203,7 +203,7 @@ def test_depth_of_a_stream_is_estimated_five_times_per_second(compared):
     assert compared[1][1] == [0, 1, 2, 3] and compared[2][1] == [0, 1, 2, 3, 4, 5, 6]
 
 
-def test_frames_of_a_stream_are_compared_with_those_of_three_seconds(compared):
+def test_stream_frames_are_compared_within_three_seconds(compared):
     estimator = ParallaxDepth()
     for number in range(6):
         streamed(estimator, 0.95 * number, number)
@@ -212,7 +212,7 @@ def test_frames_of_a_stream_are_compared_with_those_of_three_seconds(compared):
     assert len(compared) == 5, "time went back"
 
 
-def test_the_older_of_the_two_closest_of_nine_key_frames_is_removed(compared):
+def test_older_of_two_closest_of_nine_key_frames_is_removed(compared):
     estimator = ParallaxDepth()
     for number, x in enumerate([0, 3, 4, 6, 8, 10, 12, 14, 16]):
         streamed(estimator, 0.1 * number, x)
@@ -222,7 +222,7 @@ def test_the_older_of_the_two_closest_of_nine_key_frames_is_removed(compared):
     assert compared[-1] == (30, [0, 4, 6, 8, 10, 12, 14, 16]), "16.5 is nearer to 16 than any two others"
 
 
-def test_a_new_scene_and_frames_without_a_pose_are_compared_with_nothing(compared):
+def test_new_scene_and_frames_without_pose_are_not_compared(compared):
     estimator = ParallaxDepth()
     streamed(estimator, 0.0, 0.0)
     streamed(estimator, 0.3, 1.0, new_scene="cut")
@@ -241,9 +241,7 @@ def recording(count: int, apart_s: float) -> tuple[list[Frame], list[Camera]]:
 
 
 @pytest.mark.parametrize(("count", "estimated"), [(5, 5), (32, 32), (63, 32)])
-def test_at_most_32_frames_of_a_recording_get_depth_from_those_within_three_seconds(
-    compared, monkeypatch, count, estimated
-):
+def test_recording_depth_of_at_most_32_frames_uses_frames_within_three_seconds(compared, monkeypatch, count, estimated):
     monkeypatch.setattr(multiview, "agree", lambda first, second: True)
     found = ParallaxDepth().of_recording(*recording(count, 0.7))
     numbers = [frame.seq for frame in found.frames if frame.depth is not None]
@@ -253,7 +251,7 @@ def test_at_most_32_frames_of_a_recording_get_depth_from_those_within_three_seco
         assert others == [other for other in range(count) if other != x and abs(other - x) <= 4]
 
 
-def test_a_recording_of_a_still_scope_or_with_depth_stays_as_it_is(compared):
+def test_recording_of_still_scope_or_with_depth_stays_unchanged(compared):
     frames, cameras = recording(4, 0.1)
     assert ParallaxDepth().of_recording(frames, [cameras[0]] * 4).frames == frames
     frames[1] = frames[1].with_fields(depth=np.ones((HEIGHT, WIDTH), np.float32))
@@ -261,7 +259,7 @@ def test_a_recording_of_a_still_scope_or_with_depth_stays_as_it_is(compared):
 
 
 @pytest.mark.parametrize(("agreeing", "kept"), [(2, True), (1, False)])
-def test_depth_of_a_recording_is_kept_if_half_of_it_is_confirmed(compared, monkeypatch, agreeing, kept):
+def test_recording_depth_is_kept_if_half_is_confirmed(compared, monkeypatch, agreeing, kept):
     """Five frames have depth. The first agreement of two frames confirms both, each later one confirms one more."""
     answers = iter([True] * (agreeing == 2) + [False, True] + [False] * 4)
     monkeypatch.setattr(multiview, "agree", lambda first, second: next(answers))
@@ -270,7 +268,7 @@ def test_depth_of_a_recording_is_kept_if_half_of_it_is_confirmed(compared, monke
     assert found.doubts == ({} if kept else {multiview.UNCONFIRMED: 5})
 
 
-def test_reasons_why_frames_of_a_recording_have_no_depth_are_counted(monkeypatch):
+def test_reasons_for_frames_without_depth_are_counted(monkeypatch):
     def depth_of_view(view, others, size):
         x = view.camera.position[0]
         if x < 2:

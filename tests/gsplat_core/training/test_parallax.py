@@ -23,7 +23,7 @@ from tests.gsplat_core.geometry.moving_scope import (
 
 
 @pytest.mark.slow
-def test_every_frame_of_a_short_recording_gets_depth() -> None:
+def test_every_frame_of_short_recording_gets_parallax_depth() -> None:
     frames, cameras = video(6, SIDEWAYS)
     given, doubts, at_rest = ParallaxDepth().of_recording(frames, cameras)
     assert not doubts
@@ -38,7 +38,7 @@ def test_every_frame_of_a_short_recording_gets_depth() -> None:
 
 
 @pytest.mark.slow
-def test_only_what_is_believed_is_learned_from() -> None:
+def test_depth_loss_uses_confident_depth_only() -> None:
     frames, cameras = video(6, SIDEWAYS)
     frame = ParallaxDepth().of_recording(frames, cameras).frames[0]
     assert frame.depth is not None
@@ -50,14 +50,14 @@ def test_only_what_is_believed_is_learned_from() -> None:
 
 
 @pytest.mark.slow
-def test_key_frames_are_spread_over_a_long_recording(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_key_frames_are_spread_over_long_recording(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(multiview, "MOST_OFFLINE", 3)
     frames, cameras = video(9, SIDEWAYS)
     given = ParallaxDepth().of_recording(frames, cameras).frames
     assert [number for number, frame in enumerate(given) if frame.depth is not None] == [0, 4, 8]
 
 
-def test_what_is_long_ago_is_not_compared(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_more_than_longest_s_apart_are_not_compared(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(multiview, "LONGEST_S", 0.05)
     frames, cameras = video(6, SIDEWAYS)
     apart = [frame.with_fields(pts_ns=number * 100_000_000) for number, frame in enumerate(frames)]
@@ -66,7 +66,7 @@ def test_what_is_long_ago_is_not_compared(monkeypatch: pytest.MonkeyPatch) -> No
     assert all(frame.depth is None for frame in given)
 
 
-def test_wrong_poses_are_said() -> None:
+def test_wrong_poses_are_counted_as_doubts() -> None:
     frames, _ = video(6, SIDEWAYS)
     given, doubts, _ = ParallaxDepth().of_recording(
         frames, [camera_at((0.0, 0.02 * number, 0.0)) for number in range(6)]
@@ -76,7 +76,7 @@ def test_wrong_poses_are_said() -> None:
     assert any("poses" in doubt for doubt in doubts)
 
 
-def test_still_cameras_known_depth_and_other_projections_are_left_alone() -> None:
+def test_frames_with_static_camera_depth_or_other_projection_stay_unchanged() -> None:
     frames, cameras = video(4, SIDEWAYS)
     assert ParallaxDepth().of_recording(frames, [FIRST] * 4) == (frames, {}, False)
     known = [frames[0].with_fields(depth=depth_of_surface()), *frames[1:]]
@@ -86,7 +86,7 @@ def test_still_cameras_known_depth_and_other_projections_are_left_alone() -> Non
         assert ParallaxDepth().of_recording(frames, others) == (frames, {}, False)
 
 
-def test_matched_depth_becomes_a_surface_before_it_is_learned() -> None:
+def test_stereo_depth_is_smoothed_to_surface_before_training() -> None:
     frames, cameras = video(2, SIDEWAYS)
     true = depth_of_surface()
     noise_px = 0.1 * np.random.default_rng(0).standard_normal(true.shape)

@@ -30,7 +30,7 @@ from tests.gsplat_core.geometry.moving_scope import SIDEWAYS, video
 @pytest.mark.parametrize(
     ("gain_db", "dropped"), [(2 * offline.INPUT_GAIN_DB, True), (0.5 * offline.INPUT_GAIN_DB, False)]
 )
-def test_depth_and_the_right_eye_are_left_out_where_they_hurt(tmp_path, monkeypatch, gain_db, dropped):
+def test_depth_and_right_eye_are_left_out_if_validation_gains(tmp_path, monkeypatch, gain_db, dropped):
     """The scores of the validation frames are the test's; each input that is left out gains the same."""
     folder = synthesize(tmp_path / "take", frames=8, width_px=40, height_px=32)
     monkeypatch.setattr(offline, "FIRST_STEPS", 1)
@@ -50,7 +50,7 @@ def test_depth_and_the_right_eye_are_left_out_where_they_hurt(tmp_path, monkeypa
 
 
 @pytest.mark.parametrize(("trial_s", "tried"), [(7, ["depth", "right eye"]), (11, ["depth"]), (16, [])])
-def test_other_inputs_are_tried_while_they_end_early_enough(tmp_path, monkeypatch, trial_s, tried):
+def test_other_inputs_are_tried_until_half_of_time_limit(tmp_path, monkeypatch, trial_s, tried):
     """Each trial takes the test's time, of a limit of 60 s."""
     folder = synthesize(tmp_path / "take", frames=8, width_px=40, height_px=32)
     monkeypatch.setattr(offline, "FIRST_STEPS", 1)
@@ -82,7 +82,7 @@ def moving(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("gain_db", "kept"), [(2 * offline.INPUT_GAIN_DB, True), (0.5 * offline.INPUT_GAIN_DB, False)])
-def test_poses_of_a_moving_scope_are_used_where_they_help(moving, tmp_path, monkeypatch, gain_db, kept):
+def test_estimated_poses_are_used_if_validation_gains(moving, tmp_path, monkeypatch, gain_db, kept):
     """The scores of the validation frames are the test's; estimated poses gain."""
     monkeypatch.setattr(offline, "FIRST_STEPS", 1)
     monkeypatch.setattr(offline, "MOST_STEPS", 1)
@@ -99,7 +99,7 @@ def test_poses_of_a_moving_scope_are_used_where_they_help(moving, tmp_path, monk
 
 
 @pytest.mark.slow
-def test_the_path_is_estimated_while_the_first_trial_trains_and_given_up_when_it_is_late(moving, tmp_path, monkeypatch):
+def test_path_is_estimated_beside_first_trial_and_given_up_when_late(moving, tmp_path, monkeypatch):
     """It is estimated until the first trial is scored, in a limit of 60 s; each reading of the clock takes a second after that."""
     monkeypatch.setattr(offline, "FIRST_STEPS", 1)
     monkeypatch.setattr(offline, "MOST_STEPS", 1)
@@ -135,7 +135,7 @@ def test_the_path_is_estimated_while_the_first_trial_trains_and_given_up_when_it
 
 
 @pytest.mark.slow
-def test_poses_that_are_asked_for_are_those_of_all_frames(moving, tmp_path):
+def test_requested_poses_are_estimated_once_and_used_by_evaluation(moving, tmp_path):
     """Its evaluation uses them too."""
     out = tmp_path / "out"
     settings = module.ReconstructSettings(recording=moving, out=out, sinks=(), poses="estimated")
@@ -155,7 +155,7 @@ def test_poses_that_are_asked_for_are_those_of_all_frames(moving, tmp_path):
         heldout_db()
 
 
-def test_the_surround_of_a_round_view_is_neither_learned_nor_scored(tmp_path):
+def test_surround_of_round_view_is_neither_trained_on_nor_scored(tmp_path):
     size = height, width = 64, 80
     y, x = np.mgrid[:height, :width]
     inside = (x - 40) ** 2 + (y - 32) ** 2 <= 28**2
