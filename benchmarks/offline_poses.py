@@ -45,7 +45,7 @@ def main() -> None:
             began_s = time.perf_counter()
             depth = ParallaxDepth().of_recording(posed, cameras)
             line = {
-                "recording": recording.name,
+                "recording": path.parent.name if path.is_file() else path.name,
                 "size": [recording.width_px, recording.height_px],
                 "run": run,
                 "frames": len(frames),
