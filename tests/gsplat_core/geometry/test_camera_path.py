@@ -57,6 +57,19 @@ def test_camera_path_of_refuses_more_than_600_frames(frames):
         camera_path_of([frames[0]] * 601, FIRST)
 
 
+def test_camera_path_of_ends_with_exception_of_after_frame(frames):
+    tracked = []
+
+    def after_frame():
+        tracked.append(len(tracked))
+        if len(tracked) == 3:
+            raise RuntimeError("enough")
+
+    with pytest.raises(RuntimeError, match="enough"):
+        camera_path_of(frames, FIRST, after_frame)
+    assert tracked == [0, 1, 2]
+
+
 BLANK = np.zeros((8, 12, 3), np.uint8)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsplat_core.errors import RecordingInvalid
+from gsplat_core.errors import InvalidInput, RecordingInvalid
 from gsplat_core.io.bundle import load_bundle
 from gsplat_core.io.recordings import open_recording, synthesize
 from gsplat_core.training import offline
@@ -96,6 +96,21 @@ def test_estimated_poses_are_used_if_validation_gains(moving, tmp_path, monkeypa
     if kept:
         places = np.load(outcome.outputs["poses"])[:, :3, 3]
         assert places.shape == (12, 3) and np.linalg.norm(places[-1]) > 5 * np.linalg.norm(places[1])
+
+
+@pytest.mark.slow
+def test_reason_for_missing_path_is_noted_and_training_continues(moving, tmp_path, monkeypatch):
+    monkeypatch.setattr(offline, "FIRST_STEPS", 1)
+    monkeypatch.setattr(offline, "MOST_STEPS", 1)
+
+    def refused(frames, camera, after_frame):
+        raise InvalidInput("only 3 observations")
+
+    monkeypatch.setattr(module, "camera_path_of", refused)
+    settings = module.ReconstructSettings(recording=moving, out=tmp_path / "out", sinks=())
+    outcome = module.reconstruct(settings, clock=lambda: 0.0)
+    assert "no poses of the scope were estimated: only 3 observations" in outcome.notes
+    assert "poses" not in outcome.outputs and outcome.find(QualityResult).held_out.means()["psnr_tissue_db"] > 10
 
 
 @pytest.mark.slow
