@@ -44,6 +44,8 @@ once.
 LEAST_FRAMES = 31
 """Frames of a recording for a live run: a second and one more frame, since scores start after a second."""
 OFFLINE_CPU_SCALE = "0.25"
+MOST_LATE, MOST_AGE_MS = 0.005, 33
+"""Required of live runs: largest share of late frames, and largest 99th percentile of the age after the first second, in ms."""
 EQUAL_FRAMES_DB = 48.0
 """Required PSNR of held-out frames that equal their neighbours."""
 
@@ -181,6 +183,7 @@ def live_table(groups: Mapping[str, list[dict[str, Any]]]) -> str:
     head = (
         "recording", "width, px", "displayed frame (training error), dB", "previous frame, dB", "worst frame, dB", "worst difference to the previous frame, dB",
         "frames more than 1 dB below it", "late frames", "age p99, ms", "after the first second, ms", "of used frames, ms", "shown of", "withheld", "required: 3 dB above, never 1 dB below",
+        f"required: at most {MOST_LATE:.1%} late, {MOST_AGE_MS} ms after the first second".replace("%", " %"),
     )  # fmt: skip
     rows = []
     for name, results in groups.items():
@@ -192,6 +195,9 @@ def live_table(groups: Mapping[str, list[dict[str, Any]]]) -> str:
         ]
         far = [value(each, "margins.far_below") or 0 for each in results]
         met = "met" if gains and min(gains) >= 3 and max(far) == 0 else "missed"
+        late = [(value(each, "live.not_on_screen") or 0) / (value(each, "frames.ingested") or 1) for each in results]
+        ages_ms = [value(each, "live.settled_age_p99_ms") or math.inf for each in results]
+        prompt = "met" if max(late) <= MOST_LATE and max(ages_ms) <= MOST_AGE_MS else "missed"
         rows.append(
             (
                 f"`{name}`",
@@ -208,6 +214,7 @@ def live_table(groups: Mapping[str, list[dict[str, Any]]]) -> str:
                 f"{cell(results, 'live.pictures', digits=0)} of {cell(results[:1], 'frames.ingested', digits=0)}",
                 withheld(results),
                 met,
+                prompt,
             )
         )
     return table(head, rows)

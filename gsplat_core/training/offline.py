@@ -627,12 +627,12 @@ def choose_steps(
 
 
 def _per_step_s(trials: Sequence[Trial]) -> float:
-    """Return the expected time in seconds of further steps, by the last two trials. Trainings also take time that does not grow with
-    the number of steps, as when Gaussians are added."""
+    """Return the expected time in seconds of a further step, by the last two trials. Trainings also take time that does not grow with
+    the number of steps, as when Gaussians are added. If the first of the two was slowed down, it is the mean time of the last one."""
     last = trials[-1]
     mean_s = last.seconds / last.steps
     if len(trials) == 1:
         return mean_s
     before = trials[-2]
     grown_s = (last.seconds - before.seconds) / (last.steps - before.steps)
-    return max(0.0, min(grown_s, mean_s))
+    return grown_s if 0 < grown_s < mean_s else mean_s

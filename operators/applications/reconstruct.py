@@ -388,15 +388,14 @@ class _Fitting:
         except InvalidInput as error:
             self._notes.append(f"no poses of the scope were estimated: {error}")
             return None
-        posed = None if path is None else _posed(inputs, path)
-        if posed is None or is_late():
+        if path is None or is_late():
             if not self._is_stopped and not self._stop_requested():
                 self._notes.append(
                     "the scope moves, but the time limit left no time to try estimated poses; --minutes raises it"
                 )
             return None
-        self._posed_inputs = posed
-        return posed
+        self._posed_inputs = _posed(inputs, path)
+        return self._posed_inputs
 
     def _with_poses_only(self, inputs: _Inputs, is_late: IsLate) -> _Inputs | None:
         """Return inputs with estimated poses but without the depth that these poses provide. None if no poses were estimated, if

@@ -15,7 +15,7 @@ from gsplat_core.reference import plane_sweep as reference
 
 SIDE = st.sampled_from([1, 2, 3, 4, 5, 6, 7, 8, 9, 13, 16, 21, 33])
 ROUNDING = 0.5 / COST_STEPS + 2e-4
-"""Of a cost: half a unit, and the error of float32 positions times the steepest gradient."""
+"""Tolerance of a cost: half an integer unit, and the error that float32 positions cause at the steepest gradient."""
 
 
 def noise(*size: int, seed: int = 0, blur: int = 1) -> torch.Tensor:

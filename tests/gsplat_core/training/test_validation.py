@@ -66,18 +66,28 @@ def test_choose_steps_excludes_growth_time_from_step_time():
     assert training.steps == [500, 1000, 2000, 4000] and chosen.steps == 8000
 
 
-def test_choose_steps_after_slower_first_trial_stays_within_limit():
-    """As on a GPU, on which the first trial loads the kernels: the time of more steps is unknown, and the search stays within the limit."""
-    training = Training([30.0 + k for k in range(20)], step_s=0.002, growth_s=10.0)
+def test_choose_steps_after_slower_earlier_trial_expects_mean_time_of_last_steps():
+    """The third trial, 12 s, is faster than the second, 14 s: two further trainings of 4,000 steps are expected to take 24 s each."""
+    training = Training([30.0 + k for k in range(20)], step_s=0.001)
 
     def train(steps):
-        trained = training(steps)
-        training.growth_s = 0.0
-        return trained
+        training.growth_s = 13.0 if steps == 1000 else 10.0
+        return training(steps)
 
-    chosen = choose_steps(train, 60, training.clock)
-    assert training.steps == [500, 1000, 2000, 4000, 8000]
-    assert training.now_s + chosen.steps * training.step_s <= 60
+    assert choose_steps(train, 66.5, training.clock).steps == 4000
+    assert training.steps == [500, 1000, 2000]
+
+
+def test_choose_steps_after_slower_last_trial_expects_mean_time_of_its_steps():
+    """After the second trial, 12 s, further 1,000 steps are expected to take another 12 s, so that 2,000 steps fit into the limit once."""
+    training = Training([30.0 + k for k in range(20)], step_s=0.002)
+
+    def train(steps):
+        training.growth_s = 10.0 if steps == 1000 else 0.0
+        return training(steps)
+
+    assert choose_steps(train, 40, training.clock).steps == 2000
+    assert training.steps == [500, 1000]
 
 
 def test_choose_steps_counts_time_spent_before():

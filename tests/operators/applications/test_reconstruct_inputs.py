@@ -114,6 +114,27 @@ def test_reason_for_missing_path_is_noted_and_training_continues(moving, tmp_pat
 
 
 @pytest.mark.slow
+def test_poses_are_not_tried_if_path_is_complete_after_half_of_limit(moving, tmp_path, monkeypatch):
+    """The first trial takes 31 s of 60 s, by the clock of the test."""
+    monkeypatch.setattr(offline, "FIRST_STEPS", 1)
+    monkeypatch.setattr(offline, "MOST_STEPS", 1)
+    now_s, scored = 0.0, []
+
+    def score(learned, frames):
+        nonlocal now_s
+        now_s += 31.0
+        scored.append(frames[0].pose)
+        return 30.0
+
+    monkeypatch.setattr(module, "validation_psnr_db", score)
+    monkeypatch.setattr(module._PathAhead, "awaited", lambda self, is_late, progress: self._path.result())
+    settings = module.ReconstructSettings(recording=moving, out=tmp_path / "out", sinks=(), minutes=1.0)
+    outcome = module.reconstruct(settings, clock=lambda: now_s)
+    assert scored == [None] and "poses" not in outcome.outputs
+    assert any("no time to try estimated poses" in note for note in outcome.notes)
+
+
+@pytest.mark.slow
 def test_path_is_estimated_beside_first_trial_and_given_up_when_late(moving, tmp_path, monkeypatch):
     """It is estimated until the first trial is scored, in a limit of 60 s; each reading of the clock takes a second after that."""
     monkeypatch.setattr(offline, "FIRST_STEPS", 1)

@@ -111,7 +111,7 @@ def test_capture_starts_no_child_process(kind, video_url, tmp_path):
 
 
 def test_capture_opens_every_scheme_with_process_option_false(monkeypatch):
-    """By default, blocking sources such as cameras run in a child process."""
+    """A capture process opens cameras itself; elsewhere they are opened in a child process."""
     opened = []
 
     def opens(rest, options):
