@@ -66,28 +66,26 @@ def test_choose_steps_excludes_growth_time_from_step_time():
     assert training.steps == [500, 1000, 2000, 4000] and chosen.steps == 8000
 
 
-def test_choose_steps_after_slower_earlier_trial_expects_mean_time_of_last_steps():
-    """The third trial, 12 s, is faster than the second, 14 s: two further trainings of 4,000 steps are expected to take 24 s each."""
-    training = Training([30.0 + k for k in range(20)], step_s=0.001)
+@pytest.mark.parametrize(
+    ("step_s", "paused_s", "other_s", "limit_s", "trials"),
+    [
+        # The third trial (12 s) is faster than the second one (14 s): each further training of 4,000 steps may take 24 s.
+        (0.001, 13.0, 10.0, 66.5, [500, 1000, 2000]),
+        # The second trial (12 s) is slower per step than the first one (1 s): each training of 2,000 steps may take 24 s.
+        (0.002, 10.0, 0.0, 40.0, [500, 1000]),
+    ],
+)
+def test_choose_steps_expects_mean_time_of_last_steps_if_second_trial_pauses(
+    step_s, paused_s, other_s, limit_s, trials
+):
+    training = Training([30.0 + k for k in range(20)], step_s)
 
     def train(steps):
-        training.growth_s = 13.0 if steps == 1000 else 10.0
+        training.growth_s = paused_s if steps == 1000 else other_s
         return training(steps)
 
-    assert choose_steps(train, 66.5, training.clock).steps == 4000
-    assert training.steps == [500, 1000, 2000]
-
-
-def test_choose_steps_after_slower_last_trial_expects_mean_time_of_its_steps():
-    """After the second trial, 12 s, further 1,000 steps are expected to take another 12 s, so that 2,000 steps fit into the limit once."""
-    training = Training([30.0 + k for k in range(20)], step_s=0.002)
-
-    def train(steps):
-        training.growth_s = 10.0 if steps == 1000 else 0.0
-        return training(steps)
-
-    assert choose_steps(train, 40, training.clock).steps == 2000
-    assert training.steps == [500, 1000]
+    assert choose_steps(train, limit_s, training.clock).steps == 2 * trials[-1]
+    assert training.steps == trials
 
 
 def test_choose_steps_counts_time_spent_before():
