@@ -10,8 +10,8 @@ set -uo pipefail
 cd "$(dirname "$0")/.."
 out=$(realpath -m "$1") runs=${2:-3} recordings=$(realpath "${INTRASPLAT_RECORDINGS:?names the folder of the recordings}")
 python=${PYTHON:-python3}
-# Offline recordings that the first GPU takes before its live runs.
-first=(cutting heart others/organ_still)
+# Offline recordings that the first GPU takes before its live runs: those whose choice of poses takes the longest, and the shortest.
+first=(others/laparoscopy others/resting_bowel others/organ_still)
 mkdir -p "$out"
 export PYTHONPATH=$PWD${PYTHONPATH:+:$PYTHONPATH} PYTHONUNBUFFERED=1
 benchmarks/gpu_build.sh > "$out/build.txt" 2>&1 || exit 1
