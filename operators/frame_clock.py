@@ -201,16 +201,22 @@ class FrameClock:
         waited_ns = self.now_ns() - frame.arrived_ns
         return not keeps_up or waited_ns > (self.settings.catch_up_intervals or CATCH_UP_INTERVALS) * self.interval_ns
 
-    def published(self, taken_ns: int, published_ns: int, steps: int = 0, step_ns: float = 0.0) -> None:
-        """Record the publication of a model, to update the average training time.
+    def published(
+        self, taken_ns: int, published_ns: int, steps: int = 0, step_ns: float = 0.0, *, first: bool = False
+    ) -> None:
+        """Record the publication of a model, which `wait_until_shown` then waits for, and update the average training time.
 
         Args:
             taken_ns: time at which training dequeued the frame.
             published_ns: time of publication.
             steps: optimiser steps on the frame.
             step_ns: duration of one step; steps above the minimum are subtracted.
+            first: the frame is the first of a scene. It also takes the time to create the scene, so the average does not
+                include it.
         """
         self._shown.clear()
+        if first:
+            return
         spared_ns = max(0, steps - self.least_steps(behind=True)) * step_ns
         needed_ns = max(0.0, published_ns - taken_ns - spared_ns)
         self.training_ns += DISPLAY_DECAY * (needed_ns - self.training_ns)

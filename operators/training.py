@@ -327,8 +327,7 @@ class UntilDisplay(Training):
             # The initialisation of a scene already covers its first frame.
             self._since_grown = 0 if first else self._since_grown + 1
         published_ns = self._clock.now_ns()
-        if not first:
-            self._clock.published(taken_ns, published_ns, shown.steps, learner.reconstructor.step_ns)
+        self._clock.published(taken_ns, published_ns, shown.steps, learner.reconstructor.step_ns, first=first)
         return replace(shown, taken_ns=taken_ns, published_ns=published_ns)
 
     def rest(self, frame: Frame, learner: Learner, frame_waits: Callable[[], bool]) -> None:

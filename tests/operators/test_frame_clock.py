@@ -140,6 +140,13 @@ def test_too_late_depends_on_duration_of_fewest_steps(frame, fake_time):
     assert clock.too_late(frame(0, arrived_ns=fake_time.ns), waiting=1)
 
 
+def test_first_frame_of_scene_does_not_count_in_training_time(clock):
+    clock.published(0, 90_000_000, steps=5, step_ns=1e6, first=True)
+    assert clock.training_ns == 0.0
+    clock.published(0, 10_000_000, steps=1, step_ns=1e6)
+    assert clock.training_ns == pytest.approx(2e6)
+
+
 def test_frame_is_too_late_after_catch_up_intervals(frame, fake_time):
     clock = FrameClock(ClockSettings(catch_up_intervals=2.0), 30.0, fake_time)
     arrived_ns = fake_time.ns

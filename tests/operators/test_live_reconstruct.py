@@ -274,6 +274,15 @@ def test_training_waits_until_picture_is_shown(waits, frame, compute_queued):
     assert kinds[:2] == ["observe", "wait"] and kinds.count("wait") == 1
 
 
+def test_picture_of_every_frame_is_waited_for_also_of_first_one_of_scene(live, one_by_one):
+    awaited = []
+    live.clock.wait_until_shown = lambda: awaited.append(not live.clock._shown.is_set())
+    for seq, scene in enumerate([{}, {}, {"new_scene": "cut", "scene": 1}, {"scene": 1}]):
+        one_by_one((seq, scene))
+        live.clock.shown(live.time.ns, live.time.ns)
+    assert awaited == [True] * 4
+
+
 def test_queued_frame_is_trained_on_before_wait_and_rehearsal(waits, frame, compute_queued):
     waits.time.pass_ms(33)
     came = [arrived(frame, waits, seq) for seq in range(3)]
