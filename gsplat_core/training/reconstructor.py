@@ -306,8 +306,6 @@ class Reconstructor:
         self._schedule.forget()
         self._motion.forget()
         self._covering.forget()
-        if self._growth is not None:
-            self._growth.forget()
         self.eyes.forget()
         self._window = ObservationWindow(self.config.window_frames, self._seed)
 

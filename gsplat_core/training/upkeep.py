@@ -209,8 +209,8 @@ class PostponedGrowth:
         self._config, self._covering = config, covering
         self._out_of_view = OutOfView(config.max_gaussians, device) if config.preallocate else None
         self._upkeep: Upkeep | None = None
-        self._camera_before: Camera | None = None
-        """Camera at the last search for tissue that came into view."""
+        self._camera_before: Camera
+        """Camera of the scene's first frame, or at the last search for tissue that came into view."""
 
     @property
     def archived(self) -> int:
@@ -225,19 +225,14 @@ class PostponedGrowth:
         if self._out_of_view is not None:
             self._out_of_view.restart()
         self._upkeep = None if self._config.history_s is None else Upkeep(camera, self._config)
-
-    def forget(self) -> None:
-        """Discard the previous camera when the stream leaves the scene."""
-        self._camera_before = None
+        self._camera_before = camera
 
     def prepare(self, step: TrainingStep, frame: Frame, observation: Observation, motion: Following) -> None:
         """Fill tissue that came into view because the camera moved or because the motion prior moved the scene away
-        from an edge. Called before the first training step on the newest frame.
+        from an edge. Called before the first training step on every frame but the first of a scene.
         """
         before, camera = self._camera_before, observation.camera
-        if before is None:
-            self._camera_before = camera
-        elif before != camera and has_moved(camera, before, step.distance(camera)):
+        if before != camera and has_moved(camera, before, step.distance(camera)):
             self._camera_before = camera
             fill_new_tissue(step, frame, observation, before, self._config, self._out_of_view)
         if motion.has_revealed(REVEALED_SHARE * camera.width_px):
