@@ -40,6 +40,8 @@ if [ "$(nvidia-smi --list-gpus | wc -l)" -gt 1 ]; then
   beside=$!
   (export CUDA_VISIBLE_DEVICES=0; taskset -cp "0-$((half - 1))" "$BASHPID" > /dev/null; first && live)
   wait "$beside"
+  # Tests that need a second GPU, which each half of the machine lacked.
+  "$python" -m pytest -q -m cuda -rs tests/gsplat_core/cuda/test_{distributed,second_device,plain_chain}.py > "$out/tests_two.txt" 2>&1
 else
   tests
   rooms

@@ -4,25 +4,19 @@ from __future__ import annotations
 
 import platform
 import shlex
-import subprocess
 import sys
 from datetime import UTC, datetime
 from pathlib import Path
 
+from suite import commit
+
 
 def run_facts() -> dict[str, str]:
-    """Return the facts of this process. A commit with local changes ends with `+`."""
-    here = Path(__file__).resolve().parent
-    git = lambda *words: subprocess.run(
-        ["git", *words], cwd=here, capture_output=True, text=True, check=True
-    ).stdout.strip()
-    changed = git(
-        "status", "--porcelain", "--untracked-files=no", "--", ":/gsplat_core", ":/operators", ":/benchmarks/*.py"
-    )
+    """Return the facts of this process."""
     script = Path(sys.argv[0]).name
     return {
         "command": shlex.join(["python", f"benchmarks/{script}", *sys.argv[1:]]),
-        "commit": git("rev-parse", "--short=12", "HEAD") + ("+" if changed else ""),
+        "commit": commit(),
         "machine": _processor(),
         "date": datetime.now(UTC).strftime("%Y-%m-%dT%H:%MZ"),
     }
