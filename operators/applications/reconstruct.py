@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
@@ -64,10 +63,12 @@ from operators.storage import storage_errors
 
 MINUTES_ON_GPU, MINUTES_ON_CPU = 0.75, 10.0
 """Time limits in minutes of an offline reconstruction that chooses its number of optimiser steps automatically."""
-ALTERNATIVES_UNTIL = 0.5
+ALTERNATIVES_UNTIL = 0.6
 """Share of the time limit at which the last trial of other inputs (poses, depth, eyes) must be expected to end."""
-POLL_S = 0.05
-"""Time between two checks for a stop request and for the time limit while the path of the scope is awaited, in seconds."""
+TRACKING_SHARE, LEAST_TRACKED = 0.7, 0.1
+"""Share of the duration of a path's estimation in which points are tracked, and share of the frames to be tracked before the
+duration is extrapolated from them.
+"""
 
 
 @dataclass(frozen=True)
@@ -111,8 +112,10 @@ class FittedModel:
         return model
 
 
-IsLate = Callable[[], bool]
-"""Function that returns True if a further trial would end too late, or if a stop was requested."""
+IsLate = Callable[[float], bool]
+"""Function that returns True if a further trial that begins in so many seconds is expected to end too late, or if a stop was
+requested.
+"""
 
 
 class _StopFitting(Exception):
@@ -242,39 +245,6 @@ class _Inputs:
         return chosen
 
 
-class _PathAhead:
-    """Estimation of the scope's path in a thread, while the first trial trains."""
-
-    def __init__(self, inputs: _Inputs) -> None:
-        self._is_given_up = False
-        self._done, self._total = 0, len(inputs.given.frames)
-        self._pool = ThreadPoolExecutor(1, thread_name_prefix="path ahead")
-        self._path = self._pool.submit(
-            camera_path_of, inputs.given.frames, inputs.source.description.camera, after_frame=self._count
-        )
-
-    def _count(self) -> None:
-        self._done += 1
-        if self._is_given_up:
-            raise _StopFitting
-
-    def awaited(self, is_late: IsLate, progress: ProgressCallback | None) -> CameraPath | None:
-        """Wait for the path and return it; None if `is_late` returns True before. Raises InvalidInput as `camera_path_of`."""
-        while not self._path.done():
-            if is_late():
-                return None
-            if progress is not None:
-                # After the last frame is tracked, its pose and those of the others are still refined.
-                progress(Progress("poses", min(self._done, self._total - 1), self._total))
-            wait([self._path], POLL_S)
-        return self._path.result()
-
-    def give_up(self) -> None:
-        """End the estimation soon if it is not complete."""
-        self._is_given_up = True
-        self._pool.shutdown(wait=False)
-
-
 class _Fitting:
     """Offline training of one model: choice of inputs and optimiser steps by validation, then training on all training
     frames of a source. Notes for the report are added to `notes`."""
@@ -293,8 +263,6 @@ class _Fitting:
         self._begin_s = clock()
         self._learning: Reconstructor | None = None
         self._is_stopped = False
-        self._path: _PathAhead | None = None
-        """Estimation of the scope's path while alternatives are tried; None if the scope is at rest or there are poses."""
         self._posed_inputs: _Inputs | None = None
         """Inputs with estimated poses while alternatives are tried; None if none were estimated."""
         self._setup_s = 0.0
@@ -338,14 +306,8 @@ class _Fitting:
         if len(inputs.validating) < LEAST_FRAMES:
             return inputs, ChosenSteps(USUAL_STEPS, (), "few frames")
         limit_s = 60 * self._minutes
-        if not inputs.have_poses and rigid_share(inputs.given.frames) >= MOVING_SHARE:
-            self._path = _PathAhead(inputs)
-        try:
-            inputs, first, learned = self._best_inputs(inputs, ALTERNATIVES_UNTIL * limit_s)
-        finally:
-            if self._path is not None:
-                self._path.give_up()
-            self._path = self._posed_inputs = None  # frees the frames that they hold
+        inputs, first, learned = self._best_inputs(inputs, ALTERNATIVES_UNTIL * limit_s)
+        self._posed_inputs = None  # frees the frames that they hold
         spent_s = self._clock() - self._begin_s
         chosen = choose_steps(self._trial(inputs), limit_s, self._clock, spent_s, first)
         if len(chosen.trials) == 1 and not self._is_stopped:
@@ -358,8 +320,8 @@ class _Fitting:
         first = trial_of(self._trial(inputs), offline.FIRST_STEPS, self._clock)
         learned = self._learning
 
-        def is_late() -> bool:
-            ends_s = self._clock() - self._begin_s + first.duration_s
+        def is_late(in_s: float) -> bool:
+            ends_s = self._clock() - self._begin_s + in_s + first.duration_s
             return self._is_stopped or self._stop_requested() or ends_s > until_s
 
         for reason, other_than in (
@@ -380,15 +342,31 @@ class _Fitting:
 
     def _with_poses(self, inputs: _Inputs, is_late: IsLate) -> _Inputs | None:
         """Return inputs with estimated poses; None if there are poses, the scope is at rest, the poses cannot be estimated or it
-        becomes too late to try them."""
-        if self._path is None:
+        is expected to be too late to try them then."""
+        frames = inputs.given.frames
+        if inputs.have_poses or rigid_share(frames) < MOVING_SHARE:
             return None
+        begin_s, tracked = self._clock(), 0
+
+        def after_frame() -> None:
+            nonlocal tracked
+            tracked += 1
+            if self._progress is not None:
+                # After the last frame is tracked, its pose and those of the others are still refined.
+                self._progress(Progress("poses", min(tracked, len(frames) - 1), len(frames)))
+            spent_s = self._clock() - begin_s
+            share = TRACKING_SHARE * tracked / len(frames)
+            if is_late(spent_s / share - spent_s if tracked >= LEAST_TRACKED * len(frames) else 0.0):
+                raise _StopFitting
+
         try:
-            path = self._path.awaited(is_late, self._progress)
+            path = camera_path_of(frames, inputs.source.description.camera, after_frame)
         except InvalidInput as error:
             self._notes.append(f"no poses of the scope were estimated: {error}")
             return None
-        if path is None or is_late():
+        except _StopFitting:
+            path = None
+        if path is None or is_late(0.0):
             if not self._is_stopped and not self._stop_requested():
                 self._notes.append(
                     "the scope moves, but the time limit left no time to try estimated poses; --minutes raises it"
@@ -460,14 +438,14 @@ def _posed(inputs: _Inputs, path: CameraPath) -> _Inputs:
 
 def _without_depth(inputs: _Inputs, is_late: IsLate) -> _Inputs | None:
     """Return inputs without depth; None if there is none, or if it is too late."""
-    if not inputs.have_depth or inputs.settings.depth == "none" or is_late():
+    if not inputs.have_depth or inputs.settings.depth == "none" or is_late(0.0):
         return None
     return _Inputs(inputs.source, replace(inputs.settings, depth="none"), inputs.path)
 
 
 def _left_eye(inputs: _Inputs, is_late: IsLate) -> _Inputs | None:
     """Return inputs without the right eye; None if it is not used, or if it is too late."""
-    if inputs.settings.eyes != "both" or is_late():
+    if inputs.settings.eyes != "both" or is_late(0.0):
         return None
     return _Inputs(inputs.source, replace(inputs.settings, eyes="left"), inputs.path)
 

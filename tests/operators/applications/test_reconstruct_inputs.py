@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import threading
 
 import cv2
 import numpy as np
@@ -49,8 +48,8 @@ def test_depth_and_right_eye_are_left_out_if_validation_gains(tmp_path, monkeypa
     assert run["eyes"] == ("left" if dropped else "both")
 
 
-@pytest.mark.parametrize(("trial_s", "tried"), [(7, ["depth", "right eye"]), (11, ["depth"]), (16, [])])
-def test_other_inputs_are_tried_until_half_of_time_limit(tmp_path, monkeypatch, trial_s, tried):
+@pytest.mark.parametrize(("trial_s", "tried"), [(9, ["depth", "right eye"]), (13, ["depth"]), (19, [])])
+def test_other_inputs_are_tried_until_share_of_time_limit(tmp_path, monkeypatch, trial_s, tried):
     """Each trial takes the test's time, of a limit of 60 s."""
     folder = synthesize(tmp_path / "take", frames=8, width_px=40, height_px=32)
     monkeypatch.setattr(offline, "FIRST_STEPS", 1)
@@ -114,60 +113,67 @@ def test_reason_for_missing_path_is_noted_and_training_continues(moving, tmp_pat
 
 
 @pytest.mark.slow
-def test_poses_are_not_tried_if_path_is_complete_after_half_of_limit(moving, tmp_path, monkeypatch):
-    """The first trial takes 31 s of 60 s, by the clock of the test."""
+@pytest.mark.parametrize(
+    ("trial_s", "frame_s", "refined_s", "tracked"),
+    [
+        (5.0, 1.0, 4.0, 10),  # the trial with poses is expected to end after 24 of 36 s
+        (5.0, 1.0, 30.0, 10),  # refinement took too long
+        (5.0, 1.9, 0.0, 1),  # expected to end after 5 + 10 * 1.9 / 0.7 + 5 s
+        (19.0, 0.0, 0.0, 1),
+    ],
+)
+def test_poses_are_tried_if_trial_is_expected_to_end_in_time(
+    moving, tmp_path, monkeypatch, trial_s, frame_s, refined_s, tracked
+):
+    """By the clock of the test, each trial takes `trial_s` of a limit of 60 s, and tracking points in a frame `frame_s`."""
     monkeypatch.setattr(offline, "FIRST_STEPS", 1)
     monkeypatch.setattr(offline, "MOST_STEPS", 1)
-    now_s, scored = 0.0, []
+    now_s, scored, done = 0.0, [], 0
+    estimate = module.camera_path_of
+
+    def timed(frames, camera, after_frame):
+        nonlocal now_s
+
+        def count():
+            nonlocal now_s, done
+            now_s += frame_s
+            done += 1
+            after_frame()
+
+        path = estimate(frames, camera, count)
+        now_s += refined_s
+        return path
 
     def score(learned, frames):
         nonlocal now_s
-        now_s += 31.0
-        scored.append(frames[0].pose)
+        now_s += trial_s
+        scored.append(frames[0].pose is not None)
         return 30.0
 
+    monkeypatch.setattr(module, "camera_path_of", timed)
     monkeypatch.setattr(module, "validation_psnr_db", score)
-    monkeypatch.setattr(module._PathAhead, "awaited", lambda self, is_late, progress: self._path.result())
     settings = module.ReconstructSettings(recording=moving, out=tmp_path / "out", sinks=(), minutes=1.0)
-    outcome = module.reconstruct(settings, clock=lambda: now_s)
-    assert scored == [None] and "poses" not in outcome.outputs
-    assert any("no time to try estimated poses" in note for note in outcome.notes)
+    shown = []
+    outcome = module.reconstruct(settings, progress=lambda each: shown.append(each), clock=lambda: now_s)
+    expected = tracked == 10 and refined_s < 10
+    assert done == tracked and any(scored) == expected
+    assert [each.done for each in shown if each.stage == "poses"] == [1, 2, 3, 4, 5, 6, 7, 8, 9, 9][:tracked]
+    assert any("no time to try estimated poses; --minutes raises it" in note for note in outcome.notes) != expected
 
 
 @pytest.mark.slow
-def test_path_is_estimated_beside_first_trial_and_given_up_when_late(moving, tmp_path, monkeypatch):
-    """It is estimated until the first trial is scored, in a limit of 60 s; each reading of the clock takes a second after that."""
+def test_stop_request_ends_estimation_of_path(moving, tmp_path, monkeypatch):
     monkeypatch.setattr(offline, "FIRST_STEPS", 1)
-    monkeypatch.setattr(offline, "MOST_STEPS", 1)
-    began, ended, now_s = threading.Event(), threading.Event(), 0.0
+    tracked = 0
 
-    def endless(frames, camera, after_frame):
-        began.set()
-        try:
-            while True:
-                after_frame()
-                ended.wait(0.01)
-        finally:
-            ended.set()
+    def noted(each):
+        nonlocal tracked
+        tracked += each.stage == "poses"
 
-    def score(learned, frames):
-        assert began.wait(10.0) and not ended.is_set() and frames[0].pose is None
-        return 30.0
-
-    def clock():
-        nonlocal now_s
-        now_s += began.is_set()
-        return now_s
-
-    monkeypatch.setattr(module, "camera_path_of", endless)
-    monkeypatch.setattr(module, "validation_psnr_db", score)
-    settings = module.ReconstructSettings(recording=moving, out=tmp_path / "out", sinks=(), minutes=1.0)
-    stages = set()
-    outcome = module.reconstruct(settings, progress=lambda each: stages.add(each.stage), clock=clock)
-    assert ended.wait(10.0), "it was not given up"
-    assert stages == {"validate", "poses", "train", "evaluate"}
-    assert any("no time to try estimated poses; --minutes raises it" in note for note in outcome.notes)
-    assert "poses" not in outcome.outputs
+    settings = module.ReconstructSettings(recording=moving, out=tmp_path / "out", sinks=())
+    outcome = module.reconstruct(settings, progress=noted, stop_requested=lambda: tracked > 2, clock=lambda: 0.0)
+    assert tracked == 3 and outcome.interrupted
+    assert not any("estimated poses" in note for note in outcome.notes), outcome.notes
 
 
 @pytest.mark.slow
