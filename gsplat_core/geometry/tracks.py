@@ -387,8 +387,8 @@ LEAST_FOUND = 24
 """Fewest corners of a reference picture that must be found in another picture for the result to be used."""
 MOST_MISSES = 15
 """Largest number of consecutive pictures in which a reference is not found. After that it is dropped."""
-NODES = 16
-"""Number of nodes, along each side of the picture, of the smooth map from a reference picture to another one."""
+CELLS = 16
+"""Number of cells, along each side of the picture, of the smooth map from a reference picture to another one."""
 REACH = 0.12
 """Standard deviation of the Gaussian that smooths the residuals of a reference's map, as a share of the picture's longer side."""
 HELD = 0.5
@@ -488,13 +488,19 @@ class _Reference:
         """Share of the reference's corners that were found in the latest picture with enough of them."""
         self._picture = picture
         self._grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), 2).astype(np.float32)
+        """Map to the reference itself. Maps are float32 [H, W, 2]: the position in another picture of every pixel."""
         self._map = self._ahead = self._grid
-        nodes = np.stack(np.meshgrid(np.linspace(0, width - 1, NODES), np.linspace(0, height - 1, NODES)), 2)
-        self._nodes = nodes.reshape(-1, 2)
+        self._cell = -(-width // CELLS), -(-height // CELLS)
+        """Width and height in pixels of the cells, from whose centres the map is interpolated."""
+        centres = [(np.arange(CELLS + 2) - 0.5) * side - 0.5 for side in self._cell]
+        self._nodes = np.stack(np.meshgrid(*centres), 2).reshape(-1, 2)
         away = np.square(self._nodes[:, None] - self.corners).sum(2)
         self._weights = np.exp(-0.5 * away / (REACH * self._side) ** 2)
-        across = np.linspace(0, NODES - 1, width, dtype=np.float32), np.linspace(0, NODES - 1, height, dtype=np.float32)
-        self._between = np.meshgrid(*across)
+        across, down = (
+            np.maximum(0, 1 - np.abs((at[:, None] - nodes) / side))
+            for at, nodes, side in zip(self.corners.T, centres, self._cell, strict=True)
+        )
+        self._of_corners = (down[:, :, None] * across[:, None, :]).reshape(len(self.corners), len(self._nodes))
 
     def found(
         self, picture: NDArray[np.uint8], usable: NDArray[np.uint8], flow: NDArray[np.float32]
@@ -511,12 +517,12 @@ class _Reference:
         height, width = picture.shape
         last = self._map
         self._ahead = last + _warped(flow, last, cv2.INTER_LINEAR)
-        predicted = self._at(self._ahead)
+        predicted = _sampled(self._ahead, self.corners)
         kept = np.asarray(((predicted >= 0) & (predicted <= [width - 1, height - 1])).all(axis=1))
         self.missed += 1
         if kept.sum() < LEAST_FOUND:
             return None
-        start = self._smooth(kept, predicted)
+        start = self._map_of(self._smooth(kept, predicted))
         for levels in (REFERENCE_LEVELS, 0):
             warped = _warped(picture, start, cv2.INTER_CUBIC)
             moved, misses_px = followed(self._picture, warped, self.corners, window_px=PATCH_PX, levels=levels)
@@ -528,9 +534,10 @@ class _Reference:
             kept[kept] = usable[row[kept], column[kept]] > 0
             if kept.sum() < LEAST_FOUND:
                 return None
-            off = np.linalg.norm(at - self._at(self._smooth(kept, at)), axis=1)
+            smooth = self.corners + self._of_corners @ self._smooth(kept, at)
+            off = np.linalg.norm(at - smooth, axis=1)
             kept &= off < max(OFF_PX, OFF_MEDIANS * float(np.median(off[kept])))
-            start = self._smooth(kept, at)
+            start = self._map_of(self._smooth(kept, at))
         if kept.sum() < LEAST_FOUND:
             return None
         self._ahead, self.missed, self.share = start, 0, float(kept.mean())
@@ -540,12 +547,9 @@ class _Reference:
         """Keep the map to the picture of the last call of `found` as the start for the next picture."""
         self._map = self._ahead
 
-    def _at(self, values: NDArray[np.float32]) -> Points:
-        return _sampled(values, self.corners)
-
     def _smooth(self, kept: NDArray[np.bool_], at: Points) -> NDArray[np.float32]:
-        """Interpolate the positions `at` of the `kept` corners in another picture to a position of every pixel, [H, W, 2]. The
-        displacement is a quadratic polynomial plus smoothed residuals.
+        """Return the displacements at the nodes [M, 2] from the positions `at` of the `kept` corners in another picture: a
+        quadratic polynomial plus smoothed residuals.
         """
         moved = (at - self.corners)[kept].astype(np.float64)
         basis = self._basis(self.corners[kept])
@@ -553,8 +557,17 @@ class _Reference:
         factors = np.linalg.solve(square, basis.T @ moved)
         weights = self._weights[:, kept]
         local = weights @ (moved - basis @ factors) / (weights.sum(1, keepdims=True) + HELD)
-        nodes = (self._basis(self._nodes) @ factors + local).reshape(NODES, NODES, 2).astype(np.float32)
-        return np.asarray(self._grid + cv2.remap(nodes, *self._between, cv2.INTER_LINEAR), np.float32)
+        return np.asarray(self._basis(self._nodes) @ factors + local, np.float32)
+
+    def _map_of(self, displacements: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the map with these displacements at the nodes [M, 2], interpolated linearly between them.
+
+        `cv2.resize` interpolates exactly. `cv2.remap` would round positions between nodes to 1/32 of a cell.
+        """
+        (height, width), (across, down) = self._grid.shape[:2], self._cell
+        nodes = displacements.reshape(CELLS + 2, CELLS + 2, 2)
+        large = cv2.resize(nodes, ((CELLS + 2) * across, (CELLS + 2) * down), interpolation=cv2.INTER_LINEAR)
+        return self._grid + large[down : down + height, across : across + width]
 
     def _basis(self, at: NDArray[np.floating]) -> NDArray[np.float64]:
         x, y = (at.astype(np.float64) / self._side - 0.5).T
@@ -563,16 +576,19 @@ class _Reference:
 
 def _warped(values: NDArray[Any], at: NDArray[np.float32], interpolation: int) -> NDArray[Any]:
     """Sample values [H, W, ...] at the pixel positions (x, y) of a map [H, W, 2]."""
-    x, y = (np.ascontiguousarray(at[:, :, axis]) for axis in (0, 1))
-    return np.asarray(cv2.remap(values, x, y, interpolation, borderMode=cv2.BORDER_REPLICATE))
+    no_second_map = np.zeros(0, np.float32)
+    return np.asarray(cv2.remap(values, at, no_second_map, interpolation, borderMode=cv2.BORDER_REPLICATE))
 
 
 def _sampled(values: NDArray[np.float32], at: Points) -> Points:
-    """Return the values [N, 2] of a field [H, W, 2], interpolated linearly at pixel positions (x, y) [N, 2]."""
-    if not len(at):
-        return at
-    x, y = (np.ascontiguousarray(at[:, axis : axis + 1], np.float32) for axis in (0, 1))
-    return np.asarray(cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0], np.float32)
+    """Return the values [N, 2] of a map [H, W, 2], interpolated linearly at pixel positions (x, y) [N, 2]."""
+    height, width = values.shape[:2]
+    inside = np.clip(at, 0, [width - 1, height - 1])
+    left, top = np.minimum(inside.astype(int), [width - 2, height - 2]).T
+    right, down = (inside - np.stack([left, top], 1)).T[:, :, None]
+    above = values[top, left] * (1 - right) + values[top, left + 1] * right
+    below = values[top + 1, left] * (1 - right) + values[top + 1, left + 1] * right
+    return np.asarray(above * (1 - down) + below * down, np.float32)
 
 
 def _usable(inside: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -6,7 +6,15 @@ import cv2
 import numpy as np
 import pytest
 
-from gsplat_core.geometry.tracks import MOST_MISSES, Observations, ReferenceTracks, _Reference, _usable, local_contrast
+from gsplat_core.geometry.tracks import (
+    MOST_MISSES,
+    Observations,
+    ReferenceTracks,
+    _Reference,
+    _sampled,
+    _usable,
+    local_contrast,
+)
 from tests.gsplat_core.geometry.test_tracks import wide_texture
 
 HEIGHT, WIDTH = 150, 200
@@ -303,17 +311,17 @@ def reference() -> _Reference:
     ],
 )
 def test_reference_smooth_recovers_quadratic_map(moved):
-    """Coordinates are shares of the longer side from its middle; the map is found within a tenth of a pixel."""
+    """Coordinates are shares of the longer side from its middle."""
     one = reference()
     kept = np.arange(len(one.corners)) % 3 != 0
 
     def there(at: np.ndarray) -> np.ndarray:
         return at + np.stack(moved(*np.moveaxis(at / WIDTH - 0.5, -1, 0)), -1)
 
-    found = one._smooth(kept, there(one.corners.astype(np.float64)).astype(np.float32))
-    expected = there(one._grid.astype(np.float64))
-    middle = slice(20, -20)
-    assert np.abs(found - expected)[middle, middle].max() < 0.1
+    nodes = one._smooth(kept, there(one.corners.astype(np.float64)).astype(np.float32))
+    found = one._map_of(nodes)
+    assert np.abs(found - there(one._grid.astype(np.float64))).max() < 0.04
+    assert _sampled(found, one.corners) == pytest.approx(one.corners + one._of_corners @ nodes, abs=1e-4)
 
 
 def test_reference_corner_spacing_by_picture_size():
