@@ -546,7 +546,8 @@ class ChosenSteps:
     steps: int
     trials: tuple[Trial, ...]
     reason: str
-    """`given`, `best`, `limit` (the time limit ended the search), `most` (largest number tried) or `few frames`."""
+    """`given`, `best`, `limit` (the time limit ended the search), `most` (largest number tried), `few frames` or `interrupted`
+    (by a stop request)."""
     keeps_trial: bool = False
     """True if the time limit leaves no time to train on all frames, so that the best trial is the result."""
 

@@ -5,7 +5,6 @@ Held-out frames (1, 9, 17, ...) are excluded from training. The evaluation uses 
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -137,8 +136,8 @@ def reconstruct(
             excluded.
         steps: number of optimiser steps; None chooses it by validation (`gsplat_core.training.offline`).
         progress: called after each step or frame.
-        stop_requested: polled. True during training saves the model without evaluation; True during
-            evaluation acts as in a replay.
+        stop_requested: polled. True during training saves the best complete trial, or the steps so far if
+            there is none, without evaluation; True during evaluation acts as in a replay.
         report: writes the report files; None for no report.
         clock: source of the time for the time limit, in seconds.
 
@@ -245,6 +244,23 @@ class _Inputs:
         return chosen
 
 
+class _BestTrial(NamedTuple):
+    """Trial with the best score on validation frames so far. It is the result if a later training is interrupted."""
+
+    inputs: _Inputs
+    learning: Reconstructor
+    steps: int
+    psnr_db: float
+
+
+class _Interrupted(Exception):
+    """A stop request ended a training after `done` of `steps` optimiser steps."""
+
+    def __init__(self, inputs: _Inputs, learning: Reconstructor, done: int, steps: int) -> None:
+        super().__init__()
+        self.inputs, self.learning, self.done, self.steps = inputs, learning, done, steps
+
+
 class _Fitting:
     """Offline training of one model: choice of inputs and optimiser steps by validation, then training on all training
     frames of a source. Notes for the report are added to `notes`."""
@@ -261,8 +277,9 @@ class _Fitting:
         self._source, self._settings, self._progress = source, settings, progress
         self._stop_requested, self._notes, self._clock = stop_requested, notes, clock
         self._begin_s = clock()
-        self._learning: Reconstructor | None = None
-        self._is_stopped = False
+        self._tried: Reconstructor | None = None
+        """Result of the last trial, until it is kept or discarded."""
+        self._best: _BestTrial | None = None
         self._posed_inputs: _Inputs | None = None
         """Inputs with estimated poses while alternatives are tried; None if none were estimated."""
         self._setup_s = 0.0
@@ -280,16 +297,12 @@ class _Fitting:
                     inputs = _posed(inputs, camera_path_of(inputs.given.frames, inputs.source.description.camera))
                 except InvalidInput as error:
                     raise InvalidSetting(f"poses is 'estimated', but {error}") from error
-            if steps is None:
-                inputs, chosen = self._chosen(inputs)
-            else:
-                chosen = ChosenSteps(steps, (), "given")
-            if not self._is_stopped and not chosen.keeps_trial:
-                self._train(inputs, inputs.given, chosen.steps, "train")
-        learning = self._learning
-        assert learning is not None
-        if steps is None and not self._is_stopped:
-            self._notes.append(chosen.sentence)
+            try:
+                inputs, learning, chosen = self._trained(inputs, steps)
+                if steps is None:
+                    self._notes.append(chosen.sentence)
+            except _Interrupted as interrupted:
+                inputs, learning, chosen = self._kept(interrupted)
         for doubt, count in sorted(learning.depth_doubts.items()):
             self._notes.append(f"{count} key frames got no depth to train on: {doubt}")
         return Fitted(
@@ -301,28 +314,61 @@ class _Fitting:
             inputs.settings,
         )
 
+    def _trained(self, inputs: _Inputs, steps: int | None) -> tuple[_Inputs, Reconstructor, ChosenSteps]:
+        """Return the chosen inputs, the result of the training on all frames, and the choice of steps. Raises _Interrupted."""
+        if steps is not None:
+            chosen = ChosenSteps(steps, (), "given")
+        elif len(inputs.validating) < LEAST_FRAMES:
+            chosen = ChosenSteps(USUAL_STEPS, (), "few frames")
+        else:
+            inputs, chosen = self._chosen(inputs)
+        if chosen.keeps_trial and self._best is not None:
+            return inputs, self._best.learning, chosen
+        return inputs, self._train(inputs, inputs.given, chosen.steps, "train"), chosen
+
+    def _kept(self, interrupted: _Interrupted) -> tuple[_Inputs, Reconstructor, ChosenSteps]:
+        """Return inputs, training and steps of the best trial, or of the interrupted training before any trial was complete."""
+        begun = f"interrupted after {interrupted.done} of {interrupted.steps} training steps; the model is"
+        best = self._best
+        if best is None:
+            self._notes.append(f"{begun} as it was then")
+            chosen = ChosenSteps(interrupted.done, (), "interrupted")
+            return interrupted.inputs, interrupted.learning, chosen
+        self._notes.append(
+            f"{begun} that of an earlier complete training of {best.steps} steps, without validation frames"
+        )
+        return best.inputs, best.learning, ChosenSteps(best.steps, (), "interrupted")
+
     def _chosen(self, inputs: _Inputs) -> tuple[_Inputs, ChosenSteps]:
         """Return the inputs (poses, depth, eyes) and the number of optimiser steps that score best on validation frames."""
-        if len(inputs.validating) < LEAST_FRAMES:
-            return inputs, ChosenSteps(USUAL_STEPS, (), "few frames")
         limit_s = 60 * self._minutes
-        inputs, first, learned = self._best_inputs(inputs, ALTERNATIVES_UNTIL * limit_s)
-        self._posed_inputs = None  # frees the frames that they hold
+        inputs, first = self._best_inputs(inputs, ALTERNATIVES_UNTIL * limit_s)
+        self._posed_inputs = None  # frees the frames that it holds
         spent_s = self._clock() - self._begin_s
-        chosen = choose_steps(self._trial(inputs), limit_s, self._clock, spent_s, first)
-        if len(chosen.trials) == 1 and not self._is_stopped:
-            self._learning = learned
-        return inputs, chosen
+        train = self._trial(inputs)
 
-    def _best_inputs(self, inputs: _Inputs, until_s: float) -> tuple[_Inputs, Trial, Reconstructor | None]:
-        """Return the inputs that score best on validation frames after `FIRST_STEPS`, with their trial and its reconstructor. Other
-        inputs than the given ones are tried as long as their trial is expected to end at `until_s`, in seconds after the start."""
+        def longer(steps: int) -> Trained:
+            trained = train(steps)
+            if self._best is None or trained.psnr_db > self._best.psnr_db:
+                self._keep(inputs, steps, trained.psnr_db)
+            return trained
+
+        return inputs, choose_steps(longer, limit_s, self._clock, spent_s, first)
+
+    def _keep(self, inputs: _Inputs, steps: int, psnr_db: float) -> None:
+        """Keep the last trial as the best one."""
+        assert self._tried is not None
+        self._best = _BestTrial(inputs, self._tried, steps, psnr_db)
+
+    def _best_inputs(self, inputs: _Inputs, until_s: float) -> tuple[_Inputs, Trial]:
+        """Return the inputs that score best on validation frames after `FIRST_STEPS`, with their trial. Other inputs than the given
+        ones are tried as long as their trial is expected to end at `until_s`, in seconds after the start."""
         first = trial_of(self._trial(inputs), offline.FIRST_STEPS, self._clock)
-        learned = self._learning
+        self._keep(inputs, first.steps, first.psnr_db)
 
         def is_late(in_s: float) -> bool:
             ends_s = self._clock() - self._begin_s + in_s + first.duration_s
-            return self._is_stopped or self._stop_requested() or ends_s > until_s
+            return self._stop_requested() or ends_s > until_s
 
         for reason, other_than in (
             ("the scope moves, and its poses were estimated from the training frames", self._with_poses),
@@ -333,12 +379,13 @@ class _Fitting:
             if (other := other_than(inputs, is_late)) is None:
                 continue
             trial = trial_of(self._trial(other), offline.FIRST_STEPS, self._clock)
-            if trial.psnr_db >= first.psnr_db + INPUT_GAIN_DB and not self._is_stopped:
+            if trial.psnr_db >= first.psnr_db + INPUT_GAIN_DB:
                 self._notes.append(
                     f"{reason}: validation frames score {trial.psnr_db:.2f} dB, otherwise {first.psnr_db:.2f} dB"
                 )
-                inputs, first, learned = other, trial, self._learning
-        return inputs, first, learned
+                inputs, first = other, trial
+                self._keep(inputs, first.steps, first.psnr_db)
+        return inputs, first
 
     def _with_poses(self, inputs: _Inputs, is_late: IsLate) -> _Inputs | None:
         """Return inputs with estimated poses; None if there are poses, the scope is at rest, the poses cannot be estimated or it
@@ -367,7 +414,7 @@ class _Fitting:
         except _StopFitting:
             path = None
         if path is None or is_late(0.0):
-            if not self._is_stopped and not self._stop_requested():
+            if not self._stop_requested():
                 self._notes.append(
                     "the scope moves, but the time limit left no time to try estimated poses; --minutes raises it"
                 )
@@ -393,10 +440,8 @@ class _Fitting:
             kept = [frame.with_fields(pose=path.interpolated(frame.time_s)) for frame in kept]
 
         def train(steps: int) -> Trained:
-            if self._is_stopped:
-                return Trained(-math.inf)  # a score of -inf ends the search for the number of steps
-            learning = self._train(inputs, inputs.part, steps, "validate")
-            return Trained(validation_psnr_db(learning, kept), self._setup_s)
+            self._tried = self._train(inputs, inputs.part, steps, "validate")
+            return Trained(validation_psnr_db(self._tried, kept), self._setup_s)
 
         return train
 
@@ -408,8 +453,9 @@ class _Fitting:
         return MINUTES_ON_CPU if settings.device == "cpu" else MINUTES_ON_GPU
 
     def _train(self, inputs: _Inputs, given: ToFit, steps: int, stage: str) -> Reconstructor:
-        """Train an untrained reconstructor until the last optimiser step or a stop request, and return it."""
-        learning = self._learning = inputs.new()
+        """Train an untrained reconstructor and return it. Raises _Interrupted after a stop request."""
+        self._tried = None  # frees the memory of a trial that was not kept
+        learning = inputs.new()
         begin_s, done = self._clock(), 0
 
         def after_step(step: int, loss: Tensor) -> None:
@@ -425,9 +471,8 @@ class _Fitting:
         try:
             learning.fit(given, steps, after_step)
         except _StopFitting:
-            self._is_stopped = done < steps or stage != "train"
-        if self._is_stopped:
-            self._notes.append(f"interrupted after {done} of {steps} training steps; the model is as it was then")
+            if done < steps or stage != "train":
+                raise _Interrupted(inputs, learning, done, steps) from None
         return learning
 
 

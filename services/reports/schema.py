@@ -77,7 +77,8 @@ class TrainingSteps(Part):
     steps: Annotated[int, Field(ge=1)]
     reason: str
     """`given`, or the reason of the automatic choice: `best` of the trials, `limit` (the time limit ended the search),
-    `most` (the largest number tried) or `few frames`."""
+    `most` (the largest number tried) or `few frames`. `interrupted` after a stop request during training: the model has had
+    `steps` steps."""
     trials: list[TrialFacts] = []
 
 

@@ -172,7 +172,8 @@ def test_stop_request_ends_estimation_of_path(moving, tmp_path, monkeypatch):
 
     settings = module.ReconstructSettings(recording=moving, out=tmp_path / "out", sinks=())
     outcome = module.reconstruct(settings, progress=noted, stop_requested=lambda: tracked > 2, clock=lambda: 0.0)
-    assert tracked == 3 and outcome.interrupted
+    assert tracked == 3 and outcome.interrupted and "poses" not in outcome.outputs
+    assert outcome.find(offline.ChosenSteps) == offline.ChosenSteps(1, (), "interrupted")
     assert not any("estimated poses" in note for note in outcome.notes), outcome.notes
 
 

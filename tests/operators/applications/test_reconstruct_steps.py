@@ -6,7 +6,9 @@ import json
 
 import pytest
 
+from gsplat_core.io.bundle import load_bundle
 from gsplat_core.training import offline
+from operators.applications import reconstruct as module
 from operators.applications.reconstruct import ReconstructSettings, reconstruct
 from services.reports.build import write_reports
 from tests.gsplat_core.geometry.moving_scope import SIDEWAYS, video
@@ -40,3 +42,57 @@ def test_time_limit_ends_step_search(settings, monkeypatch):
     outcome = reconstruct(settings, progress=lambda each: trained.add(each.stage), clock=lambda: float(next(seconds)))
     assert any("the time limit ended the search" in note for note in outcome.notes)
     assert trained - {"poses"} == {"validate", "evaluate"}
+
+
+@pytest.mark.parametrize(
+    ("during", "steps", "done", "made", "what"),
+    [
+        ("validate", 2, 1, 1, "as it was then"),
+        ("validate", 4, 3, 2, "that of an earlier complete training of 2 steps"),
+        ("validate", 8, 2, 4, "that of an earlier complete training of 4 steps"),
+        ("train", 8, 7, 8, "that of an earlier complete training of 8 steps"),
+        ("train", 4, 2, 4, "that of an earlier complete training of 4 steps"),
+    ],
+)
+def test_stop_request_during_training_keeps_best_complete_trial(settings, monkeypatch, during, steps, done, made, what):
+    """Trials have 2, 4 and 8 steps and scores of the test, which grow unless 4 steps are to be chosen; the training on all
+    frames follows.
+    """
+    monkeypatch.setattr(offline, "FIRST_STEPS", 2)
+    monkeypatch.setattr(offline, "MOST_STEPS", 8)
+    monkeypatch.setattr(module, "rigid_share", lambda frames: 0.0)
+    is_stopped, newest, scored = False, None, {}
+
+    def noted(each):
+        nonlocal is_stopped, newest
+        newest = each
+        is_stopped |= (each.stage, each.total, each.done) == (during, steps, done)
+
+    def score(learned, frames):
+        scored[newest.total] = learned.snapshot().sha256()
+        return 0.0 if len(scored) == 3 and (during, steps) == ("train", 4) else float(len(scored))
+
+    monkeypatch.setattr(module, "validation_psnr_db", score)
+    outcome = reconstruct(settings, progress=noted, stop_requested=lambda: is_stopped, clock=lambda: 0.0)
+    assert outcome.interrupted
+    chosen = outcome.find(offline.ChosenSteps)
+    assert (chosen.steps, chosen.reason, chosen.trials) == (made, "interrupted", ())
+    assert any(
+        f"interrupted after {done} of {steps} training steps; the model is {what}" in note for note in outcome.notes
+    )
+    if made in scored:
+        assert load_bundle(outcome.outputs["model"]).sha256() == scored[made]
+
+
+def test_stop_request_during_training_of_given_steps_keeps_what_was_made(settings):
+    is_stopped = False
+
+    def noted(each):
+        nonlocal is_stopped
+        is_stopped |= each.done == 5
+
+    outcome = reconstruct(settings, steps=20, progress=noted, stop_requested=lambda: is_stopped)
+    assert outcome.find(offline.ChosenSteps) == offline.ChosenSteps(5, (), "interrupted")
+    assert any(
+        "interrupted after 5 of 20 training steps; the model is as it was then" in note for note in outcome.notes
+    )
