@@ -229,8 +229,8 @@ class _Fit:
         whole = np.zeros((size, count, size, count))
         for row in range(size):
             for column in range(row, size):
-                whole[row, :, column] = (nodes * S[:, row, column, None]).T @ nodes
-                whole[column, :, row] = whole[row, :, column].T
+                block = (nodes * S[:, row, column, None]).T @ nodes
+                whole[row, :, column], whole[column, :, row] = block, block.T
         known = (
             smoothness(self._grid) / (BEND * self._distance) ** 2 + np.eye(count) / (AMPLITUDE * self._distance) ** 2
         )

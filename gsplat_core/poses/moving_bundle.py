@@ -506,8 +506,8 @@ def _amplitude_terms(
     whole = torch.zeros(size, nodes, size, nodes, dtype=own.dtype)
     for row in range(size):
         for column in range(row, size):
-            whole[row, :, column] = (influence * own[:, row, column, None]).T @ influence
-            whole[column, :, row] = whole[row, :, column].T
+            block = (influence * own[:, row, column, None]).T @ influence
+            whole[row, :, column], whole[column, :, row] = block, block.T
         whole[row, :, row] += bundle.field.stiffness
     slopes = torch.einsum("pa,pm->am", slope, influence)
     slopes = slopes + torch.einsum("mn,njb->jbm", bundle.field.stiffness, bundle.amplitudes).reshape(size, nodes)
@@ -524,7 +524,7 @@ def _rigid(bundle: MovingBundle, wave_count: int) -> Tensor:
     x, y, z = at.unbind(1)
     one, zero = torch.ones_like(x), torch.zeros_like(x)
     rows = [one, zero, zero, zero, z, -y, zero, one, zero, -z, zero, x, zero, zero, one, y, -x, zero]
-    modes = torch.linalg.qr(torch.stack(rows, 1).reshape(-1, 6)).Q.view(-1, 3, 6)
+    modes = torch.linalg.qr(torch.stack(rows, 1).reshape(-1, 6)).Q.view(len(at), 3, -1)
     block = HELD / SIGMA * torch.einsum("mik,njk->imjn", modes, modes)
     each = torch.eye(wave_count, dtype=block.dtype)
     return torch.einsum("imjn,ab->iamjbn", block, each).reshape(3 * wave_count, len(at), 3 * wave_count, len(at))

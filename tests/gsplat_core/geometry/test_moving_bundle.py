@@ -64,6 +64,17 @@ def test_moving_bundle_adjust_never_increases_cost():
     assert all(after <= before for before, after in pairwise(costs)) and costs[-1] < costs[0]
 
 
+@pytest.mark.parametrize("with_prior", [False, True])
+@pytest.mark.parametrize("nodes", [1, 2])
+def test_moving_bundle_adjust_with_few_nodes_decreases_cost(nodes, with_prior):
+    """Points that lie close together have a single node."""
+    sightings, _ = seen_for(5.0, rate_hz=4.0)
+    few = bundle_of(sightings, waves(sightings.times_s, (BREATHING_HZ,)), nodes)
+    way = learned_from(few.poses, sightings.times_s, few.waves) if with_prior else None
+    assert len(few.field.nodes) == nodes
+    assert adjust(few, 0.004, 4, way)[1] < 0.9 * adjust(few, 0.004, 0, way)[1]
+
+
 def test_moving_bundle_keeps_first_camera():
     bundle, _ = breathing(5.0)
     found, _ = adjust(bundle, 0.004, 3)
