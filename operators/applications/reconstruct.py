@@ -294,9 +294,11 @@ class _Fitting:
             inputs = _Inputs(judged(self._source, self._stop_requested), settings)
             if settings.poses == "estimated":
                 try:
-                    inputs = _posed(inputs, camera_path_of(inputs.given.frames, inputs.source.description.camera))
+                    path = self._path(inputs, lambda in_s: self._stop_requested())
                 except InvalidInput as error:
                     raise InvalidSetting(f"poses is 'estimated', but {error}") from error
+                if path is not None:
+                    inputs = _posed(inputs, path)
             try:
                 inputs, learning, chosen = self._trained(inputs, steps)
                 if steps is None:
@@ -390,9 +392,26 @@ class _Fitting:
     def _with_poses(self, inputs: _Inputs, is_late: IsLate) -> _Inputs | None:
         """Return inputs with estimated poses; None if there are poses, the scope is at rest, the poses cannot be estimated or it
         is expected to be too late to try them then."""
-        frames = inputs.given.frames
-        if inputs.have_poses or rigid_share(frames) < MOVING_SHARE:
+        if inputs.have_poses or rigid_share(inputs.given.frames) < MOVING_SHARE:
             return None
+        try:
+            path = self._path(inputs, is_late)
+        except InvalidInput as error:
+            self._notes.append(f"no poses of the scope were estimated: {error}")
+            return None
+        if path is None or is_late(0.0):
+            if not self._stop_requested():
+                self._notes.append(
+                    "the scope moves, but the time limit left no time to try estimated poses; --minutes raises it"
+                )
+            return None
+        self._posed_inputs = _posed(inputs, path)
+        return self._posed_inputs
+
+    def _path(self, inputs: _Inputs, is_late: IsLate) -> CameraPath | None:
+        """Estimate the path of the scope from the training frames. None as soon as it is expected to be complete too late, or after
+        a stop request. Raises InvalidInput as `camera_path_of`."""
+        frames = inputs.given.frames
         begin_s, tracked = self._clock(), 0
 
         def after_frame() -> None:
@@ -407,20 +426,9 @@ class _Fitting:
                 raise _StopFitting
 
         try:
-            path = camera_path_of(frames, inputs.source.description.camera, after_frame)
-        except InvalidInput as error:
-            self._notes.append(f"no poses of the scope were estimated: {error}")
-            return None
+            return camera_path_of(frames, inputs.source.description.camera, after_frame)
         except _StopFitting:
-            path = None
-        if path is None or is_late(0.0):
-            if not self._stop_requested():
-                self._notes.append(
-                    "the scope moves, but the time limit left no time to try estimated poses; --minutes raises it"
-                )
             return None
-        self._posed_inputs = _posed(inputs, path)
-        return self._posed_inputs
 
     def _with_poses_only(self, inputs: _Inputs, is_late: IsLate) -> _Inputs | None:
         """Return inputs with estimated poses but without the depth that these poses provide. None if no poses were estimated, if

@@ -178,6 +178,20 @@ def test_stop_request_ends_estimation_of_path(moving, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
+def test_stop_request_ends_estimation_of_requested_poses(moving, tmp_path):
+    tracked = 0
+
+    def noted(each):
+        nonlocal tracked
+        tracked += each.stage == "poses"
+
+    settings = module.ReconstructSettings(recording=moving, out=tmp_path / "out", sinks=(), poses="estimated")
+    outcome = module.reconstruct(settings, steps=9, progress=noted, stop_requested=lambda: tracked > 2)
+    assert tracked == 3 and outcome.interrupted and "poses" not in outcome.outputs
+    assert any("interrupted after 1 of 9 training steps" in note for note in outcome.notes)
+
+
+@pytest.mark.slow
 def test_requested_poses_are_estimated_once_and_used_by_evaluation(moving, tmp_path):
     """Its evaluation uses them too."""
     out = tmp_path / "out"
