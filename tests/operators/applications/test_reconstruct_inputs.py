@@ -125,7 +125,7 @@ def test_reason_for_missing_path_is_noted_and_training_continues(moving, tmp_pat
 def test_poses_are_tried_if_trial_is_expected_to_end_in_time(
     moving, tmp_path, monkeypatch, trial_s, frame_s, refined_s, tracked
 ):
-    """By the clock of the test, each trial takes `trial_s` of a limit of 60 s, and tracking points in a frame `frame_s`."""
+    """The clock of the test counts `trial_s` for each trial and `frame_s` for each tracked frame. The limit is 60 s."""
     monkeypatch.setattr(offline, "FIRST_STEPS", 1)
     monkeypatch.setattr(offline, "MOST_STEPS", 1)
     now_s, scored, done = 0.0, [], 0
