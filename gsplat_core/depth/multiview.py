@@ -87,7 +87,7 @@ APART_PX = 5
 RETURNS_PX = 0.5
 """Largest accepted error of a point tracked forward and back, in pixels."""
 FEWEST_POINTS = 24
-"""Fewest tracked corners that a view must have in common with the reference picture to be used."""
+"""Fewest tracked corners that a view must have in common with the reference picture to be used, and that must agree with the poses."""
 TRACK_ERROR_PX = 0.5
 """Standard deviation of a tracked position in pixels."""
 RELIEF = 0.5
@@ -103,7 +103,7 @@ POSE_ERROR_PX = 0.6
 FEWEST_AGREEING = 0.6
 """Smallest share of the views whose poses must explain the image motion."""
 CONTRADICTED = "the poses do not explain how the pictures move: they are wrong, or the tissue itself moves"
-"""Rejection reason if fewer than `FEWEST_AGREEING` of the views agree with their poses."""
+"""Rejection reason if fewer than `FEWEST_AGREEING` of the views, or fewer than `FEWEST_POINTS` corners, agree with the poses."""
 ROUNDS = 6
 """Rounds of iteratively reweighted least squares, which reduces the weight of corners on moving objects."""
 Array = NDArray[np.float64]
@@ -161,6 +161,8 @@ def explained_by_poses(reference: View, others: Sequence[View]) -> Parallax | st
     if moved.max() < LEAST_PARALLAX_PX:
         return "there is too little parallax to estimate depth from"
     agree = (seen[kept] & (_off_px(c[kept], d[kept], focal, inverse) < 3 * MOST_LEFT_PX)).any(0)
+    if agree.sum() < FEWEST_POINTS:
+        return CONTRADICTED
     own = np.sqrt(np.maximum(off**2 - POSE_ERROR_PX**2, 0)) / np.maximum(moved, LEAST_PARALLAX_PX)
     views = tuple(usable[number] for number in kept)
     return Parallax(inverse[agree], plane, views, float(moved.max()), float(np.median(own)))

@@ -154,6 +154,18 @@ def test_view_agrees_with_residual_up_to_quarter_of_parallax(explained, off_px, 
     assert (found != multiview.CONTRADICTED) == explains
 
 
+@pytest.mark.parametrize("agreeing", [0, 23, 24])
+def test_two_dozen_corners_must_agree_however_large_the_parallax(explained, agreeing):
+    """A parallax of 24 pixels allows a median residual of 6 pixels, but a corner that is off by 4 pixels has no depth."""
+    up_and_down = 4 * np.stack([np.zeros(40), np.where(np.arange(40) % 2, 1, -1)], 1)
+    up_and_down[:agreeing] = 0
+    found = explained(track(camera(8.0), up_and_down))
+    if agreeing < 24:
+        assert found == multiview.CONTRADICTED
+    else:
+        assert len(found.inverse_depths) == 24
+
+
 def test_corner_on_moving_object_is_left_out(explained):
     off_px = np.zeros((40, 2))
     off_px[:5] = [0, 3.2]
