@@ -27,7 +27,7 @@ from gsplat_core.scene.cameras import Camera
 from gsplat_core.scene.frames import Frame
 from gsplat_core.scene.gaussians import Gaussians, RowMoves
 from gsplat_core.training.config import ReconstructorConfig
-from gsplat_core.training.initialisation import colours_beside_tools, gaussians_at_pixels, tissue_depth
+from gsplat_core.training.initialisation import colours_beside_tools, depth_at_pixels, gaussians_at_pixels
 from gsplat_core.training.observations import Observation, depth_of, pixels_of, unprojected, value_at
 from gsplat_core.training.steps.step import TrainingStep
 from gsplat_core.transfers import HostCopy, tensor_of
@@ -180,12 +180,13 @@ def gaussians_beside(
     if len(wanted) == 0 or most <= 0:
         return None
     height, width = frame.image.shape[:2]
-    depth = tissue_depth(frame.with_fields(depth=depth_mm), config.default_depth_mm)
+    spacing_px = grid_spacing(height * width, config.gaussians)
+    pixels = wanted[:: math.ceil(len(wanted) / most)]
     added = gaussians_at_pixels(
-        wanted[:: math.ceil(len(wanted) / most)],
-        grid_spacing(height * width, config.gaussians),
+        pixels,
+        spacing_px,
         colours_beside_tools(frame),
-        depth,
+        depth_at_pixels(pixels, frame.with_fields(depth=depth_mm), config.default_depth_mm),
         observation.camera,
         sh_degree=config.sh_degree,
     )

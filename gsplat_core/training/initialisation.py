@@ -63,13 +63,12 @@ def gaussians_from_frame(
     """
     height, width = frame.image.shape[:2]
     pixels, spacing_px = jittered_grid(width, height, count, seed)
-    created = gaussians_at_pixels(
-        pixels, spacing_px, tissue_colours(frame), tissue_depth(frame, default_depth_mm), camera, sh_degree=sh_degree
-    )
+    row, column = pixel_indices(pixels, height, width)
+    depth_mm = tissue_depth(frame, default_depth_mm)[row, column]
+    created = gaussians_at_pixels(pixels, spacing_px, tissue_colours(frame), depth_mm, camera, sh_degree=sh_degree)
     hidden = excluded(frame, spacing_px)
     if hidden is not None:
-        column, row = pixels.astype(np.int64).T
-        created.logit_opacities[torch.from_numpy(hidden[row.clip(0, height - 1), column.clip(0, width - 1)])] = HIDDEN
+        created.logit_opacities[torch.from_numpy(hidden[row, column])] = HIDDEN
     return created
 
 
@@ -94,6 +93,12 @@ def jittered_grid(width: int, height: int, count: int, seed: int) -> tuple[NDArr
     return np.stack([u.ravel(), v.ravel()], -1), spacing
 
 
+def pixel_indices(pixels: NDArray[np.float64], height: int, width: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the row and column of the pixel at or next to each position [M, 2] (x, y) in a picture of this size."""
+    column, row = (np.clip(pixels[:, k].astype(np.int64), 0, most - 1) for k, most in enumerate((width, height)))
+    return row, column
+
+
 def blur_sigma_px(spacing_px: float) -> float:
     """Return the blur (standard deviation in pixels) of a picture from which Gaussians of this spacing take colours."""
     return max(0.3, 0.3 * spacing_px)
@@ -114,16 +119,14 @@ def gaussians_at_pixels(
         pixels: positions [M, 2] as x, y; pixel centres at +0.5.
         spacing_px: distance of neighbouring Gaussians in pixels, to which their width is proportional.
         image: RGB uint8 [H, W, 3], source of colours.
-        depth_mm: float32 [H, W].
+        depth_mm: float32 [M], depth of each Gaussian.
         camera: camera of the picture, with its pose.
         sh_degree: degree of the spherical harmonics.
     """
-    height, width = depth_mm.shape
-    column = np.clip(pixels[:, 0].astype(np.int64), 0, width - 1)
-    row = np.clip(pixels[:, 1].astype(np.int64), 0, height - 1)
+    row, column = pixel_indices(pixels, *image.shape[:2])
     smooth = cv2.GaussianBlur(image, (0, 0), blur_sigma_px(spacing_px))
     colour = smooth[row, column].astype(np.float64) / 255
-    z = depth_mm[row, column].astype(np.float64)
+    z = depth_mm.astype(np.float64)
     camera_to_world = np.linalg.inv(camera.world_to_camera)
     points, pixel_mm = unprojected(pixels, z, camera)
     points = points @ camera_to_world[:3, :3].T + camera_to_world[:3, 3]
@@ -227,6 +230,34 @@ def tissue_depth(frame: Frame, default_depth_mm: float) -> NDArray[np.float32]:
     if not known.any():
         return np.full((height, width), default_depth_mm, np.float32)
     return measured if known.all() else np.where(known, measured, filled_depth(measured, known))
+
+
+FILLED_PX = 160
+"""Smallest width in pixels to which depth is reduced before `depth_at_pixels` extrapolates it."""
+
+
+def depth_at_pixels(pixels: NDArray[np.float64], frame: Frame, default_depth_mm: float) -> NDArray[np.float32]:
+    """Return z in millimetres at pixels [M, 2] as `tissue_depth`, but extrapolated at a reduced size.
+
+    This takes a third to a quarter of the time, because a stream's picture waits for it.
+    """
+    measured = possible_depth(frame)
+    known = np.isfinite(measured) & (measured > 0)
+    row, column = pixel_indices(pixels, *measured.shape)
+    if not known.any():
+        return np.full(len(pixels), default_depth_mm, np.float32)
+    there = known[row, column]
+    found = np.where(there, measured[row, column], np.float32(0))
+    if not there.all():
+        step = max(1, measured.shape[1] // FILLED_PX)
+        rows, columns = (min(step // 2, size - 1) for size in measured.shape)
+        some = known[rows::step, columns::step]
+        if not some.any():
+            return np.where(there, found, tissue_depth(frame, default_depth_mm)[row, column])
+        coarse = filled_depth(measured[rows::step, columns::step], some)
+        at = (np.minimum(each // step, size - 1) for each, size in zip((row, column), coarse.shape, strict=True))
+        found = np.where(there, found, coarse[tuple(at)])
+    return found
 
 
 COARSE = 4

@@ -15,6 +15,7 @@ from gsplat_core.training.initialisation import (
     StartOnDevice,
     blur_sigma_px,
     colours_beside_tools,
+    depth_at_pixels,
     filled,
     gaussians_at_pixels,
     jittered_grid,
@@ -86,7 +87,7 @@ def test_blur_sigma_is_three_tenths_of_spacing(spacing, sigma):
 def test_gaussians_at_pixels_cover_picture_and_face_camera():
     camera = Camera.from_focal(60.0, 64, 48)
     pixels, spacing = jittered_grid(64, 48, 300, 0)
-    image, depth = np.full((48, 64, 3), 120, np.uint8), np.full((48, 64), 50, np.float32)
+    image, depth = np.full((48, 64, 3), 120, np.uint8), np.full(len(pixels), 50, np.float32)
     made = gaussians_at_pixels(pixels, spacing, image, depth, camera, sh_degree=1)
     widths = made.log_scales.exp() * 60 / 50 / spacing
     assert torch.allclose(widths[:, :2], torch.tensor(0.7), rtol=1e-4)
@@ -138,6 +139,38 @@ def test_tissue_depth_uses_default_for_unknown_depth(depth, expected):
     found = tissue_depth(beside_a_tool(columns=80).with_fields(depth=plane, mask=None), 70.0)
     assert found.shape == (40, 80) and found.dtype == np.float32
     np.testing.assert_allclose(found, expected)
+
+
+def with_depth(depth: np.ndarray) -> Frame:
+    return Frame(0, 0, np.zeros((*depth.shape, 3), np.uint8), depth=depth.astype(np.float32))
+
+
+@pytest.mark.parametrize("enlarged", [0.5, 1, 3, 8])
+def test_depth_at_pixels_keeps_known_depth_and_continues_plane(enlarged):
+    """Inverse depth is linear across the picture and unknown in the left quarter, as where tissue comes into view."""
+    rows, columns = np.mgrid[: int(120 * enlarged), : int(160 * enlarged)] / enlarged
+    plane = 1 / (0.02 + 4e-5 * columns - 2e-5 * rows)
+    frame = with_depth(np.where(columns < 40, 0, plane))
+    pixels = np.array([[159.9, 3.5], [100.0, 60.2], [39.0, 100.9], [20.5, 60.5], [0.0, 0.0], [5.9, 119.9]]) * enlarged
+    found = depth_at_pixels(pixels, frame, 60.0)
+    exact = plane[pixels[:, 1].astype(int), pixels[:, 0].astype(int)]
+    assert found.dtype == np.float32
+    np.testing.assert_array_equal(found[:2], exact[:2].astype(np.float32))
+    np.testing.assert_allclose(found[2:], exact[2:], rtol=0.03)
+
+
+@pytest.mark.parametrize(("depth", "expected"), [(None, 70.0), (0.0, 70.0), (np.nan, 70.0), (-5.0, 70.0), (50.0, 50.0)])
+def test_depth_at_pixels_uses_default_for_unknown_depth(depth, expected):
+    frame = Frame(0, 0, np.zeros((8, 9, 3), np.uint8))
+    frame = frame if depth is None else with_depth(np.full((8, 9), depth))
+    np.testing.assert_array_equal(depth_at_pixels(np.array([[0.0, 0.0], [8.5, 7.5]]), frame, 70.0), expected)
+
+
+def test_depth_at_pixels_finds_known_pixels_between_samples():
+    depth = np.zeros((40, 640))
+    depth[3, 5] = 80.0
+    found = depth_at_pixels(np.array([[5.5, 3.5], [300.0, 30.0]]), with_depth(depth), 60.0)
+    assert found[0] == 80 and 40 <= found[1] <= 160
 
 
 @pytest.mark.parametrize("coarse", [1, 2, 4])
