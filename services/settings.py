@@ -391,6 +391,15 @@ class LogSettings(Section):
     )
 
 
+class GpuSettings(Section):
+    """Use of the GPUs by several streams."""
+
+    mps: bool = Field(
+        default=False,
+        description="Let streams on one GPU compute at the same time, with NVIDIA's Multi-Process Service, instead of in turns. An error of one stream on the GPU then restarts all streams on that GPU.",
+    )
+
+
 class StreamSettings(Section):
     """Settings of a stream that the service creates when it starts."""
 
@@ -435,6 +444,7 @@ class ServiceSettings(BaseSettings):
     uploaded_recordings: RecordingSettings = RecordingSettings()
     jobs: JobSettings = JobSettings()
     log: LogSettings = LogSettings()
+    gpu: GpuSettings = GpuSettings()
     streams: dict[ResourceName, StreamSettings] = Field(
         default={"endoscope": StreamSettings(source="synthetic:?width=320&height=256&frames=24&moving=1")},
         description="Streams created when the service starts.",

@@ -303,6 +303,7 @@ def assembled(settings: ServiceSettings) -> Parts:
         event_receiver(measures, events),
         settings.limits.streams,
         settings.server.takeover_s,
+        mps=settings.gpu.mps,
     )
     measures.streams = streams
     models = registry_of(settings)

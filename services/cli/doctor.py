@@ -9,6 +9,7 @@ import importlib.util
 import json
 import os
 import platform
+import shutil
 import sys
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
@@ -18,6 +19,7 @@ import typer
 
 from services import product_version
 from services.cli.terminal import BAD_INPUT, OK
+from services.supervisor.gpu_sharing import CONTROL as MPS_CONTROL
 
 PACKAGES = (
     "torch",
@@ -149,7 +151,14 @@ def _cuda(ops: list[str]) -> list[Check]:
         "" if refusal is None else "`make cuda` builds them for this GPU; until then use --device cpu",
         needed=False,
     )
-    return [gpu, built, Check("ops on the GPU", f"{len(ops)}: {', '.join(ops)}", needed=False)]
+    return [gpu, built, Check("ops on the GPU", f"{len(ops)}: {', '.join(ops)}", needed=False), _mps()]
+
+
+def _mps() -> Check:
+    """Check for the program that lets several streams use one GPU at the same time."""
+    program = shutil.which(MPS_CONTROL)
+    advice = "" if program else "only needed for several streams on one GPU (setting gpu.mps); NVIDIA's driver has it"
+    return Check("Multi-Process Service", program or "not installed", program is not None, advice, needed=False)
 
 
 def _video() -> list[Check]:

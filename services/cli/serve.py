@@ -29,6 +29,7 @@ from services.errors import SettingsInvalid
 from services.openigtlink import MessageServer, StreamMessages, folder_of, send
 from services.private_files import keep_files_private, make_state_private
 from services.settings import NAME_PATTERN, ServiceSettings, load_settings
+from services.supervisor.gpu_sharing import check_mps
 
 
 def serve_command(
@@ -41,6 +42,8 @@ def serve_command(
     settings = load_settings(config, {**_assigned(setting), **flags})
     log_to_stderr(settings.log)
     listener = bind(settings)  # a failure must come before any file or process is created
+    if settings.gpu.mps:
+        check_mps()
     refuse_unfinished_restore(settings)
     make_state_private(settings.data_dir, settings.uploaded_recordings.folder, settings.jobs.folder)
     parts = assembled(settings)

@@ -21,6 +21,7 @@ from services.errors import BusError, Conflict, NotFound, RegistryError, Rejecte
 from services.registry.models import ModelRegistry
 from services.schemas import StreamView
 from services.settings import StreamSettings
+from services.supervisor.gpu_sharing import WithMps
 from services.supervisor.launcher import ByLauncher, Direct, Start
 from services.supervisor.process import ManagedProcess, ProcessState, StreamEvent
 from services.supervisor.worker import ProcessLimits, ProcessSpec, assigned, gpus, remove_dead, specs_of
@@ -208,6 +209,8 @@ class SupervisedStreams:
         on_event: Callable[[StreamEvent], None],
         most: int = 16,
         takeover_s: float = 0.0,
+        *,
+        mps: bool = False,
     ) -> None:
         """Create the manager without streams.
 
@@ -216,10 +219,12 @@ class SupervisedStreams:
             on_event: receives process events.
             most: limit on the number of streams, including stopped ones (`limits.streams`).
             takeover_s: time for which processes continue after this process has died (`server.takeover_s`).
+            mps: engines on one GPU compute at the same time (`gpu.mps`).
         """
         self._runtime, self._on_event, self._most = runtime, on_event, most
         self._limits = ProcessLimits(orphan_after_s=takeover_s)
         self._launcher = ByLauncher(runtime, takeover_s)
+        self._mps = WithMps(self._launcher, runtime) if mps else None
         self._streams: dict[str, Stream] = {}
 
     @asynccontextmanager
@@ -237,6 +242,8 @@ class SupervisedStreams:
         finally:
             await asyncio.gather(*(self._stop(stream, "the server ends") for stream in self._streams.values()))
             await self._launcher.close(stop=True)
+            if self._mps is not None:
+                await self._mps.close()
             await asyncio.to_thread(remove_dead)
 
     def streams(self) -> Sequence[Stream]:
@@ -267,7 +274,11 @@ class SupervisedStreams:
         if len(self._streams) >= self._most:
             raise Conflict(f"there are {self._most} streams, which is limits.streams; delete one, or raise it")
         made = self._streams[name] = Stream(
-            settings, self._specs(name, settings), self._runtime, start=self._launcher, on_event=self._on_event
+            settings,
+            self._specs(name, settings),
+            self._runtime,
+            start=self._mps or self._launcher,
+            on_event=self._on_event,
         )
         return made.view()
 

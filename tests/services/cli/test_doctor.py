@@ -29,9 +29,17 @@ def doctor_checks(monkeypatch):
 
 def test_doctor_reports_working_cuda_kernels(doctor_checks):
     checks = doctor_checks(GPU, None)
-    assert all(check.ok for check in checks.values())
+    assert all(check.ok for check in checks.values() if check.name != "Multi-Process Service")
     assert checks["CUDA kernels"].value == "built by nvcc 13.0 for compute capability 8.0, 9.0"
     assert checks["ops on the GPU"].value == "2: adam_, composite"
+
+
+def test_doctor_finds_program_for_several_streams_on_one_gpu(doctor_checks, monkeypatch):
+    monkeypatch.setattr(doctor.shutil, "which", lambda name: f"/usr/bin/{name}")
+    assert doctor_checks(GPU, None)["Multi-Process Service"].value == "/usr/bin/nvidia-cuda-mps-control"
+    monkeypatch.setattr(doctor.shutil, "which", lambda name: None)
+    found = doctor_checks(GPU, None)["Multi-Process Service"]
+    assert not found.ok and "gpu.mps" in found.advice
 
 
 def test_doctor_advises_make_cuda_for_gpu_without_kernels(doctor_checks):
