@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Build, run the CUDA tests, and measure every recording with default settings, and four rooms, on one or two NVIDIA GPUs.
 # Usage: benchmarks/gpu_generality.sh OUT [RUNS]
-#   OUT    folder of the logs; OUT/cuda.jsonl is the log for benchmarks/logs/generality, OUT/rooms_cutting.jsonl for logs/cuda,
+#   OUT    folder of the logs; OUT/cuda.jsonl is the log for benchmarks/logs/generality, OUT/rooms_cutting*.jsonl for logs/cuda,
 #          OUT/paths.jsonl has the durations of estimated paths on this host's CPU
 #   RUNS   runs of each command (default 3)
 # INTRASPLAT_RECORDINGS is the folder of the recordings, PYTHON the interpreter (default python3). With two GPUs, live runs have the
@@ -28,7 +28,7 @@ others() {
 print(*(name for name in generality.recordings(pathlib.Path(sys.argv[1])) if name not in sys.argv[2:]), sep="\n")' "$recordings" "${first[@]}")
   measure offline --parts offline --only "${names[@]}"
 }
-rooms() { "$python" benchmarks/suite.py --device cuda --only rooms_cutting --out "$out" > "$out/rooms.txt" 2>&1; }
+rooms() { "$python" benchmarks/suite.py --device cuda --only rooms_cutting rooms_cutting_mps --out "$out" > "$out/rooms.txt" 2>&1; }
 paths() {
   "$python" benchmarks/offline_poses.py "$recordings"/others/{laparoscopy,resting_bowel}/video.mp4 --runs 1 > "$out/paths.jsonl" 2> "$out/paths.txt"
 }
@@ -41,7 +41,7 @@ if [ "$(nvidia-smi --list-gpus | wc -l)" -gt 1 ]; then
   (export CUDA_VISIBLE_DEVICES=0; taskset -cp "0-$((half - 1))" "$BASHPID" > /dev/null; first && live)
   wait "$beside"
   # Tests that need a second GPU, which each half of the machine lacked.
-  "$python" -m pytest -q -m cuda -rs tests/gsplat_core/cuda/test_{distributed,second_device,plain_chain}.py > "$out/tests_two.txt" 2>&1
+  "$python" -m pytest -m cuda -rs tests/gsplat_core/cuda/test_{distributed,second_device,plain_chain}.py > "$out/tests_two.txt" 2>&1
 else
   tests
   rooms

@@ -242,7 +242,10 @@ TABLES = (
         "Several `intrasplat live RECORDING --fps 30 --loop` at once, for 15 s (`rooms.py`). Each figure is that of the worst room of a run.",
         "recording",
         ROOM_COLUMNS,
-        (Row("`cutting`, four rooms", "cuda/rooms_cutting", asked="43 dB, p99 33 ms, 1 late"),),
+        (
+            Row("`cutting`, four rooms", "cuda/rooms_cutting", asked="43 dB, p99 33 ms, 1 late"),
+            Row("the same with `--mps`", "cuda/rooms_cutting_mps", asked="43 dB, p99 33 ms, 1 late"),
+        ),
     ),
     Table(
         "Replay",

@@ -88,6 +88,7 @@ BENCHMARKS = (
         }.items()
     ),
     Benchmark("rooms_cutting", "benchmarks/rooms.py {recordings}/cutting --rooms 4 --device cuda", "cuda"),
+    Benchmark("rooms_cutting_mps", "benchmarks/rooms.py {recordings}/cutting --rooms 4 --device cuda --mps", "cuda"),
     Benchmark("render", "benchmarks/gpu_splat.py", "cuda", runs=1),
     Benchmark("rasterization", "benchmarks/gpu_eager.py", "cuda", runs=1),
     Benchmark("training", "benchmarks/gpu_training.py", "cuda", runs=1),
