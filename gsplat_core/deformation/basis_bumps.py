@@ -62,6 +62,7 @@ INERT = (INERT_CENTER, 0.0, 0.0)
 CAPACITY_STEP = 16
 """Number of bump columns to a multiple of which the allocated capacity is rounded up."""
 HEADROOM = 1.25
+"""Factor by which more columns or rows are allocated than needed, so that few of many small additions move the tensors."""
 COLUMNS_AHEAD = 1
 """Number of bump columns beyond the newest frame's time that are kept ready in a live session."""
 
@@ -319,7 +320,7 @@ class BumpTensors(ContinuedField):
         if parents is not None and parents.shape != (count,):
             raise InvalidInput(f"parents must be [{count}], one for each new Gaussian, got {list(parents.shape)}")
         if count > self._spare_rows:
-            self.reserve(used + count)
+            self.reserve(used + count if used == 0 else math.ceil(HEADROOM * (used + count)))
         self._spare_rows -= count
         if parents is not None:
             for parameter in self._whole_parameters():

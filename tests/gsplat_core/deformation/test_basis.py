@@ -156,6 +156,16 @@ def test_basis_field_appended_gaussians_start_still_or_like_parents():
         field.append(3, parents=torch.tensor([0]))
 
 
+def test_many_small_additions_allocate_rarely():
+    field = BasisField(1000, (0.0, 1.0), bumps=6)
+    allocated = set()
+    for _ in range(400):
+        field.append(10)
+        allocated.add(field.weights.shape[0])
+    assert field.count == 5000 and max(allocated) <= 1.25 * 5000
+    assert len(allocated) < 10
+
+
 def test_basis_field_select_accepts_indices_or_mask():
     field = random_field(5)
     before = field.deltas(1.0).detach()
