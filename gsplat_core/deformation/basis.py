@@ -26,7 +26,7 @@ from gsplat_core.deformation.basis_bumps import (
     BasisRates,
     BumpTensors,
     bump_capacity,
-    least_squares_weights,
+    kept_weights,
 )
 from gsplat_core.deformation.field import (
     Capabilities,
@@ -300,7 +300,7 @@ class BasisField(BumpTensors):
 
         The result is bounded by `OVERSHOOT`.
         """
-        solution = least_squares_weights([self.frame_time(time_s) for time_s in times_s], self.bumps)
+        solution = kept_weights(tuple(self.frame_time(time_s) for time_s in times_s), self.bumps)
         weights = torch.einsum("bt,ntc->nbc", solution.to(offsets), offsets)
         low, high = offsets.amin(dim=1, keepdim=True), offsets.amax(dim=1, keepdim=True)
         beyond = OVERSHOOT * (high - low)

@@ -8,6 +8,7 @@ import copy
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, Self
 
 import torch
@@ -181,6 +182,14 @@ def least_squares_weights(taus: Sequence[float], bumps: int) -> Tensor:
     heights = torch.stack([basis_field(*row, each, tau)[0] for tau in taus]) if taus else each.new_zeros(0, bumps)
     bends = torch.eye(bumps, dtype=torch.float64).diff(n=2, dim=0)
     return torch.linalg.solve(heights.T @ heights + BEND * bends.T @ bends + 1e-6 * torch.eye(bumps), heights.T)
+
+
+@lru_cache(maxsize=4)
+def kept_weights(taus: tuple[float, ...], bumps: int) -> Tensor:
+    """Return `least_squares_weights`, which is kept, because it is needed for every frame that adds Gaussians. Callers must not
+    modify it.
+    """
+    return least_squares_weights(taus, bumps)
 
 
 class BumpTensors(ContinuedField):
