@@ -124,8 +124,7 @@ def gaussians_at_pixels(
         sh_degree: degree of the spherical harmonics.
     """
     row, column = pixel_indices(pixels, *image.shape[:2])
-    smooth = cv2.GaussianBlur(image, (0, 0), blur_sigma_px(spacing_px))
-    colour = smooth[row, column].astype(np.float64) / 255
+    colour = _blurred_at(image, row, column, blur_sigma_px(spacing_px)).astype(np.float64) / 255
     z = depth_mm.astype(np.float64)
     camera_to_world = np.linalg.inv(camera.world_to_camera)
     points, pixel_mm = unprojected(pixels, z, camera)
@@ -143,6 +142,20 @@ def gaussians_at_pixels(
         logit_opacities=torch.from_numpy(np.full(count, math.log(FIRST_OPACITY / (1 - FIRST_OPACITY)), np.float32)),
         sh=torch.from_numpy(sh),
     )
+
+
+def _blurred_at(
+    image: NDArray[np.uint8], row: NDArray[np.int64], column: NDArray[np.int64], sigma_px: float
+) -> NDArray[np.uint8]:
+    """Return the colours [M, 3] of a picture at some pixels after a Gaussian blur. Only the part of the picture that contains
+    them is blurred.
+    """
+    if len(row) == 0:
+        return np.empty((0, 3), np.uint8)
+    reach = math.ceil(4 * sigma_px) + 1  # beyond OpenCV's kernel, so that the result is that of the whole picture
+    top, left = (max(0, int(each.min()) - reach) for each in (row, column))
+    part = image[top : int(row.max()) + reach + 1, left : int(column.max()) + reach + 1]
+    return np.asarray(cv2.GaussianBlur(part, (0, 0), sigma_px), np.uint8)[row - top, column - left]
 
 
 def facing(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -175,7 +188,7 @@ def tissue_colours(frame: Frame) -> NDArray[np.uint8]:
     """
     if frame.mask is None or frame.mask.all() or not frame.mask.any():
         return frame.image
-    bare_tool = (frame.mask == 0).astype(np.uint8)
+    bare_tool = (frame.mask == 0).view(np.uint8)
     tool = cv2.dilate(bare_tool, np.ones((2 * TOOL_MARGIN_PX + 1,) * 2, np.uint8))
     if tool.all():  # dilation would leave no tissue
         tool = bare_tool
@@ -190,7 +203,7 @@ def colours_beside_tools(frame: Frame) -> NDArray[np.uint8]:
     if frame.mask is None or frame.mask.all() or not frame.mask.any():
         return frame.image
     height, width = frame.mask.shape
-    bare_tool = (frame.mask == 0).astype(np.uint8)
+    bare_tool = (frame.mask == 0).view(np.uint8)
     tool = cv2.dilate(bare_tool, np.ones((2 * TOOL_MARGIN_PX + 1,) * 2, np.uint8))
     small = (max(1, width // 4), max(1, height // 4))
     tissue = np.asarray(1 - tool, np.uint8)

@@ -84,6 +84,27 @@ def test_blur_sigma_is_three_tenths_of_spacing(spacing, sigma):
     assert blur_sigma_px(spacing) == pytest.approx(sigma)
 
 
+@pytest.mark.parametrize("spacing", [0.5, 3.1, 12.0])
+@pytest.mark.parametrize(
+    ("left", "top", "right", "bottom"), [(0, 0, 80, 60), (0, 0, 1, 60), (70, 20, 80, 21), (31, 17, 45, 40)]
+)
+def test_colours_at_some_pixels_are_those_of_blurred_picture(spacing, left, top, right, bottom):
+    rng = np.random.default_rng(1)
+    image = rng.integers(0, 256, (60, 80, 3), np.uint8)
+    pixels = rng.uniform((left, top), (right, bottom), (25, 2))
+    made = gaussians_at_pixels(
+        pixels, spacing, image, np.full(25, 50, np.float32), Camera.from_focal(60.0, 80, 60), sh_degree=0
+    )
+    blurred = cv2.GaussianBlur(image, (0, 0), blur_sigma_px(spacing))
+    expected = blurred[pixels[:, 1].astype(int), pixels[:, 0].astype(int)] / 255
+    np.testing.assert_allclose(made.sh[:, 0] * initialisation.SH_C0 + 0.5, expected, atol=1e-6)
+
+
+def test_gaussians_at_no_pixels_are_none():
+    nothing = np.zeros((0, 2)), 2.0, np.zeros((8, 8, 3), np.uint8), np.zeros(0, np.float32)
+    assert gaussians_at_pixels(*nothing, Camera.from_focal(8.0, 8, 8), sh_degree=1).count == 0
+
+
 def test_gaussians_at_pixels_cover_picture_and_face_camera():
     camera = Camera.from_focal(60.0, 64, 48)
     pixels, spacing = jittered_grid(64, 48, 300, 0)
