@@ -2,7 +2,7 @@
 # Build, run the CUDA tests, and measure every recording with default settings, and four rooms, on one or two NVIDIA GPUs.
 # Usage: benchmarks/gpu_generality.sh OUT [RUNS]
 #   OUT    folder of the logs; OUT/cuda.jsonl is the log for benchmarks/logs/generality, OUT/rooms_cutting*.jsonl for logs/cuda,
-#          OUT/paths.jsonl has the durations of estimated paths on this host's CPU
+#          OUT/paths.jsonl has the durations of estimated paths on this host's CPU, OUT/setup.jsonl those before the first step offline
 #   RUNS   runs of each command (default 3)
 # INTRASPLAT_RECORDINGS is the folder of the recordings, PYTHON the interpreter (default python3). With two GPUs, live runs have the
 # first GPU and half of the processor cores for themselves; tests and most offline runs take the other half at the same time.
@@ -29,6 +29,9 @@ print(*(name for name in generality.recordings(pathlib.Path(sys.argv[1])) if nam
   measure offline --parts offline --only "${names[@]}"
 }
 rooms() { "$python" benchmarks/suite.py --device cuda --only rooms_cutting rooms_cutting_mps --out "$out" > "$out/rooms.txt" 2>&1; }
+setup() {
+  "$python" benchmarks/offline_setup.py "$recordings"/others/{laparoscopy,resting_bowel}/video.mp4 --device cuda > "$out/setup.jsonl" 2> "$out/setup.txt"
+}
 paths() {
   "$python" benchmarks/offline_poses.py "$recordings"/others/{laparoscopy,resting_bowel}/video.mp4 --runs 1 > "$out/paths.jsonl" 2> "$out/paths.txt"
 }
@@ -36,7 +39,7 @@ first() { measure offline_first --parts offline --only "${first[@]}"; }
 
 if [ "$(nvidia-smi --list-gpus | wc -l)" -gt 1 ]; then
   half=$(($(nproc) / 2))
-  (export CUDA_VISIBLE_DEVICES=1; taskset -cp "$half-$((2 * half - 1))" "$BASHPID" > /dev/null; tests; rooms; paths; others) &
+  (export CUDA_VISIBLE_DEVICES=1; taskset -cp "$half-$((2 * half - 1))" "$BASHPID" > /dev/null; tests; rooms; paths; setup; others) &
   beside=$!
   (export CUDA_VISIBLE_DEVICES=0; taskset -cp "0-$((half - 1))" "$BASHPID" > /dev/null; first && live)
   wait "$beside"
@@ -46,6 +49,7 @@ else
   tests
   rooms
   paths
+  setup
   first
   others
   live

@@ -38,10 +38,12 @@ def room(figures: dict[str, Any]) -> dict[str, Any]:
 @contextmanager
 def multi_process_service() -> Iterator[Mapping[str, str]]:
     """Run NVIDIA's Multi-Process Service with folders of its own. Yields the environment of the processes that use it."""
-    with tempfile.TemporaryDirectory(prefix="mps-") as folder:
+    with tempfile.TemporaryDirectory(prefix="mps-", ignore_cleanup_errors=True) as folder:
         environment = {**os.environ, "CUDA_MPS_PIPE_DIRECTORY": folder, "CUDA_MPS_LOG_DIRECTORY": folder}
+        # The rooms' CUDA_VISIBLE_DEVICES counts the daemon's GPUs, which must therefore be all.
+        of_daemon = {name: value for name, value in environment.items() if name != "CUDA_VISIBLE_DEVICES"}
         control = "nvidia-cuda-mps-control"
-        subprocess.run([control, "-d"], env=environment, check=True, stdout=subprocess.DEVNULL)
+        subprocess.run([control, "-d"], env=of_daemon, check=True, stdout=subprocess.DEVNULL)
         try:
             yield environment
         finally:

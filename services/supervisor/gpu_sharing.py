@@ -101,11 +101,14 @@ class WithMps:
 
     async def _run(self, arguments: Sequence[str], commands: str = "") -> tuple[int, str]:
         """Run the control program; return its exit code and output, or code 1 and the reason why it does not run."""
+        environment = {**os.environ, **self.environment}
+        # The clients' CUDA_VISIBLE_DEVICES counts the daemon's GPUs, which must therefore be all.
+        environment.pop("CUDA_VISIBLE_DEVICES", None)
         try:
             # A file instead of a pipe, which the daemon would hold open.
             with self._output.open("w") as said:
                 process = await asyncio.create_subprocess_exec(
-                    CONTROL, *arguments, env={**os.environ, **self.environment}, start_new_session=True,
+                    CONTROL, *arguments, env=environment, start_new_session=True,
                     stdin=asyncio.subprocess.PIPE, stdout=said, stderr=asyncio.subprocess.STDOUT,
                 )  # fmt: skip
         except OSError as error:

@@ -20,7 +20,7 @@ DAEMON = """#!/bin/sh
 cd "$CUDA_MPS_PIPE_DIRECTORY"
 if [ "$1" = -d ]; then
   if [ -e running ]; then echo "An instance of this daemon is already running"; exit 1; fi
-  echo started >> calls; touch running; sleep 20 &
+  echo "started$CUDA_VISIBLE_DEVICES" >> calls; touch running; sleep 20 &
   echo $! > pid
   exit 0
 fi
@@ -71,8 +71,9 @@ def calls(runtime: RuntimeFolder) -> list[str]:
     return (runtime.path / ".mps" / "calls").read_text().split()
 
 
-def test_engines_share_one_daemon_that_ends_with_the_service(runtime, program):
+def test_engines_share_one_daemon_that_ends_with_the_service(runtime, program, monkeypatch):
     program(DAEMON)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "1")  # which the daemon must not have
     inner = Started()
     with_mps = WithMps(inner, runtime)
     assert start(with_mps) == start(with_mps) == 4711
