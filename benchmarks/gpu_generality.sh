@@ -39,9 +39,9 @@ first() { measure offline_first --parts offline --only "${first[@]}"; }
 
 if [ "$(nvidia-smi --list-gpus | wc -l)" -gt 1 ]; then
   half=$(($(nproc) / 2))
-  (export CUDA_VISIBLE_DEVICES=1; taskset -cp "$half-$((2 * half - 1))" "$BASHPID" > /dev/null; tests; rooms; paths; setup; others) &
+  (export CUDA_VISIBLE_DEVICES=1; taskset -cp "$half-$((2 * half - 1))" "$BASHPID" > /dev/null; tests; rooms; paths; others) &
   beside=$!
-  (export CUDA_VISIBLE_DEVICES=0; taskset -cp "0-$((half - 1))" "$BASHPID" > /dev/null; first && live)
+  (export CUDA_VISIBLE_DEVICES=0; taskset -cp "0-$((half - 1))" "$BASHPID" > /dev/null; first; setup; live)
   wait "$beside"
   # Tests that need a second GPU, which each half of the machine lacked.
   "$python" -m pytest -m cuda -rs tests/gsplat_core/cuda/test_{distributed,second_device,plain_chain}.py > "$out/tests_two.txt" 2>&1
