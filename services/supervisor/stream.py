@@ -418,6 +418,16 @@ class SupervisedStreams:
         engine = specs["engine"].engine
         assert engine is not None
         placed = assigned(engine, [each for each in others if each is not None], gpus())
+        if (
+            placed.gpu is not None
+            and self._mps is None
+            and placed.gpu in [each.gpu for each in others if each is not None]
+        ):
+            log.warning(
+                "%s and other streams take turns on GPU %d; gpu.mps: true lets them compute at the same time (docs/operations.md)",
+                name,
+                placed.gpu,
+            )
         return {**specs, "engine": specs["engine"].model_copy(update={"engine": placed})}
 
 

@@ -11,6 +11,7 @@ import pytest
 
 from services.bus.runtime import RuntimeFolder
 from services.errors import CannotServe, RuntimeFolderUnusable
+from services.settings import StreamSettings
 from services.supervisor import gpu_sharing
 from services.supervisor.gpu_sharing import CONTROL, WithMps, check_mps
 from services.supervisor.stream import SupervisedStreams
@@ -174,3 +175,14 @@ def test_streams_end_the_daemon_last(runtime, monkeypatch):
     assert order == ["launcher", "mps"]
     asyncio.run(run(False))
     assert order == ["launcher", "mps", "launcher"]
+
+
+@pytest.mark.parametrize("mps", [False, True])
+def test_streams_that_take_turns_on_a_gpu_are_logged(runtime, monkeypatch, caplog, mps):
+    monkeypatch.setattr("services.supervisor.stream.gpus", lambda: 2)
+    streams = SupervisedStreams(runtime, lambda event: None, mps=mps)
+    for name, device in [("a", "cuda"), ("b", "cuda"), ("c", "cpu"), ("d", "cuda:1")]:
+        streams.create(name, StreamSettings(source="synthetic:?width=64", device=device))
+    turns = [record.getMessage() for record in caplog.records if "take turns" in record.getMessage()]
+    assert len(turns) == (0 if mps else 1)
+    assert all(line.startswith("d and other streams take turns on GPU 1; gpu.mps: true") for line in turns)
