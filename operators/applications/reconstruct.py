@@ -239,7 +239,8 @@ class _Inputs:
             why = ", ".join(f"{reason}: {count}" for reason, count in left_out.items())
             raise NothingShown(
                 f"nothing was shown: none of the {description.frame_count} frames of {description.name} can be trained on"
-                f" ({why}); give other frames, and pictures of more than 8 bits with values up to 65535"
+                f" ({why}); give other frames"
+                + (", or pictures of more than 8 bits with values up to 65535" if left_out["black"] else "")
             )
         return chosen
 
