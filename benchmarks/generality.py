@@ -178,8 +178,8 @@ def withheld(results: Iterable[Mapping[str, Any]]) -> str:
     return ", ".join(f"{reason} {count}" for reason, count in counts.items()) or "0"
 
 
-def live_table(groups: Mapping[str, list[dict[str, Any]]]) -> str:
-    """Return the table of live runs."""
+def live_table(groups: Mapping[str, list[dict[str, Any]]], failed: Collection[str]) -> str:
+    """Return the table of live runs. Recordings in `failed`, of which a run ended with an error, meet nothing."""
     head = (
         "recording", "width, px", "displayed frame (training error), dB", "previous frame, dB", "worst frame, dB", "worst difference to the previous frame, dB",
         "frames more than 1 dB below it", "late frames", "age p99, ms", "after the first second, ms", "of used frames, ms", "shown of", "withheld", "required: 3 dB above, never 1 dB below",
@@ -194,10 +194,11 @@ def live_table(groups: Mapping[str, list[dict[str, Any]]]) -> str:
             and (before := value(each, "live.previous_frame_db")) is not None
         ]
         far = [value(each, "margins.far_below") or 0 for each in results]
-        met = "met" if gains and min(gains) >= 3 and max(far) == 0 else "missed"
+        met = "met" if gains and min(gains) >= 3 and max(far) == 0 and name not in failed else "missed"
         late = [(value(each, "live.not_on_screen") or 0) / (value(each, "frames.ingested") or 1) for each in results]
         ages_ms = [value(each, "live.settled_age_p99_ms") or math.inf for each in results]
-        prompt = "met" if max(late) <= MOST_LATE and max(ages_ms) <= MOST_AGE_MS else "missed"
+        is_prompt = max(late) <= MOST_LATE and max(ages_ms) <= MOST_AGE_MS and name not in failed
+        prompt = "met" if is_prompt else "missed"
         rows.append(
             (
                 f"`{name}`",
@@ -220,8 +221,8 @@ def live_table(groups: Mapping[str, list[dict[str, Any]]]) -> str:
     return table(head, rows)
 
 
-def offline_table(groups: Mapping[str, list[dict[str, Any]]]) -> str:
-    """Return the table of offline runs."""
+def offline_table(groups: Mapping[str, list[dict[str, Any]]], failed: Collection[str]) -> str:
+    """Return the table of offline runs. Recordings in `failed`, of which a run ended with an error, meet nothing."""
     head = (
         "recording", "width, px", "held-out frames, dB", "of them with both neighbours, dB", "neighbours' mean, dB", "previous frame, dB", "training frames (training error), dB",
         "whole command, s", f"required: neighbours' mean ({EQUAL_FRAMES_DB:g} dB for equal frames)",
@@ -235,7 +236,7 @@ def offline_table(groups: Mapping[str, list[dict[str, Any]]]) -> str:
             if (held_out := value(each, "quality.heldout_between.psnr_tissue_db")) is not None
             and (mean := value(each, "quality.baselines.heldout_neighbour_mean_db")) is not None
         ]
-        met = ("met" if min(gains) >= 0 else "missed") if gains else "–"
+        met = ("met" if min(gains) >= 0 and name not in failed else "missed") if gains else "–"
         rows.append(
             (
                 f"`{name}`",
@@ -373,6 +374,12 @@ TITLES = {
 }
 
 
+def _reason(error: str) -> str:
+    """Return the line of a command's error output that says what happened."""
+    lines = [line for line in error.strip().splitlines() if not line.startswith("error: this is a bug in intrasplat")]
+    return next((line for line in reversed(lines) if line.strip()), "no message")
+
+
 def generality_text(folder: Path = FOLDER) -> str:
     """Return the text of results/generality.md."""
     parts = [
@@ -391,16 +398,16 @@ def generality_text(folder: Path = FOLDER) -> str:
             for line in own:
                 if "result" in line:
                     groups.setdefault(line["recording"], []).append(line["result"])
-            failed = [
-                f"- `{line['recording']}`, run {line['run']}: {line['error'].strip().splitlines()[-1]}"
-                for line in own
-                if "error" in line
-            ]
+            failed = [line for line in own if "error" in line]
             if not own:
                 continue
-            parts += [f"## {title}, {name}", live_table(groups) if part.startswith("live") else offline_table(groups)]
+            table_of = live_table if part.startswith("live") else offline_table
+            parts += [f"## {title}, {name}", table_of(groups, [line["recording"] for line in failed])]
             if failed:
-                parts.append("Ended with an error:\n\n" + "\n".join(failed))
+                runs = (f"- `{line['recording']}`, run {line['run']}: {_reason(line['error'])}" for line in failed)
+                parts.append(
+                    "Ended with an error, so that the figures are those of the other runs:\n\n" + "\n".join(runs)
+                )
             parts.append(
                 f"{_origin(own[0])}; {_runs(own)} runs of `{own[0]['command']}` and the same for the other recordings."
             )

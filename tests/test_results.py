@@ -71,6 +71,35 @@ def test_a_row_takes_the_lines_of_its_command_alone(tmp_path):
     assert publish.results_of(publish.every_recording("one", "cpu", "live", "c"), tmp_path) == []
 
 
+@pytest.mark.parametrize("fails", [False, True])
+def test_recording_of_which_a_run_failed_meets_no_requirement(tmp_path, fails):
+    def line(part: str, run: int, **outcome) -> str:
+        return json.dumps(LINE | {"part": part, "recording": "a", "run": run, **outcome})
+
+    live = {
+        "live": {
+            "settled_psnr_tissue_db": 40.0,
+            "previous_frame_db": 30.0,
+            "not_on_screen": 0,
+            "settled_age_p99_ms": 20.0,
+        },
+        "frames": {"ingested": 90},
+    }
+    offline = {
+        "quality": {"heldout_between": {"psnr_tissue_db": 40.0}, "baselines": {"heldout_neighbour_mean_db": 30.0}}
+    }
+    error = "Traceback\n  File x\nIndexError: it is empty\nerror: this is a bug in intrasplat; please report it\n"
+    lines = [line("live", 1, result=live), line("offline", 1, result=offline)]
+    if fails:
+        lines += [line(part, 2, error=error) for part in ("live", "offline")]
+    (tmp_path / "cpu.jsonl").write_text("\n".join(lines), encoding="utf-8")
+    text = generality.generality_text(tmp_path)
+    rows = [row for row in text.splitlines() if row.startswith("| `a`")]
+    assert [row.endswith("| missed |") for row in rows] == [fails, fails]
+    assert [row.count("| met |") for row in rows] == ([0, 0] if fails else [1, 1])
+    assert text.count("- `a`, run 2: IndexError: it is empty\n") == (2 if fails else 0)
+
+
 def test_interruptions_of_the_machine_are_stated_with_its_figures(tmp_path):
     folder = written(tmp_path, {"live": {"db": 40.0}})
     assert "interrupted" not in publish.provenance(TABLE, folder)

@@ -250,9 +250,8 @@ FILLED_PX = 160
 
 
 def depth_at_pixels(pixels: NDArray[np.float64], frame: Frame, default_depth_mm: float) -> NDArray[np.float32]:
-    """Return z in millimetres at pixels [M, 2] as `tissue_depth`, but extrapolated at a reduced size.
-
-    This takes a third to a quarter of the time, because a stream's picture waits for it.
+    """Return z in millimetres at pixels [M, 2] as `tissue_depth`, but extrapolated at a reduced size, because a stream's picture
+    waits for it.
     """
     measured = possible_depth(frame)
     known = np.isfinite(measured) & (measured > 0)

@@ -26,3 +26,4 @@ def test_least_squares_weights_independent_of_thread_count(bumps, times):
 def test_kept_weights_are_those_of_the_given_times_and_bumps():
     for taus, bumps in [((0.0, 1.5, 3.0), 5), ((0.0, 1.5, 3.5), 5), ((0.0, 1.5, 3.0), 6), ((0.0, 1.5, 3.0), 5)]:
         assert torch.equal(kept_weights(taus, bumps), least_squares_weights(taus, bumps))
+    assert kept_weights(taus, bumps) is kept_weights(taus, bumps)
