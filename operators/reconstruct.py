@@ -227,8 +227,6 @@ WARM_STEPS = {"cpu": 3, "cuda": 40}
 """Optimiser steps on each warm-up picture."""
 EYES_APART = 0.07
 """Stereo baseline of the warm-up as a share of the scene's distance."""
-MOVED_APART = 0.1
-"""Distance between the cameras of consecutive warm-up pictures as a share of the scene's distance."""
 
 
 def warm_reconstructor(
@@ -251,17 +249,13 @@ def warm_reconstructor(
     height, width = image.shape[:2]
     tissue = np.ones((height, width), np.uint8)
     tissue[height // 2 :, : width // 2] = 0  # a tool, so that the code for hidden tissue runs, too
-    distance_mm = reconstructor.config.default_depth_mm
-    depth = np.full((height, width), distance_mm, np.float32)
-    pose = np.eye(4)
+    depth = np.full((height, width), reconstructor.config.default_depth_mm, np.float32)
     drawn: list[object] = []
     for frames in (WARM_FRAMES, 1):  # the second scene runs the code that reuses memory
         for seq in range(frames):
-            # A moving camera, so that the code that fills tissue coming into view runs, too.
-            pose[0, 3] = -MOVED_APART * distance_mm * seq
-            frame = Frame(seq, seq * 33_000_000, image, mask=tissue, pose=pose.copy())
+            frame = Frame(seq, seq * 33_000_000, image, mask=tissue)
             if stereo:
-                right = reconstructor.camera.right_eye(EYES_APART * distance_mm)
+                right = reconstructor.camera.right_eye(EYES_APART * reconstructor.config.default_depth_mm)
                 frame = frame.with_fields(right_image=image, right_camera=right)
             # A time budget makes the reconstructor measure the duration of an optimiser step.
             reconstructor.observe(frame, budget=Budget.until(0.0, at_least=WARM_STEPS[reconstructor.device.type]))

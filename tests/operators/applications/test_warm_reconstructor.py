@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from gsplat_core.scene.cameras import Camera
-from gsplat_core.training import upkeep
 from gsplat_core.training.config import ReconstructorConfig
 from gsplat_core.training.reconstructor import Reconstructor
 from gsplat_core.training.schedule import LiveTraining
@@ -27,18 +26,3 @@ def test_warm_reconstructor_runs_upkeep_per_scene_and_leaves_no_gaussians(monkey
     warm_reconstructor(reconstructor, lambda frame, model: drawn.append(model))
     assert done == [True, True] and len(drawn) == 5
     assert reconstructor.gaussians == 0
-
-
-def test_warm_reconstructor_fills_tissue_that_comes_into_view(monkeypatch):
-    added = []
-    fill = upkeep.fill_new_tissue
-
-    def noted(step, *others):
-        before = step.gaussians.count
-        fill(step, *others)
-        added.append(step.gaussians.count - before)
-
-    monkeypatch.setattr(upkeep, "fill_new_tissue", noted)
-    config = ReconstructorConfig(gaussians=120, max_gaussians=240, history_s=1.0, preallocate=True)
-    warm_reconstructor(Reconstructor(config, Camera.from_focal(50.0, 48, 40), live=LiveTraining()))
-    assert len(added) == 3 and min(added) > 0
