@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 
 import pytest
+
+from services.settings import ENVIRONMENT_PREFIX, load_settings
 
 ROOT = Path(__file__).resolve().parents[2]
 UNITS = sorted((ROOT / "deploy" / "systemd").iterdir())
@@ -41,3 +44,16 @@ def test_systemd_unit_uses_notify_and_watchdog():
     text = (ROOT / "deploy" / "systemd" / "intrasplat.service").read_text()
     assert "\nType=notify\n" in text and "\nNotifyAccess=main\n" in text
     assert re.search(r"^WatchdogSec=\d+s$", text, re.MULTILINE)
+
+
+def test_commands_with_service_settings_use_folders_that_systemd_unit_creates(monkeypatch):
+    """`keys`, `backup` and `igtl` know the folders of the service from the settings file alone."""
+    for name in [name for name in os.environ if name.startswith(ENVIRONMENT_PREFIX)]:
+        monkeypatch.delenv(name)
+    unit = (ROOT / "deploy" / "systemd" / "intrasplat.service").read_text()
+    (config,) = re.findall(r"^ExecStart=.* --config (\S+)$", unit, re.MULTILINE)
+    assert f"deploy/settings.yaml {config}\n" in (ROOT / "docs" / "operations.md").read_text()
+    settings = load_settings(ROOT / "deploy" / "settings.yaml")
+    assert f"\nStateDirectory={settings.data_dir.relative_to('/var/lib')}\n" in unit
+    assert f"\nRuntimeDirectory={settings.runtime_dir.relative_to('/run')}\n" in unit
+    assert f"{ENVIRONMENT_PREFIX}PATHS__" not in unit
