@@ -32,6 +32,7 @@ from services.cli.options import (
     MergedOption,
     MeshArgument,
     ModelArgument,
+    ModelFolderArgument,
     OrderOption,
     OutOption,
     PackedFileArgument,
@@ -296,7 +297,7 @@ def bench(
 
 @app.command()
 def pack(
-    model: ModelArgument,
+    model: ModelFolderArgument,
     file: PackedFileArgument,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
     json: JsonOption = False,

@@ -162,6 +162,17 @@ def stop(name: StreamName, service: Service = Service()) -> int:
     return print_found([service(lambda client: client.stop_stream(name))], STREAM, False, stream_row)
 
 
+@command("options")
+def stream_options(name: StreamName, option: OptionsOption = None, service: Service = Service()) -> int:
+    """Change options of a stream and print those that are set, as JSON. The affected process restarts. `name=null` restores a default.
+    Without --option, nothing changes.
+    """
+    wanted = assigned(option or ())
+    found = service(lambda client: client.set_stream_options(name, wanted) if wanted else client.stream(name))
+    typer.echo(json_format.dumps(found.options))
+    return OK
+
+
 @command("create")
 def create(
     name: StreamName,

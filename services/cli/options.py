@@ -49,9 +49,10 @@ ModelArgument = Annotated[
     Path,
     path_argument(
         "MODEL",
-        "A model folder that replay or reconstruct wrote; render, bench, view, export and measure also take a scene.ply, .splat or .spz of other programs.",
+        "A model folder that replay or reconstruct wrote, or a .ply, .splat or .spz file of another program.",
     ),
 ]
+ModelFolderArgument = Annotated[Path, path_argument("MODEL", "A model folder that replay or reconstruct wrote.")]
 PackedFileArgument = Annotated[Path, path_argument("FILE", "The packed file, which ends in .isplat.")]
 MeshArgument = Annotated[Path, path_argument("MESH", "A triangle mesh: .ply, .stl or .obj.")]
 ExportedFileArgument = Annotated[Path, path_argument("FILE", "The exported file.")]

@@ -268,6 +268,13 @@ class Client(ReplayMethods, SnapshotMethods):
         """Stop a stream."""
         return StreamView.model_validate(self._ask("POST", f"/v1/streams/{name}/stop"))
 
+    def set_stream_options(self, name: str, options: Mapping[str, Any]) -> StreamView:
+        """Change options of a stream, whose affected process restarts. Options that are not given keep their values, and None
+        restores the default.
+        """
+        answer = self._ask("PATCH", f"/v1/streams/{name}/options", json={"options": dict(options)})
+        return StreamView.model_validate(answer)
+
     def delete_stream(self, name: str) -> None:
         """Stop and delete a stream."""
         self._ask("DELETE", f"/v1/streams/{name}")

@@ -81,7 +81,7 @@ BODIES = [
 COMMANDS = [
     ["streams"], ["models"], ["models", "liver"], ["recordings"], ["replays"], ["start", "s"], ["create", "s", "synthetic:"],
     ["activate", "liver", "1"], ["rollback", "liver"], ["snapshot", "s"], ["snapshots", "s"], ["replay", "r"], ["cancel", "0" * 16],
-    ["keep", "0" * 16, "liver"],
+    ["keep", "0" * 16, "liver"], ["options", "s", "--option", "seed=1"],
 ]  # fmt: skip
 
 

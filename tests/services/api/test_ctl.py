@@ -100,6 +100,16 @@ def test_ctl_reads_key_from_flag_then_key_file_then_variable(ctl, service, tmp_p
     assert ctl("whoami")[0] == BAD_INPUT
 
 
+def test_ctl_options_changes_named_options_only_and_prints_those_that_are_set(ctl, service):
+    assert json.loads(ctl("options", "theatre-1")[1]) == {}
+    assert ctl("options", "theatre-1", "--option", "seed=7", "--option", "tool-mask=none")[0] == OK
+    code, out, _ = ctl("options", "theatre-1", "--option", "engine_scale=0.5")
+    assert code == OK and json.loads(out) == {"seed": 7, "tool_mask": "none", "engine_scale": 0.5}
+    assert service.stream("theatre-1").options == json.loads(out)
+    code, _, err = ctl("options", "theatre-1", "--option", "unknown=1")
+    assert code == BAD_INPUT and "nearest" in err
+
+
 def uploaded(service: Client, tmp_path) -> None:
     (tmp_path / "file").write_bytes(b"GOOD")
     service.checked("liver", service.upload("liver", tmp_path / "file").version)
