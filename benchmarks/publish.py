@@ -178,6 +178,7 @@ ROOM_COLUMNS = (
 
 
 LIVE_FRONT = (
+    "width",
     "displayed frame (training error)",
     "previous frame",
     "next frame, before it is seen",
@@ -186,8 +187,18 @@ LIVE_FRONT = (
 )
 
 
+SCENES = {
+    "surgical50k_640x512": "50,000 splats on a surface, 640x512,",
+    "volume1m_1080p": "1,000,000 splats in a volume, 1920x1080,",
+    "volume4m_4k": "4,000,000 splats in a volume, 3840x2160,",
+}
+"""Words of the README and RESULTS.md for the scenes of `gpu_scenes.py`."""
+
+
 def kernel(log: str, work: str, asked: str = "", front: bool = False) -> Row:
-    return Row(work, f"cuda/{log}", {"work": work}, asked=asked, front=front)
+    scene, _, rest = work.partition(" ")
+    what = f"{SCENES[scene]} {rest}" if scene in SCENES else work
+    return Row(what, f"cuda/{log}", {"work": work}, asked=asked, front=front)
 
 
 def every_recording(what: str, device: str, part: str, recording: str, asked: str = "", front: bool = False) -> Row:
@@ -289,7 +300,7 @@ TABLES = (
     ),
     Table(
         "Kernels, one GPU",
-        "Time of one call, next to gsplat 1.5.3 and plain PyTorch in the same process.",
+        "Time of one call, next to gsplat 1.5.3 and plain PyTorch in the same process ([scenes](results/README.md#recordings-and-scenes)).",
         "work",
         KERNEL_COLUMNS,
         (
