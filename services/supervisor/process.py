@@ -255,6 +255,8 @@ class ManagedProcess:
             identity = await self._running()
             if identity is not None:
                 how = await self._watched(identity)
+            elif self._down[0] == "down":  # it could not be started
+                how = self._down[1]
             else:
                 how = "it ended at once"
             self._identity, self._heartbeat = None, None

@@ -10,7 +10,7 @@ import asyncio
 import logging
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from gsplat_core.errors import InvalidSetting
@@ -21,7 +21,7 @@ from services.errors import BusError, Conflict, NotFound, RegistryError, Rejecte
 from services.registry.models import ModelRegistry
 from services.schemas import StreamView
 from services.settings import StreamSettings
-from services.supervisor.gpu_sharing import WithMps
+from services.supervisor.gpu_sharing import WithMps, end_mps
 from services.supervisor.launcher import ByLauncher, Direct, Start
 from services.supervisor.process import ManagedProcess, ProcessState, StreamEvent
 from services.supervisor.worker import ProcessLimits, ProcessSpec, assigned, gpus, remove_dead, specs_of
@@ -242,8 +242,7 @@ class SupervisedStreams:
         finally:
             await asyncio.gather(*(self._stop(stream, "the server ends") for stream in self._streams.values()))
             await self._launcher.close(stop=True)
-            if self._mps is not None:
-                await self._mps.close()
+            await end_mps(self._runtime)
             await asyncio.to_thread(remove_dead)
 
     def streams(self) -> Sequence[Stream]:
@@ -273,11 +272,13 @@ class SupervisedStreams:
             raise Conflict(f"a stream named {name} already exists; delete it first, or choose another name")
         if len(self._streams) >= self._most:
             raise Conflict(f"there are {self._most} streams, which is limits.streams; delete one, or raise it")
+        specs = self._specs(name, settings)
+        engine = specs["engine"].engine
         made = self._streams[name] = Stream(
             settings,
-            self._specs(name, settings),
+            specs,
             self._runtime,
-            start=self._mps or self._launcher,
+            start=self._mps if self._mps is not None and engine is not None and engine.mps else self._launcher,
             on_event=self._on_event,
         )
         return made.view()
@@ -418,6 +419,7 @@ class SupervisedStreams:
         engine = specs["engine"].engine
         assert engine is not None
         placed = assigned(engine, [each for each in others if each is not None], gpus())
+        placed = replace(placed, mps=self._mps is not None and placed.device == "cuda")
         if (
             placed.gpu is not None
             and self._mps is None

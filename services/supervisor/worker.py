@@ -49,6 +49,7 @@ class EngineSpec(CallerEngineOptions):
         int | None,
         Option("Index of the GPU (`CUDA_VISIBLE_DEVICES`)", commands=(), null="the first one", ge=0, le=1023),
     ] = None
+    mps: Annotated[bool, Option("Use the GPU at the same time as other engines (`gpu.mps`)", commands=())] = False
 
 
 class _Strict(BaseModel):

@@ -13,7 +13,7 @@ from services.bus.runtime import RuntimeFolder
 from services.errors import CannotServe, RuntimeFolderUnusable
 from services.settings import StreamSettings
 from services.supervisor import gpu_sharing
-from services.supervisor.gpu_sharing import CONTROL, WithMps, check_mps
+from services.supervisor.gpu_sharing import CONTROL, WithMps, check_mps, end_mps
 from services.supervisor.stream import SupervisedStreams
 
 DAEMON = """#!/bin/sh
@@ -83,7 +83,7 @@ def test_engines_share_one_daemon_that_ends_with_the_service(runtime, program, m
     assert inner.calls == 2 * [("services.supervisor.engine", ["--spec", "x"], shared, True)]
     assert (runtime.path / ".mps").stat().st_mode & 0o077 == 0
     assert calls(runtime) == ["started"]
-    asyncio.run(with_mps.close())
+    asyncio.run(end_mps(runtime))
     assert calls(runtime) == ["started", "quit"] and not (runtime.path / ".mps" / "running").exists()
     assert asyncio.run(with_mps.how_ended(5)) == "5 ended"
 
@@ -94,7 +94,7 @@ def test_capture_is_no_client_and_starts_no_daemon(runtime, program):
     with_mps = WithMps(inner, runtime)
     start(with_mps, "capture")
     assert inner.calls[0][2] == {"CUDA_VISIBLE_DEVICES": "1"}
-    asyncio.run(with_mps.close())
+    asyncio.run(end_mps(runtime))
     assert list((runtime.path / ".mps").iterdir()) == []
 
 
@@ -103,7 +103,7 @@ def test_next_service_uses_daemon_of_one_that_died(runtime, program):
     start(WithMps(Started(), runtime))
     after = WithMps(Started(), runtime)
     start(after)
-    asyncio.run(after.close())
+    asyncio.run(end_mps(runtime))
     assert calls(runtime) == ["started", "quit"]
 
 
@@ -111,9 +111,9 @@ def test_ended_daemon_is_started_again_for_the_next_engine(runtime, program):
     program(DAEMON)
     with_mps = WithMps(Started(), runtime)
     start(with_mps)
-    asyncio.run(WithMps(Started(), runtime).close())
+    asyncio.run(end_mps(runtime))
     start(with_mps)
-    asyncio.run(with_mps.close())
+    asyncio.run(end_mps(runtime))
     assert calls(runtime) == ["started", "quit", "started", "quit"]
 
 
@@ -150,31 +150,100 @@ def test_check_names_the_missing_program(tmp_path, monkeypatch, program):
     check_mps()
 
 
-def test_streams_end_the_daemon_last(runtime, monkeypatch):
-    order = []
+class Launcher(Started):
+    """Stand-in for the launcher process, whose end tells which other programs have ended before."""
 
-    class Launcher(Started):
-        def __init__(self, folder, orphan_after_s):
-            super().__init__()
+    def __init__(self, folder, orphan_after_s):
+        super().__init__()
+        self.folder = folder
 
-        async def close(self, *, stop):
-            order.append("launcher")
+    def open(self):
+        pass
 
-    class Mps(WithMps):
-        async def close(self):
-            order.append("mps")
+    async def close(self, *, stop):
+        with (self.folder.path / ".mps" / "calls").open("a") as file:
+            file.write("launcher\n")
 
+
+@pytest.mark.parametrize("mps", [False, True])
+def test_streams_end_the_daemon_last_also_one_that_a_dead_service_left(runtime, program, monkeypatch, caplog, mps):
     monkeypatch.setattr("services.supervisor.stream.ByLauncher", Launcher)
-    monkeypatch.setattr("services.supervisor.stream.WithMps", Mps)
+    program(DAEMON)
+    start(WithMps(Started(), runtime))
 
-    async def run(mps):
+    async def run():
         async with SupervisedStreams(runtime, lambda event: None, mps=mps).running({}):
             pass
 
-    asyncio.run(run(True))
-    assert order == ["launcher", "mps"]
-    asyncio.run(run(False))
-    assert order == ["launcher", "mps", "launcher"]
+    asyncio.run(run())
+    assert calls(runtime) == ["started", "launcher", "quit"]
+    asyncio.run(run())
+    assert calls(runtime) == ["started", "launcher", "quit", "launcher"] and not caplog.records
+
+
+def test_daemon_that_does_not_end_is_logged(runtime, program, monkeypatch, caplog):
+    program(DAEMON)
+    start(WithMps(Started(), runtime))
+    program("#!/bin/sh\necho 'Cannot find MPS control daemon process'\nexit 1\n")
+    asyncio.run(end_mps(runtime))
+    assert "does not end: Cannot find MPS control daemon process" in caplog.text
+
+
+@pytest.mark.parametrize("mps", [False, True])
+def test_only_engines_on_a_gpu_are_clients(runtime, program, monkeypatch, mps):
+    program(DAEMON)
+    launchers = []
+
+    class Kept(Launcher):
+        def __init__(self, *arguments):
+            super().__init__(*arguments)
+            launchers.append(self)
+
+        async def close(self, *, stop):
+            pass
+
+    monkeypatch.setattr("services.supervisor.stream.ByLauncher", Kept)
+    monkeypatch.setattr("services.supervisor.stream.gpus", lambda: 1)
+
+    async def run():
+        streams = SupervisedStreams(runtime, lambda event: None, mps=mps)
+        two = {name: StreamSettings(source="synthetic:?width=64", device=name) for name in ("cuda", "cpu")}
+        async with streams.running(two), asyncio.timeout(20):
+            while len({(call[0], call[1][1]) for call in launchers[0].calls}) < 4:
+                await asyncio.sleep(0.01)
+
+    asyncio.run(run())
+    clients = {call[1][1] for call in launchers[0].calls if "CUDA_MPS_PIPE_DIRECTORY" in call[2]}
+    assert clients == ({str(runtime.stream("cuda").spec("engine"))} if mps else set())
+
+
+def test_engine_that_was_started_with_another_setting_is_replaced(runtime, monkeypatch):
+    monkeypatch.setattr("services.supervisor.stream.gpus", lambda: 1)
+    digests = {}
+    for mps in (False, True):
+        streams = SupervisedStreams(runtime, lambda event: None, mps=mps)
+        for name in ("cuda", "cpu"):
+            streams.create(name, StreamSettings(source="synthetic:?width=64", device=name))
+        digests[mps] = {each.name: each.specs["engine"].digest for each in streams.streams()}
+    assert digests[True]["cuda"] != digests[False]["cuda"] and digests[True]["cpu"] == digests[False]["cpu"]
+
+
+def test_reason_why_daemon_does_not_start_is_the_engines_reason(runtime, program, monkeypatch):
+    program("#!/bin/sh\necho 'MPS is not supported on this GPU'\nexit 3\n")
+    monkeypatch.setattr("services.supervisor.stream.ByLauncher", Launcher)
+    monkeypatch.setattr("services.supervisor.stream.gpus", lambda: 1)
+    events = []
+
+    async def run():
+        streams = SupervisedStreams(runtime, events.append, mps=True)
+        settings = StreamSettings(source="synthetic:?width=64", device="cuda")
+        async with streams.running({"theatre": settings}), asyncio.timeout(20):
+            while not [each for each in events if each.role == "engine" and each.kind == "ended"]:
+                await asyncio.sleep(0.01)
+
+    asyncio.run(run())
+    (first, *_) = [each.reason for each in events if each.role == "engine" and each.kind == "ended"]
+    assert first.startswith("it cannot be started: ") and "MPS is not supported on this GPU" in first
 
 
 @pytest.mark.parametrize("mps", [False, True])
