@@ -101,9 +101,11 @@ MOST_LEFT_PX, MOST_LEFT = 1.0, 0.25
 POSE_ERROR_PX = 0.6
 """Residual of static tissue in pixels, from errors of poses and tracking."""
 FEWEST_AGREEING = 0.6
-"""Smallest share of the views whose poses must explain the image motion."""
+"""Smallest share of the views whose poses must explain the image motion; also of the corners, where fewer than `FEWEST_POINTS` agree."""
+TOO_FEW = "too few points of the tissue can be tracked"
+"""Rejection reason if fewer than `FEWEST_POINTS` corners can be tracked, or agree although most of them do."""
 CONTRADICTED = "the poses do not explain how the pictures move: they are wrong, or the tissue itself moves"
-"""Rejection reason if fewer than `FEWEST_AGREEING` of the views, or fewer than `FEWEST_POINTS` corners, agree with the poses."""
+"""Rejection reason if fewer than `FEWEST_AGREEING` of the views, or of the corners where they are few, agree with the poses."""
 ROUNDS = 6
 """Rounds of iteratively reweighted least squares, which reduces the weight of corners on moving objects."""
 Array = NDArray[np.float64]
@@ -137,7 +139,7 @@ def explained_by_poses(reference: View, others: Sequence[View]) -> Parallax | st
     tracks = [_followed(reference, view, corners) for view in others]
     usable = [number for number, (_, found) in enumerate(tracks) if found.sum() >= FEWEST_POINTS]
     if not usable:
-        return "too few points of the tissue can be tracked"
+        return TOO_FEW
     terms = [_terms(corners, tracks[number][0], reference.camera, others[number].camera) for number in usable]
     c, d = (np.stack(each) for each in zip(*terms, strict=True))
     seen = np.stack([tracks[number][1] for number in usable])
@@ -162,7 +164,7 @@ def explained_by_poses(reference: View, others: Sequence[View]) -> Parallax | st
         return "there is too little parallax to estimate depth from"
     agree = (seen[kept] & (_off_px(c[kept], d[kept], focal, inverse) < 3 * MOST_LEFT_PX)).any(0)
     if agree.sum() < FEWEST_POINTS:
-        return CONTRADICTED
+        return TOO_FEW if agree.sum() >= FEWEST_AGREEING * seen[kept].any(0).sum() else CONTRADICTED
     own = np.sqrt(np.maximum(off**2 - POSE_ERROR_PX**2, 0)) / np.maximum(moved, LEAST_PARALLAX_PX)
     views = tuple(usable[number] for number in kept)
     return Parallax(inverse[agree], plane, views, float(moved.max()), float(np.median(own)))

@@ -117,13 +117,25 @@ class Trajectory:
         return 1 - (self.error_px / max(self.still_error_px, 1e-9)) ** 2
 
 
-def trajectory_of(frames: Iterable[Frame], camera: Camera, *, separate_breathing: bool = True) -> Trajectory:
+def _nothing() -> None:
+    pass
+
+
+def trajectory_of(
+    frames: Iterable[Frame],
+    camera: Camera,
+    *,
+    separate_breathing: bool = True,
+    while_refining: Callable[[], None] = _nothing,
+) -> Trajectory:
     """Estimate the poses of a recording's frames.
 
     Args:
         frames: frames in temporal order, read once.
         camera: intrinsics of all frames; must be a pinhole.
         separate_breathing: model periodic tissue motion. If False, it is part of the poses.
+        while_refining: called from several threads for each frame whose pose is estimated, after all frames were read. An
+            exception that it raises ends the estimation.
 
     Raises:
         InvalidInput: for another camera model, fewer than 3 or more than `MOST_FRAMES` frames, or
@@ -148,7 +160,7 @@ def trajectory_of(frames: Iterable[Frame], camera: Camera, *, separate_breathing
         raise InvalidInput(
             f"only {len(seen.frame)} observations of tissue could be tracked over {count} frames: the pictures contain too few recognisable points"
         )
-    return _Odometry(seen, camera, times_s).run(separate_breathing)
+    return _Odometry(seen, camera, times_s, while_refining).run(separate_breathing)
 
 
 def followed_part(frame: Frame) -> NDArray[np.uint8] | None:
@@ -162,7 +174,10 @@ def followed_part(frame: Frame) -> NDArray[np.uint8] | None:
 class _Odometry:
     """State of one recording's estimate, float64 on the CPU. Equal observations give bit-identical results."""
 
-    def __init__(self, seen: Observations, camera: Camera, times_s: list[float]) -> None:
+    def __init__(
+        self, seen: Observations, camera: Camera, times_s: list[float], while_refining: Callable[[], None] = _nothing
+    ) -> None:
+        self._while_refining = while_refining
         K, count = camera.K, len(times_s)
         self._count, self._times_s = count, torch.tensor(times_s, dtype=torch.float64)
         self._frame, self._point = torch.from_numpy(seen.frame), torch.from_numpy(seen.point)
@@ -210,6 +225,7 @@ class _Odometry:
         self._take_up(0)
         keys, next_adjustment = 1, 3
         for frame in range(1, self._count):
+            self._while_refining()
             self._poses[frame] = self._poses[frame - 1]
             if not self._place(frame):
                 self._lost.append(frame)
@@ -221,6 +237,7 @@ class _Odometry:
                 self._adjust(frame, flat_px)
                 next_adjustment = max(keys + 1, int(keys * GROWTH) + 1)
         for frame in range(1, self._count):
+            self._while_refining()
             if not self._is_key[frame]:
                 self._place(frame)
         return float(torch.log1p(errors_px(self._whole()).square()).sum())
@@ -463,7 +480,10 @@ class CameraPath:
 
 
 def camera_path_of(
-    frames: Sequence[Frame], camera: Camera, after_frame: Callable[[], None] = lambda: None
+    frames: Sequence[Frame],
+    camera: Camera,
+    after_frame: Callable[[], None] = _nothing,
+    while_refining: Callable[[], None] = _nothing,
 ) -> CameraPath:
     """Estimate the path of a scope. Periodic tissue motion stays a part of it, because it moves the pictures as well.
 
@@ -471,6 +491,7 @@ def camera_path_of(
         frames: frames in temporal order. Their depth, if any, gives the unit of length.
         camera: intrinsics, and the pose of the first frame.
         after_frame: called after each frame is tracked. An exception that it raises ends the estimation.
+        while_refining: as of `trajectory_of`.
 
     Raises:
         InvalidInput: for more than `MOST_PATH_FRAMES` frames, and as `trajectory_of`.
@@ -485,7 +506,7 @@ def camera_path_of(
             yield frame
             after_frame()
 
-    found = trajectory_of(read(), camera, separate_breathing=False)
+    found = trajectory_of(read(), camera, separate_breathing=False, while_refining=while_refining)
     poses = found.poses.copy()
     poses[:, :3, 3] *= _unit(frames, found, camera)
     return CameraPath(np.array([frame.time_s for frame in frames]), poses @ camera.world_to_camera, found)

@@ -298,7 +298,9 @@ class _Fitting:
                     path = self._path(inputs, lambda in_s: self._stop_requested())
                 except InvalidInput as error:
                     raise InvalidSetting(f"poses is 'estimated', but {error}") from error
-                if path is not None:
+                if path is None or self._stop_requested():
+                    self._notes.append("the estimation of poses was interrupted: the model has none")
+                else:
                     inputs = _posed(inputs, path)
             try:
                 inputs, learning, chosen = self._trained(inputs, steps)
@@ -426,8 +428,12 @@ class _Fitting:
             if is_late(spent_s / share - spent_s if tracked >= LEAST_TRACKED * len(frames) else 0.0):
                 raise _StopFitting
 
+        def while_refining() -> None:
+            if is_late(0.0):
+                raise _StopFitting
+
         try:
-            return camera_path_of(frames, inputs.source.description.camera, after_frame)
+            return camera_path_of(frames, inputs.source.description.camera, after_frame, while_refining)
         except _StopFitting:
             return None
 

@@ -166,6 +166,13 @@ def test_two_dozen_corners_must_agree_however_large_the_parallax(explained, agre
         assert len(found.inverse_depths) == 24
 
 
+@pytest.mark.parametrize(("count", "agreeing", "reason"), [(24, 23, "TOO_FEW"), (24, 13, "CONTRADICTED")])
+def test_few_corners_of_which_most_agree_are_too_few(explained, count, agreeing, reason):
+    off_px = np.zeros((40, 2))
+    off_px[agreeing:] = [0, 4]
+    assert explained(track(camera(8.0), off_px, count=count)) == getattr(multiview, reason)
+
+
 def test_corner_on_moving_object_is_left_out(explained):
     off_px = np.zeros((40, 2))
     off_px[:5] = [0, 3.2]

@@ -13,6 +13,7 @@ import torch
 from gsplat_core.errors import InvalidInput, RecordingInvalid
 from gsplat_core.io.bundle import load_bundle
 from gsplat_core.io.recordings import open_recording, synthesize
+from gsplat_core.poses import odometry
 from gsplat_core.training import offline
 from gsplat_core.training.metrics import psnr_tissue_db
 from operators.applications import reconstruct as module
@@ -102,7 +103,7 @@ def test_reason_for_missing_path_is_noted_and_training_continues(moving, tmp_pat
     monkeypatch.setattr(offline, "FIRST_STEPS", 1)
     monkeypatch.setattr(offline, "MOST_STEPS", 1)
 
-    def refused(frames, camera, after_frame):
+    def refused(frames, camera, after_frame, while_refining):
         raise InvalidInput("only 3 observations")
 
     monkeypatch.setattr(module, "camera_path_of", refused)
@@ -131,7 +132,7 @@ def test_poses_are_tried_if_trial_is_expected_to_end_in_time(
     now_s, scored, done = 0.0, [], 0
     estimate = module.camera_path_of
 
-    def timed(frames, camera, after_frame):
+    def timed(frames, camera, after_frame, while_refining):
         nonlocal now_s
 
         def count():
@@ -140,7 +141,7 @@ def test_poses_are_tried_if_trial_is_expected_to_end_in_time(
             done += 1
             after_frame()
 
-        path = estimate(frames, camera, count)
+        path = estimate(frames, camera, count, while_refining)
         now_s += refined_s
         return path
 
@@ -189,6 +190,29 @@ def test_stop_request_ends_estimation_of_requested_poses(moving, tmp_path):
     outcome = module.reconstruct(settings, steps=9, progress=noted, stop_requested=lambda: tracked > 2)
     assert tracked == 3 and outcome.interrupted and "poses" not in outcome.outputs
     assert any("interrupted after 1 of 9 training steps" in note for note in outcome.notes)
+    assert "the estimation of poses was interrupted: the model has none" in outcome.notes
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("poses", ["estimated", None])
+def test_stop_request_ends_refinement_of_path(moving, tmp_path, monkeypatch, poses):
+    """The request comes while the pose of the fourth frame is estimated from the tracks of all ten."""
+    monkeypatch.setattr(offline, "FIRST_STEPS", 1)
+    placed = []
+    place = odometry._Odometry._place
+
+    def counted(self, frame):
+        placed.append(frame)
+        return place(self, frame)
+
+    monkeypatch.setattr(odometry._Odometry, "_place", counted)
+    settings = module.ReconstructSettings(
+        recording=moving, out=tmp_path / "out", sinks=(), **{"poses": poses} if poses else {}
+    )
+    outcome = module.reconstruct(settings, stop_requested=lambda: 3 in placed, clock=lambda: 0.0)
+    assert placed and max(placed) <= 4, placed
+    assert outcome.interrupted and "poses" not in outcome.outputs
+    assert any("poses was interrupted" in note for note in outcome.notes) == (poses == "estimated")
 
 
 @pytest.mark.slow
