@@ -249,6 +249,10 @@ FILLED_PX = 160
 """Smallest width in pixels to which depth is reduced before `depth_at_pixels` extrapolates it."""
 
 
+SAMPLED_SHARE = 0.5
+"""Smallest density of depth among the samples of a reduced picture, relative to the whole picture, with which it is used."""
+
+
 def depth_at_pixels(pixels: NDArray[np.float64], frame: Frame, default_depth_mm: float) -> NDArray[np.float32]:
     """Return z in millimetres at pixels [M, 2] as `tissue_depth`, but extrapolated at a reduced size, because a stream's picture
     waits for it.
@@ -264,7 +268,7 @@ def depth_at_pixels(pixels: NDArray[np.float64], frame: Frame, default_depth_mm:
         step = max(1, measured.shape[1] // FILLED_PX)
         rows, columns = (min(step // 2, size - 1) for size in measured.shape)
         some = known[rows::step, columns::step]
-        if not some.any():
+        if some.mean() < SAMPLED_SHARE * known.mean():  # depth in lines between the samples
             return np.where(there, found, tissue_depth(frame, default_depth_mm)[row, column])
         coarse = filled_depth(measured[rows::step, columns::step], some)
         at = (np.minimum(each // step, size - 1) for each, size in zip((row, column), coarse.shape, strict=True))

@@ -194,6 +194,15 @@ def test_depth_at_pixels_finds_known_pixels_between_samples():
     assert found[0] == 80 and 40 <= found[1] <= 160
 
 
+def test_depth_at_pixels_uses_depth_in_lines_between_samples():
+    """A wrong depth at the only sampled pixel has no more weight than the other pixels."""
+    depth = np.zeros((60, 640))
+    depth[::4] = 80.0
+    depth[2, 2] = 20.0
+    found = depth_at_pixels(np.array([[300.0, 30.0], [630.0, 50.5], [200.0, 2.0]]), with_depth(depth), 60.0)
+    np.testing.assert_allclose(found, 80, rtol=0.02)
+
+
 @pytest.mark.parametrize("coarse", [1, 2, 4])
 def test_filled_averages_cells_and_extrapolates_into_holes(coarse):
     values = torch.arange(64.0).repeat(48, 1)[None]
