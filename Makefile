@@ -53,7 +53,7 @@ format: .venv/.development
 fuzz: native .venv/.development
 	$(BIN)/python -m tests.system.api_fuzzing --examples $(EXAMPLES)
 
-# Measure this machine into benchmarks/logs/cpu. `make results` generates RESULTS.md and the README's table from the logs.
+# Measure this machine into benchmarks/logs/cpu. `make results` generates RESULTS.md, the generated pages of benchmarks/results and the README's tables from the logs.
 bench: native .venv/.development
 	$(BIN)/python benchmarks/suite.py --device cpu
 	$(BIN)/python benchmarks/publish.py

@@ -1,7 +1,7 @@
 #!/bin/bash
 # Run the steps of docker/Dockerfile's target `cpu` without a Docker engine, in a root created by debootstrap instead of the base image
 # (Debian bookworm with its own Python 3.11). At the end the service and its health check run as user 10001.
-# Needs root, debootstrap, a network, 12 GB and half an hour. Usage: docker/check_in_clean_root.sh FOLDER [MIRROR]
+# Needs root, debootstrap, a network, 12 GB and 5 minutes (with a package mirror) to half an hour. Usage: docker/check_in_clean_root.sh FOLDER [MIRROR]
 # TORCH_INDEX_URL and TORCH_SHA256 have the meaning of the image's build arguments. With an empty TORCH_INDEX_URL, torch comes from the lock.
 set -euo pipefail
 repository=$(cd "$(dirname "$0")/.." && pwd)

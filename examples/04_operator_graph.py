@@ -1,6 +1,6 @@
 """Write an operator and run it in a graph.
 
-A custom operator measures how much of each frame the tool covers. It runs in parallel with a second branch whose operator fails
+A custom operator measures how much of each frame the tool covers. It runs beside a second branch whose operator fails
 on one frame: its fault policy ends that branch, and the first branch continues to the end of the recording.
 
 Usage: python examples/04_operator_graph.py [--engine embedded|holoscan]
