@@ -169,7 +169,7 @@ def stream_options(name: StreamName, option: OptionsOption = None, service: Serv
     """
     wanted = assigned(option or ())
     found = service(lambda client: client.set_stream_options(name, wanted) if wanted else client.stream(name))
-    typer.echo(json_format.dumps(found.options))
+    typer.echo(json_format.dumps({key: value for key, value in found.options.items() if value is not None}))
     return OK
 
 

@@ -106,6 +106,10 @@ def test_ctl_options_changes_named_options_only_and_prints_those_that_are_set(ct
     code, out, _ = ctl("options", "theatre-1", "--option", "engine_scale=0.5")
     assert code == OK and json.loads(out) == {"seed": 7, "tool_mask": "none", "engine_scale": 0.5}
     assert service.stream("theatre-1").options == json.loads(out)
+    assert json.loads(ctl("options", "theatre-1", "--option", "seed=null")[1]) == {
+        "tool_mask": "none",
+        "engine_scale": 0.5,
+    }
     code, _, err = ctl("options", "theatre-1", "--option", "unknown=1")
     assert code == BAD_INPUT and "nearest" in err
 
