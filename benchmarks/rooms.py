@@ -56,7 +56,6 @@ def main() -> int:
     parser.add_argument("--rooms", type=int, default=4)
     parser.add_argument("--seconds", type=float, default=15.0, help="duration of each stream")
     parser.add_argument("--device", default="cuda")
-    parser.add_argument("--budget-ms", type=float, help="as of `intrasplat live`; the default otherwise")
     parser.add_argument("--mps", action="store_true", help="use NVIDIA's Multi-Process Service")
     options = parser.parse_args()
     with multi_process_service() if options.mps else nullcontext(os.environ) as environment:
@@ -67,7 +66,6 @@ def measure(options: argparse.Namespace, environment: Mapping[str, str]) -> int:
     """Run the rooms and print their figures; return the exit code."""
     words = [sys.executable, str(PLAIN), "live", options.recording, "--device", options.device, "--fps", "30", "--loop"]
     words += ["--seconds", str(options.seconds)]
-    words += [] if options.budget_ms is None else ["--budget-ms", str(options.budget_ms)]
     running = [
         subprocess.Popen(words, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         for _ in range(options.rooms)
@@ -81,7 +79,6 @@ def measure(options: argparse.Namespace, environment: Mapping[str, str]) -> int:
     summary = {
         "rooms": len(rooms),
         "mps": options.mps,
-        "budget_ms": options.budget_ms,
         "displayed_db": min(each["displayed_db"] for each in rooms),
         "previous_frame_db": rooms[0]["previous_frame_db"],
         "age_p99_ms": max(each["age_p99_ms"] for each in rooms),

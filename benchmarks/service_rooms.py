@@ -20,7 +20,7 @@ from run_facts import run_facts
 from service_server import Server
 from service_watchers import Watch, quantiles
 
-from services.supervisor.gpu_sharing import CONTROL, FOLDER
+from services.supervisor.gpu_sharing import CONTROL, FOLDER, variables
 
 SOURCE = "synthetic:?width=320&height=256&frames=24&fps=30"
 LIVE_WITHIN_S = 120.0
@@ -82,8 +82,7 @@ def until_live(server: Server, names: list[str]) -> None:
 
 def clients(server: Server) -> set[int]:
     """Return the process ids of the clients of the service's Multi-Process Service."""
-    folder = os.fspath(server.runtime / FOLDER)
-    environment = {**os.environ, "CUDA_MPS_PIPE_DIRECTORY": folder, "CUDA_MPS_LOG_DIRECTORY": folder}
+    environment = {**os.environ, **variables(server.runtime / FOLDER)}
 
     def ask(command: str) -> list[int]:
         said = subprocess.run(
