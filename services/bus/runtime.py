@@ -240,7 +240,10 @@ class StreamFolder:
             for path in (self.spec(role), self.log(role), self.path / f"{role}.lock", self.path / f"{role}.show"):
                 path.unlink(missing_ok=True)
         self.engine_size.unlink(missing_ok=True)
-        self.path.rmdir()
+        for part in self.path.glob("*.part"):  # of a process that was killed while it wrote
+            part.unlink(missing_ok=True)
+        if self.path.exists():
+            self.path.rmdir()
 
 
 def own_folder(path: Path) -> None:
@@ -284,9 +287,13 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Replace a file atomically, readable by its owner only."""
     part = path.with_name(f"{path.name}.{os.getpid()}.part")
     descriptor = os.open(part, os.O_CREAT | os.O_WRONLY | os.O_TRUNC | os.O_CLOEXEC, 0o600)
-    with open(descriptor, "wb") as file:
-        file.write(packed_json(content))
-    os.replace(part, path)
+    try:
+        with open(descriptor, "wb") as file:
+            file.write(packed_json(content))
+        os.replace(part, path)
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise
 
 
 def read_json(path: Path) -> dict[str, Any]:

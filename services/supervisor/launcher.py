@@ -77,12 +77,12 @@ def cause_of(how: str) -> str:
 
 
 def last_words(log: Path) -> str:
-    """Return the last error in a process's log, or its last line if it has no error; empty without a log."""
+    """Return the last error in a process's log, or its last line if it has no error; empty without a readable log."""
     try:
         with open(log, "rb") as file:
             file.seek(max(0, file.seek(0, os.SEEK_END) - _TAIL_BYTES))
             lines = [line.strip() for line in file.read().decode(errors="replace").split("\n") if line.strip()]
-    except FileNotFoundError:
+    except OSError:
         return ""
     errors = [index for index, line in enumerate(lines) if (match := _LOGGED.match(line)) and match["level"] == "ERROR"]
     if errors:

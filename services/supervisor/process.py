@@ -252,7 +252,10 @@ class ManagedProcess:
 
     async def _keep(self) -> None:
         while True:
-            identity = await self._running()
+            try:
+                identity = await self._running()
+            except OSError as error:
+                identity, self._down = None, ("down", f"it cannot be started: {error}")
             if identity is not None:
                 how = await self._watched(identity)
             elif self._down[0] == "down":  # it could not be started
@@ -260,9 +263,12 @@ class ManagedProcess:
             else:
                 how = "it ended at once"
             self._identity, self._heartbeat = None, None
-            if self._folder.record(self._role) is not None:
-                continue  # another process already serves this role; adopt it
-            self._folder.clean(self._role)
+            try:
+                if self._folder.record(self._role) is not None:
+                    continue  # another process already serves this role; adopt it
+                self._folder.clean(self._role)
+            except OSError as error:
+                log.warning("%s %s: %s", self._spec.stream, self._role, error)
             well_s = time.monotonic() - self._well_s if self._well_s else 0.0
             wait_s = self._restarts.ended(well_s)
             self._causes[cause_of(how)] += 1
@@ -291,6 +297,7 @@ class ManagedProcess:
         return await self._started()
 
     async def _started(self) -> ProcessIdentity | None:
+        self._folder.path.mkdir(mode=0o700, exist_ok=True)  # it may have been deleted
         output = self._folder.log(self._role)
         if output.exists() and output.stat().st_size > MOST_LOG_BYTES:
             output.unlink()
@@ -300,7 +307,17 @@ class ManagedProcess:
         self._down = "starting", "it is being started"
         try:
             module, fresh = f"services.supervisor.{self._role}", self._restarts.never_well >= FRESH_AFTER
-            pid = await self._start.start(module, arguments, output, self._environment(), fresh=fresh)
+            starting = asyncio.create_task(
+                self._start.start(module, arguments, output, self._environment(), fresh=fresh)
+            )
+            try:
+                pid = await asyncio.shield(starting)
+            except asyncio.CancelledError:
+                # The process may exist already. `close` ends the identity that is known here.
+                await asyncio.wait({starting})
+                if starting.exception() is None:
+                    self._identity = ProcessIdentity.of(starting.result())
+                raise
         except OSError as error:
             self._down = "down", f"it cannot be started: {error}"
             return None

@@ -103,3 +103,19 @@ def test_remove_deletes_all_files_of_stream(runtime):
         path.touch()
     stream.remove()
     assert runtime.streams() == []
+
+
+def test_failed_write_leaves_no_part_file(tmp_path):
+    target = tmp_path / "engine.json"
+    target.mkdir()
+    with pytest.raises(OSError):
+        write_json(target, {})
+    assert [path.name for path in tmp_path.iterdir()] == ["engine.json"]
+
+
+def test_remove_deletes_parts_of_killed_writers(runtime):
+    stream = runtime.stream("room-1")
+    (stream.path / "engine.spec.7.part").write_bytes(b"{")
+    stream.remove()
+    assert not stream.path.exists()
+    stream.remove()  # also if it is deleted already

@@ -443,3 +443,62 @@ def test_listen_ignores_malformed_and_foreign_heartbeats(runtime, monkeypatch):
     with pytest.raises(asyncio.CancelledError):
         asyncio.run(process._listen())
     assert process._heartbeat == {"pid": 7, "state": "live"} and closed == [None]
+
+
+def test_close_during_start_ends_the_started_process(runtime):
+    async def close() -> tuple[int, list[Any]]:
+        asked, children = asyncio.Event(), []
+
+        class SlowStart(Direct):
+            async def start(self, *arguments, **options):
+                asked.set()
+                await asyncio.sleep(0.05)  # a launcher's answer, which comes after its fork
+                children.append(await asyncio.create_subprocess_exec("sleep", "60"))
+                return children[0].pid
+
+            async def how_ended(self, pid):
+                return f"exit status {await children[0].wait()}"
+
+        process = managed(runtime, start=SlowStart())
+        process.open()
+        await asyncio.wait_for(asked.wait(), 10)
+        await process.close("it was requested")
+        return children[0].returncode, process.events
+
+    code, events = asyncio.run(close())
+    assert code == -signal.SIGTERM
+    assert events[-1].kind == "stopped"
+
+
+@pytest.mark.parametrize("wrong", ["the specification", "the folder"])
+def test_supervision_goes_on_after_file_errors(runtime, monkeypatch, wrong):
+    monkeypatch.setattr(processes, "MOST_S", 0.01)
+    monkeypatch.setattr(processes, "is_of_no_use", lambda how: True)  # a wait of MOST_S between starts
+
+    async def run() -> list[str]:
+        start = Starter()
+        process = managed(runtime, start=start)
+        folder = process._folder
+        reasons = []
+        if wrong == "the folder":
+            folder.path.rmdir()
+            folder.path.write_bytes(b"")  # nothing can be written into a file
+        else:
+            folder.spec("engine").mkdir()  # which a file cannot replace
+        process.open()
+        for _ in range(1000):
+            await asyncio.sleep(0.005)
+            if process._causes.total() >= 2 and not reasons:
+                reasons.append(process.state.reason)
+                assert not start.started
+                if wrong == "the folder":
+                    folder.path.unlink()
+                else:
+                    folder.spec("engine").rmdir()
+            if start.started:
+                break
+        assert start.started, "it is started once the folder can be used"
+        await process.close("done")
+        return reasons
+
+    assert asyncio.run(run())[0]
