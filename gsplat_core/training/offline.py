@@ -561,7 +561,12 @@ class ChosenSteps:
             "most": f"{MOST_STEPS} steps are the most that are tried",
         }
         if self.reason == "few frames":
-            return f"{self.steps} training steps, the usual number: too few frames to keep some for validation"
+            usual = (
+                "the usual number"
+                if self.steps >= USUAL_STEPS
+                else f"fewer than the usual {USUAL_STEPS}, because the time limit leaves no time for more; --minutes raises it"
+            )
+            return f"{self.steps} training steps, {usual}: too few frames to keep some for validation"
         found = f" (validation frames: {tried})" if tried else ""
         kept = ". There was no time left to train on the validation frames too" if self.keeps_trial else ""
         return f"{self.steps} training steps were chosen{found}: {reasons[self.reason]}{kept}"

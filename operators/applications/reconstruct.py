@@ -5,6 +5,7 @@ Held-out frames (1, 9, 17, ...) are excluded from training. The evaluation uses 
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -64,6 +65,8 @@ MINUTES_ON_GPU, MINUTES_ON_CPU = 0.75, 10.0
 """Time limits in minutes of an offline reconstruction that chooses its number of optimiser steps automatically."""
 ALTERNATIVES_UNTIL = 0.6
 """Share of the time limit at which the last trial of other inputs (poses, depth, eyes) must be expected to end."""
+RATE_STEPS = 50
+"""Number of steps after which the duration of a training without trials is extrapolated."""
 TRACKING_SHARE, LEAST_TRACKED = 0.7, 0.1
 """Share of the duration of a path's estimation in which points are tracked, and share of the frames to be tracked before the
 duration is extrapolated from them.
@@ -119,6 +122,15 @@ requested.
 
 class _StopFitting(Exception):
     """Raised by a progress callback to end the training, or the estimation of the scope's path."""
+
+
+class _TooManySteps(Exception):
+    """Raised by a progress callback if a training would end after the time limit."""
+
+    def __init__(self, possible: int) -> None:
+        super().__init__(possible)
+        self.possible = possible
+        """Number of steps of a new training that ends in time."""
 
 
 def reconstruct(
@@ -324,12 +336,22 @@ class _Fitting:
         if steps is not None:
             chosen = ChosenSteps(steps, (), "given")
         elif len(inputs.validating) < LEAST_FRAMES:
-            chosen = ChosenSteps(USUAL_STEPS, (), "few frames")
+            return self._usually_trained(inputs)
         else:
             inputs, chosen = self._chosen(inputs)
         if chosen.keeps_trial and self._best is not None:
             return inputs, self._best.learning, chosen
         return inputs, self._train(inputs, inputs.given, chosen.steps, "train"), chosen
+
+    def _usually_trained(self, inputs: _Inputs) -> tuple[_Inputs, Reconstructor, ChosenSteps]:
+        """Train for the usual number of steps, or for as many as fit into the time limit. Raises _Interrupted."""
+        steps, until_s = USUAL_STEPS, self._begin_s + 60 * self._minutes
+        try:
+            learning = self._train(inputs, inputs.given, steps, "train", until_s)
+        except _TooManySteps as error:
+            steps = error.possible
+            learning = self._train(inputs, inputs.given, steps, "train")
+        return inputs, learning, ChosenSteps(steps, (), "few frames")
 
     def _kept(self, interrupted: _Interrupted) -> tuple[_Inputs, Reconstructor, ChosenSteps]:
         """Return inputs, training and steps of the best trial, or of the interrupted training before any trial was complete."""
@@ -467,17 +489,25 @@ class _Fitting:
             return settings.minutes
         return MINUTES_ON_CPU if settings.device == "cpu" else MINUTES_ON_GPU
 
-    def _train(self, inputs: _Inputs, given: ToFit, steps: int, stage: str) -> Reconstructor:
-        """Train an untrained reconstructor and return it. Raises _Interrupted after a stop request."""
+    def _train(self, inputs: _Inputs, given: ToFit, steps: int, stage: str, until_s: float = math.inf) -> Reconstructor:
+        """Train an untrained reconstructor and return it. Raises _Interrupted after a stop request, and _TooManySteps if the
+        first steps show that the training would end after `until_s`."""
         self._tried = None  # frees the memory of a trial that was not kept
         learning = inputs.new()
-        begin_s, done = self._clock(), 0
+        begin_s, done, first_s = self._clock(), 0, 0.0
 
         def after_step(step: int, loss: Tensor) -> None:
-            nonlocal done
+            nonlocal done, first_s
             if not done:
-                self._setup_s = self._clock() - begin_s
+                first_s = self._clock()
+                self._setup_s = first_s - begin_s
             done = step
+            if step == RATE_STEPS and until_s < math.inf:
+                now_s = self._clock()
+                per_step_s = (now_s - first_s) / (step - 1)
+                if now_s + (steps - step) * per_step_s > until_s:
+                    left_s = until_s - now_s - self._setup_s
+                    raise _TooManySteps(max(RATE_STEPS, math.floor(left_s / per_step_s)))
             if self._progress is not None:
                 self._progress(Progress(stage, step, steps, unit="steps"))
             if self._stop_requested():

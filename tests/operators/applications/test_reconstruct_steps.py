@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import itertools
 import json
 
 import pytest
@@ -96,3 +98,25 @@ def test_stop_request_during_training_of_given_steps_keeps_what_was_made(setting
     assert any(
         "interrupted after 5 of 20 training steps; the model is as it was then" in note for note in outcome.notes
     )
+
+
+@pytest.mark.parametrize(("seconds_per_call", "steps"), [(0.0, 40), (0.5, 40), (2.0, 18)])
+def test_few_frames_are_trained_within_the_time_limit(settings, monkeypatch, seconds_per_call, steps):
+    """The clock advances at each of its calls: at the start of each training, at its first step and at the one that
+    extrapolates. With 2 s a call, nine steps seem to take 2 s, and 4 of 12 s are left.
+    """
+    for path in sorted(settings.recording.iterdir())[2:]:
+        path.unlink()
+    monkeypatch.setattr(module, "USUAL_STEPS", 40)
+    monkeypatch.setattr(offline, "USUAL_STEPS", 40)
+    monkeypatch.setattr(module, "RATE_STEPS", 10)
+    calls = itertools.count()
+    trained = []
+    outcome = reconstruct(
+        dataclasses.replace(settings, minutes=12 / 60),
+        progress=lambda each: trained.append((each.done, each.total)) if each.stage == "train" else None,
+        clock=lambda: seconds_per_call * next(calls),
+    )
+    chosen = outcome.find(offline.ChosenSteps)
+    assert (chosen.steps, chosen.reason) == (steps, "few frames") and trained[-1] == (steps, steps)
+    assert ("fewer than the usual 40, because the time limit" in chosen.sentence) is (steps < 40)
