@@ -265,7 +265,7 @@ class MaskAndDepthStage(Stage):
             if checked.finding is not None:
                 self.found[checked.finding] += 1
                 frame = frame.with_fields(depth=checked.depth)
-        fault = None if frame.mask is None else self._mask.fault(frame.mask, frame.pts_ns)
+        fault = None if frame.mask is None else self._mask.fault(frame.mask, frame.image, frame.pts_ns)
         return frame if fault is None else self.withhold(frame, fault)
 
 

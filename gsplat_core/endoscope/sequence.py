@@ -438,6 +438,10 @@ LOST_FRAMES, LOST_S = 5, 0.19
 """Largest number of consecutive frames with a lost mask, and their duration in seconds. After that the tool counts as
 withdrawn.
 """
+CHANGED_LEVELS = 20
+"""Median difference of a picture from the previous one over the tool, in grey levels, from which a mask without any tool is
+believed: the tool was withdrawn, or the scene changed.
+"""
 FARTHEST_MM = 2000.0
 """Largest plausible depth for an endoscope, in millimetres."""
 WRONG_DEPTH_SHARE = 0.2
@@ -449,16 +453,26 @@ UNUSUAL_FRAMES = 10
 
 
 class MaskCheck:
-    """Check of tool masks for missing tissue, and for tools that disappear suddenly."""
+    """Check of tool masks for missing tissue, and for tools that disappear from the mask but not from the picture."""
 
     def __init__(self) -> None:
         self._tool_share = 0.0
+        self._tool: NDArray[np.bool_] | None = None
+        """Sampled pixels of the tool in the newest mask that did not count as lost."""
+        self._picture: NDArray[np.uint8] | None = None
+        """Sampled previous picture; None without a tool."""
         self._lost = 0
         self._seen_ns = 0
         """Timestamp in nanoseconds of the newest mask that did not count as lost."""
 
-    def fault(self, mask: NDArray[np.generic], pts_ns: int) -> str | None:
-        """Return "no tissue" or "tool mask lost" for a faulty mask [H, W] (1 = tissue) at `pts_ns`, else None."""
+    def fault(self, mask: NDArray[np.generic], image: NDArray[np.uint8], pts_ns: int) -> str | None:
+        """Return "no tissue" or "tool mask lost" for a faulty mask, else None.
+
+        Args:
+            mask: tool mask [H, W], 1 = tissue.
+            image: picture of that mask, uint8 [H, W, 3].
+            pts_ns: its timestamp in nanoseconds.
+        """
         some = _some(mask)
         tissue = np.count_nonzero(some) / some.size
         if tissue < LEAST_TISSUE:
@@ -466,10 +480,22 @@ class MaskCheck:
         lost_s = (pts_ns - self._seen_ns) * 1e-9
         gone = tissue == 1.0 and self._tool_share >= LOST_TOOL_SHARE
         if gone and self._lost < LOST_FRAMES and 0 <= lost_s <= LOST_S:
-            self._lost += 1
-            return "tool mask lost"
+            picture = _some(image)
+            if not self._changed(picture):
+                self._lost, self._picture = self._lost + 1, picture
+                return "tool mask lost"
         self._tool_share, self._seen_ns, self._lost = 1 - tissue, pts_ns, 0
+        has_tool = self._tool_share >= LOST_TOOL_SHARE
+        self._tool, self._picture = (some == 0, _some(image)) if has_tool else (None, None)
         return None
+
+    def _changed(self, picture: NDArray[np.uint8]) -> bool:
+        """Return True if the picture differs from the previous one where the tool was."""
+        before, tool = self._picture, self._tool
+        if before is None or tool is None or before.shape != picture.shape:
+            return True
+        difference = np.abs(picture[tool].astype(np.int16) - before[tool])
+        return float(np.median(difference.mean(axis=1))) >= CHANGED_LEVELS
 
 
 @dataclass(frozen=True)
@@ -524,5 +550,5 @@ class DepthCheck:
 
 def _some(plane: NDArray[Any]) -> NDArray[Any]:
     """Return every n-th row and column of a plane, about `SAMPLES` along its shorter side."""
-    step = max(STEP_PX, min(plane.shape) // SAMPLES)
+    step = max(STEP_PX, min(plane.shape[:2]) // SAMPLES)
     return np.ascontiguousarray(plane[::step, ::step])

@@ -16,21 +16,52 @@ def mask(tool_columns, size=40):
     return plane
 
 
+def picture(tool_columns, size=40, tissue=150):
+    """Grey instrument before tissue."""
+    image = np.full((size, size, 3), (tissue, 60, 60), np.uint8)
+    image[:, :tool_columns] = 90
+    return image
+
+
 def test_mask_check_reports_no_tissue_for_frame_full_of_tool():
     check = MaskCheck()
-    assert [check.fault(mask(columns), 0) for columns in (8, 40, 8)] == [None, "no tissue", None]
+    assert [check.fault(mask(columns), picture(columns), 0) for columns in (8, 40, 8)] == [None, "no tissue", None]
 
 
 @pytest.mark.parametrize(("fps", "lost"), [(60, 5), (30, 5), (25, 4), (5, 0)])
 def test_mask_check_reports_lost_mask_for_limited_time(fps, lost):
     check = MaskCheck()
-    found = [check.fault(mask(columns), round(k * 1e9 / fps)) for k, columns in enumerate((12, 12, *[0] * 12, 12))]
+    found = [
+        check.fault(mask(columns), picture(12), round(k * 1e9 / fps))
+        for k, columns in enumerate((12, 12, *[0] * 12, 12))
+    ]
     assert found == [None, None] + ["tool mask lost"] * lost + [None] * (13 - lost)
 
 
 def test_mask_check_accepts_tool_leaving_gradually():
     check = MaskCheck()
-    assert {check.fault(mask(columns, 160), 0) for columns in (48, 36, 20, 4, 0, 0)} == {None}
+    assert {check.fault(mask(columns, 160), picture(48, 160), 0) for columns in (48, 36, 20, 4, 0, 0)} == {None}
+
+
+@pytest.mark.parametrize(
+    ("before", "after"), [(picture(12), picture(0)), (picture(12), picture(0, tissue=90)[..., ::-1])]
+)
+def test_mask_check_believes_that_tool_is_gone_if_the_picture_changes_there(before, after):
+    check = MaskCheck()
+    assert check.fault(mask(12), before, 0) is None
+    assert check.fault(mask(0), after, 33_000_000) is None, "withdrawn, or another scene"
+
+
+def test_mask_check_compares_consecutive_pictures():
+    check = MaskCheck()
+    shown = [picture(12), picture(12), picture(0), picture(0)]
+    masks = [mask(12), *[mask(0)] * 3]
+    found = [check.fault(*each, 33_000_000 * k) for k, each in enumerate(zip(masks, shown, strict=True))]
+    assert found == [None, "tool mask lost", None, None]
+    brightened = [np.minimum(picture(12).astype(int) + 15 * k, 255).astype(np.uint8) for k in range(4)]
+    check = MaskCheck()
+    found = [check.fault(*each, 33_000_000 * k) for k, each in enumerate(zip(masks, brightened, strict=True))]
+    assert found == [None, *["tool mask lost"] * 3], "each picture is like the one before"
 
 
 def plane(value=60.0):
@@ -79,7 +110,7 @@ def test_depth_and_mask_checks_accept_any_values(height, width, dtype, seed):
     depth[rng.random((height, width)) < 0.2] = np.nan
     found = DepthCheck().checked(depth)
     assert found.depth is None or np.isfinite(found.depth).all()
-    MaskCheck().fault(rng.integers(0, 2, (height, width), np.uint8), 0)
+    MaskCheck().fault(rng.integers(0, 2, (height, width), np.uint8), np.zeros((height, width, 3), np.uint8), 0)
 
 
 @pytest.mark.parametrize("shape", [(1024, 4096), (4096, 1024), (40, 60)])
