@@ -132,6 +132,10 @@ async def create_stream(request: Request, caller: CallerOf, wanted: StreamReques
     found = streams_of(request)
     if not caller.may_use(wanted.name):
         raise Forbidden(f"the key {caller.name} is limited to other streams; make {wanted.name} with another key")
+    if wanted.show != "live" and caller.streams is not None:
+        raise Forbidden(
+            f"the key {caller.name} is limited to streams and sees no models; show live, or use another key"
+        )
     address = _ADDRESS.fullmatch(wanted.source)
     detail = {"scheme": "" if address is None else address["scheme"][:20], "show": wanted.show}
     async with recorded(request, caller, "stream.create", wanted.name, {**detail}):

@@ -463,6 +463,8 @@ class ShownModels:
         """Time at which an engine refused `show_model`, by stream, model and version."""
         self._requests: dict[str, ModelRequest] = {}
         """Last `show_model` command by stream, until its model is rolled back."""
+        self._without_earlier: dict[str, tuple[str, int, str]] = {}
+        """Name, version and reason of a model that an engine gave up and that has no earlier version, by stream."""
 
     @asynccontextmanager
     async def following(self) -> AsyncIterator[None]:
@@ -513,6 +515,13 @@ class ShownModels:
         if (shown.get("name"), shown.get("version")) == (name, active.version):
             stream.model_fault = None
             return
+        if self._is_held_back(stream.name, name, active.version, engine.figures):
+            *_, reason = self._without_earlier[stream.name]
+            stream.model_fault = (
+                f"{name}/{active.version} was given up ({reason}) and has no earlier version; activate another version,"
+                " or restart the stream to try it again"
+            )
+            return
         now_s, which = asyncio.get_running_loop().time(), (stream.name, name, active.version)
         if now_s - self._refused.get(which, -AGAIN_S) < AGAIN_S:
             return
@@ -537,11 +546,25 @@ class ShownModels:
         if (name, version) != (request.name, request.version):
             return
         del self._requests[stream]
-        change = await asyncio.to_thread(
-            self._registry.rollback, name, "engine", expected_current=version, reason=reason
-        )
+        try:
+            change = await asyncio.to_thread(
+                self._registry.rollback, name, "engine", expected_current=version, reason=reason
+            )
+        except Conflict:
+            self._without_earlier[stream] = given_up[-1]
+            raise
         self._events.tell("model.rollback", name, given_up=version, version=change.version, stream=stream)
         log.error("%s/%d was rolled back to %d: %s", name, version, change.version, reason)
+
+    def _is_held_back(self, stream: str, name: str, version: int, figures: Mapping[str, Any]) -> bool:
+        """Return True if the stream's running engine gave up this version, which has no earlier one. It would give it up again."""
+        held = self._without_earlier.get(stream)
+        if held is None:
+            return False
+        if held in _given_up(figures) and held[:2] == (name, version):
+            return True
+        del self._without_earlier[stream]  # another version is active, or the engine is a new one
+        return False
 
 
 def _given_up(figures: Mapping[str, Any]) -> GivenUp:

@@ -30,7 +30,7 @@ from services.bus.runtime import ProcessIdentity, Role, StreamFolder, read_json,
 from services.errors import BadMessage
 from services.settings import StreamSettings
 
-StreamName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]{0,31}$")]
+StreamName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]{0,39}$")]
 NVIDIA = Path("/proc/driver/nvidia/gpus")
 
 
@@ -142,8 +142,8 @@ def specs_of(name: str, stream: StreamSettings, limits: ProcessLimits | None = N
     Raises:
         InvalidSetting: if an option is unknown or out of range, or the source cannot be opened.
     """
+    check_stream_options(stream.options)
     options = {name: value for name, value in stream.options.items() if value is not None}
-    check_stream_options(options)
     check_address(stream.source)
     kind, _, number = stream.device.partition(":")
     if kind == "auto":

@@ -439,6 +439,8 @@ def test_limited_key_lists_starts_and_creates_only_its_streams(limited):
     assert ask("GET", "/v1/streams/nowhere").status_code == 403, "it does not tell which streams there are"
     assert ask("GET", "/v1/me").json()["streams"] == ["new", "theatre-1"]
     wanted = {"source": "synthetic:", "start": False}
+    refused = ask("POST", "/v1/streams", json={"name": "new", "show": "model liver", **wanted})
+    assert refused.status_code == 403 and "sees no models" in refused.json()["detail"]
     assert ask("POST", "/v1/streams", json={"name": "new", **wanted}).status_code == 201
     assert ask("POST", "/v1/streams", json={"name": "other", **wanted}).status_code == 403
     assert ask("POST", "/v1/streams", "viewer", json={"name": "new", **wanted}).status_code == 403

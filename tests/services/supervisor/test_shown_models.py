@@ -126,6 +126,26 @@ def test_first_version_given_up_by_engine_raises_conflict(parts):
         show_active_times(parts)
 
 
+def test_first_version_given_up_is_not_shown_again_by_the_same_engine(parts):
+    show_active_times(parts)
+    parts.engine.gives_up(1, "it took 399 ms", instead=None)
+    follow_times(parts, 5)
+    assert len(parts.engine.asked) == 1
+    assert "wall/1 was given up (it took 399 ms)" in parts.stream.model_fault
+    parts.registry.current = 2
+    follow_times(parts, 2)
+    assert parts.engine.asked[-1][1] == "/models/wall/2" and parts.stream.model_fault is None
+    parts.registry.current = 1
+    follow_times(parts, 2)
+    assert parts.engine.asked[-1][1] == "/models/wall/1", "it was activated again"
+    parts.engine.gives_up(1, "it took 398 ms", instead=None)
+    follow_times(parts, 3)
+    assert len(parts.engine.asked) == 3
+    parts.engine.figures = {"model": None, "gave_way": []}
+    follow_times(parts, 2)
+    assert len(parts.engine.asked) == 4, "a new engine tries it"
+
+
 def test_show_active_does_not_repeat_refused_command(parts):
     parts.engine.refuses = True
     with pytest.raises(CommandRefused):

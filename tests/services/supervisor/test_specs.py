@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import stat
 from dataclasses import asdict
 
@@ -10,6 +11,7 @@ from pydantic import ValidationError
 
 from gsplat_core.errors import InvalidSetting
 from services.bus.runtime import ProcessIdentity, write_json
+from services.settings import NAME_PATTERN
 from services.supervisor.worker import EngineSpec, ProcessLimits, ProcessSpec, SourceSpec, assigned
 
 
@@ -32,7 +34,13 @@ def test_process_spec_digest_changes_with_settings():
     assert len({each.digest for each in (spec(), *changed, spec(stream="b"))}) == 4
 
 
-@pytest.mark.parametrize("name", ["", "A", "../x", "a/b", ".", "-a", "x" * 33, "a\n", "ä"])
+def test_process_spec_takes_every_stream_name_of_the_settings():
+    longest = "x" * 40
+    assert re.match(NAME_PATTERN, longest) and not re.match(NAME_PATTERN, longest + "x")
+    assert spec(stream=longest).stream == longest
+
+
+@pytest.mark.parametrize("name", ["", "A", "../x", "a/b", ".", "-a", "x" * 41, "a\n", "ä"])
 def test_process_spec_rejects_invalid_stream_names(name):
     with pytest.raises(ValidationError):
         spec(stream=name)

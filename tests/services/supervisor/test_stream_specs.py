@@ -45,6 +45,7 @@ def test_specs_of_resolves_device_and_gpu(monkeypatch, device, found, expected):
     [
         ({"scael": 1}, "no option 'scael'; the nearest is 'scale'"),
         ({"gpu": 1}, "no option 'gpu'"),
+        ({"gpu": None}, "no option 'gpu'"),
         ({"scale": 9}, "scale is 9; it must be above 0 and at most 4"),
         ({"budget_ms": "soon"}, "budget_ms is 'soon'; it must be a number"),
     ],
