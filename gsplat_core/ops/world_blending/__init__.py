@@ -334,6 +334,13 @@ def rasterize_to_pixels_eval3d(
     )  # fmt: skip
     rays = pixel_rays(lens, shutter, Ks, image_width, image_height)
     batches, images = math.prod(batch_dims), math.prod(image_dims)
+    # Gaussians without a whitening matrix show nothing, and get no gradient from its infinite elements.
+    usable = quats.isfinite().all(-1) & (quats != 0).any(-1)
+    usable &= scales.isfinite().all(-1) & (1 / (scales * scales)).isfinite().all(-1)
+    identity = torch.tensor([1.0, 0, 0, 0], dtype=quats.dtype, device=quats.device)
+    quats = torch.where(usable[..., None], quats, identity)
+    scales = torch.where(usable[..., None], scales, torch.ones_like(scales))
+    opacities = torch.where(usable[..., None, :], opacities, torch.zeros_like(opacities))
     # Whitening matrices: rows are the axes divided by the scales.
     whitening = sigma_offsets(quats, torch.ones_like(scales)) / scales[..., None]
     blend = blend_world

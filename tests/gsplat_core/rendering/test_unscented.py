@@ -100,6 +100,30 @@ def test_unscented_values_and_gradients_match_reference(kind):
         )
 
 
+@pytest.mark.parametrize("unscented", [False, True])
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [(name, value) for name in ("quats", "scales") for value in (torch.nan, torch.inf, -torch.inf)]
+    + [("quats", 0.0), ("scales", 0.0), ("scales", 1e-30)],
+)  # fmt: skip
+def test_unusable_gaussians_show_nothing_and_have_zero_gradients(name, value, unscented):
+    """`scales` of 1e-30 have a finite inverse, but its square is infinite."""
+    size = {"width": W, "height": H, "with_ut": unscented, "with_eval3d": True, "packed": False}
+    given = scene()
+    given[name][3] = value
+    leaves = [given[each].requires_grad_() for each in ("means", "quats", "scales", "opacities", "colors")]
+    found, alphas, _ = rasterization(**given, **size)
+    without = {
+        each: torch.cat([tensor[:3], tensor[4:]]) if each not in ("viewmats", "Ks") else tensor
+        for each, tensor in given.items()
+    }
+    assert torch.allclose(found, rasterization(**without, **size)[0])
+    gradients = torch.autograd.grad(found.sum() + alphas.sum(), leaves)
+    for gradient in gradients:
+        assert gradient.isfinite().all() and (gradient[3] == 0).all()
+        assert (gradient[4:] != 0).any()
+
+
 def test_rolling_shutter_harmonics_use_pose_at_middle_of_readout():
     given = scene()
     end = given["viewmats"].clone()
