@@ -219,6 +219,8 @@ def _inside(root: Path, name: object, path: Path, index: int, findings: Findings
 
 
 DEFAULT_FPS = 30.0
+SAME_RATE_WITHIN = 0.01
+"""Largest relative difference of the frame rates of both eyes' videos; rounded rates and variable intervals differ by less."""
 _LAYOUTS = "a video, a folder with video.mp4, with images/ (EndoNeRF), with images and cameras.json, or with images"
 
 
@@ -281,6 +283,7 @@ def _inspect_folder(path: Path, findings: Findings) -> Contents | SessionContent
             findings.warn(path, f"{', '.join(names[:5])} belong to neither eye", "They are not read")
         files = list(eyes.left)
     if not files:
+        names = sorted(entry.name for entry in folder.iterdir()) if folder.is_dir() else names
         what = f"found {', '.join(names[:8])}{', …' if len(names) > 8 else ''}" if names else "the folder is empty"
         findings.problem(folder, f"no video and no PNG or JPEG images: {what}", f"Give {_LAYOUTS}", missing=True)
         return None
@@ -329,6 +332,13 @@ def _video_pair(path: Path, left: Path, right: Path, findings: Findings) -> Cont
             right,
             f"it has {theirs[0]} frames of {theirs[1]}x{theirs[2]} px, {left.name} has {ours[0]} of {ours[1]}x{ours[2]}",
             "Give as many frames of one size for both eyes, taken at the same moments",
+        )
+        return None
+    if images.fps and other.fps and abs(other.fps / images.fps - 1) > SAME_RATE_WITHIN:
+        findings.problem(
+            right,
+            f"it has {other.fps:g} frames/s, {left.name} has {images.fps:g}, so their frames are of different moments",
+            "Give videos of one frame rate for both eyes, taken at the same moments",
         )
         return None
     return _with_sidecars(path, "video", images, None, findings, other)

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import json
+from fractions import Fraction
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from gsplat_core.errors import RecordingInvalid
+from gsplat_core.errors import RecordingInvalid, RecordingMissing
 from gsplat_core.io.recordings import open_recording
 from gsplat_core.io.recordings.layouts import split_eyes
 from tests.gsplat_core.io.recordings.test_stereo_calibration import scared_json
+from tests.gsplat_core.io.recordings.videos import FRAMES, write_timed
 
 
 def names(*texts):
@@ -105,6 +107,26 @@ def test_stereo_calibration_of_other_size_is_refused(tmp_path):
     picture(tmp_path / "right.png", size=(100, 80))
     scared_json(tmp_path)
     with pytest.raises(RecordingInvalid, match=r"principal point .* is outside"):
+        open_recording(tmp_path)
+
+
+@pytest.mark.parametrize(("rate", "is_open"), [(25, True), (30, False), (24, False)])
+def test_videos_of_two_eyes_must_have_one_frame_rate(tmp_path, rate, is_open):
+    write_timed(tmp_path / "left.mp4", list(range(FRAMES)))
+    write_timed(tmp_path / "right.mp4", list(range(FRAMES)), rate, Fraction(1, rate))
+    if is_open:
+        assert next(iter(open_recording(tmp_path))).right_image is not None
+        return
+    with pytest.raises(RecordingInvalid, match=f"right.mp4.*it has {rate} frames/s, left.mp4 has 25"):
+        open_recording(tmp_path)
+
+
+@pytest.mark.parametrize("folder", ["", "images"])
+def test_error_names_pictures_of_other_formats(tmp_path, folder):
+    place = tmp_path / folder
+    place.mkdir(exist_ok=True)
+    cv2.imwrite(str(place / "000.tiff"), np.zeros((48, 64, 3), np.uint8))
+    with pytest.raises(RecordingMissing, match=r"no PNG or JPEG images: found 000\.tiff"):
         open_recording(tmp_path)
 
 
