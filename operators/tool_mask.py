@@ -101,6 +101,10 @@ class RecordedToolMaskOp(Operator):
             outcome.note(f"{self.without_mask} frames had no tool mask; all of their pixels counted as tissue")
 
 
+MOSTLY_TOOLS = 0.5
+"""Mean share of the pictures' pixels that were detected as tools above which a note says so."""
+
+
 class FoundToolMaskOp(Operator):
     """Detects tools in frames without a mask. Recorded masks are kept.
 
@@ -116,8 +120,8 @@ class FoundToolMaskOp(Operator):
         make_finder: factory called in `initialize()`, before any source starts, and at each restart.
         method: name for `FoundMasks`.
         doubts: True to replace an all-tool mask by an all-tissue mask, unless tissue was detected in
-            one of the last `BELIEVED_FRAMES` frames. The detector can mistake grey tissue for steel
-            throughout a stream.
+            one of the last `BELIEVED_FRAMES` frames, and to note a mean tool share above `MOSTLY_TOOLS`. The
+            detector can mistake grey tissue for steel throughout a stream.
     """
 
     def __init__(
@@ -191,6 +195,10 @@ class FoundToolMaskOp(Operator):
         if self._disbelieved:
             outcome.note(
                 f"in {self._disbelieved} frames everything looked like a tool for too long; all of their pixels counted as tissue"
+            )
+        if self.doubts and share > MOSTLY_TOOLS:
+            outcome.note(
+                f"{share:.0%} of the pictures were taken for tools on average and are not reconstructed; if that is tissue, give --tool-mask none"
             )
 
 

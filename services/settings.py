@@ -414,7 +414,7 @@ class StreamSettings(Section):
         description="Displayed content: `live`, or `model NAME` from the registry.",
     )
     device: str = Field(
-        default="auto", pattern=r"^(auto|cpu|cuda(:\d+)?)$", description="Device: auto, cpu, cuda or cuda:N."
+        default="auto", pattern=r"^(auto|cpu|cuda(:\d{1,3})?)$", description="Device: auto, cpu, cuda or cuda:N."
     )
     start: bool = Field(default=True, description="Start the stream with the service.")
     options: dict[str, Any] = Field(default={}, description="Options of the source and the reconstruction.")

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from gsplat_core.endoscope.sequence import picture_fault
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings.calibration import default_camera
+from gsplat_core.io.recordings.packed_eyes import TWO_EYES
 from gsplat_core.scene.frames import Frame, resized_frame
 from operators.sources.address import StereoLayout
 from operators.sources.live import LiveSource
@@ -195,6 +196,7 @@ class SplitSource(DerivedSource):
             camera=camera,
             fields=about.fields | {"right_image"},
             digest=None,
+            notes=tuple(note for note in about.notes if TWO_EYES not in note),
         )
 
 

@@ -287,6 +287,12 @@ def test_new_scene_resets_tool_mask_belief_and_withheld_frames_are_ignored(frame
     assert found == [0.0, 1.0] and found_masks(operator).disbelieved == 1
 
 
+@pytest.mark.parametrize(("share", "is_noted"), [(0.4, True), (0.6, False)])
+def test_note_on_pictures_taken_mostly_for_tools(frame, compute, share, is_noted):
+    _, operator = tissue_shares(frame, compute, *[share] * 4)
+    assert any("60% of the pictures were taken for tools" in note for note in notes(operator)) == is_noted
+
+
 class SaysPixels:
     """Finds a mask with so many tissue pixels of 384."""
 
@@ -333,8 +339,9 @@ def test_all_tool_mask_is_believed_for_ten_frames_after_tissue(frame, compute):
     result = outcome.find(FoundMasks)
     assert (result.method, result.found, result.recorded, result.disbelieved) == ("says", 18, 0, 4)
     assert result.tool_share == pytest.approx((10 + 284 / 384 + 1 + 1) / 18)
-    (note,) = outcome.notes
+    note, more = outcome.notes
     assert note.startswith("in 4 frames everything looked like a tool")
+    assert more.startswith("71% of the pictures were taken for tools") and "--tool-mask none" in more
 
 
 def test_tool_mask_with_least_tissue_is_believed(frame, compute):

@@ -455,8 +455,44 @@ def recognise(stream: BinaryIO) -> Container:
         if segment_end is not None and segment_end > size:
             raise UnusableContainer(f"the video is cut off: {size} of {segment_end} bytes are there")
         return Container("matroska", tuple(damaged))
-    what = "is empty (0 bytes)" if not head else f"is not a video (it begins with {head[:12]!r})"
+    if not head:
+        what = "is empty (0 bytes)"
+    elif kind := _other_format(head, stream):
+        what = f"is {kind}"
+    else:
+        what = f"is not a video (it begins with {head[:12]!r})"
     raise UnusableContainer(f"the file {what}; known are MP4/MOV, AVI and Matroska/WebM")
+
+
+_OTHER_FORMATS = (
+    (b"\x00\x00\x01\xba", "an MPEG program stream"),
+    (b"\x00\x00\x00\x01", "a raw H.264 or H.265 stream"),
+    (b"\x00\x00\x01", "a raw MPEG stream"),
+    (b"GIF8", "an animated GIF"),
+    (b"FLV\x01", "a Flash video"),
+    (b"OggS", "an Ogg file"),
+    (b"\x30\x26\xb2\x75\x8e\x66\xcf\x11", "a Windows Media file"),
+    (b"YUV4MPEG2", "raw YUV4MPEG2 video"),
+)
+"""First bytes of well-known formats that are not read, for messages."""
+_TRANSPORT_PACKETS = (188, 192)
+"""Bytes of a packet of an MPEG transport stream, and of one with 4 bytes of arrival time before it."""
+
+
+def _other_format(head: bytes, stream: BinaryIO) -> str | None:
+    """Return the name of a well-known video format that is not read, or None.
+
+    Formats: ISO/IEC 13818-1, section 2.4.3 (transport stream) and 2.5.3 (program stream).
+    """
+    for magic, name in _OTHER_FORMATS:
+        if head.startswith(magic):
+            return name
+    for length in _TRANSPORT_PACKETS:
+        stream.seek(length - 188)
+        packets = stream.read(3 * length)
+        if len(packets) >= 2 * length + 1 and packets[0] == packets[length] == packets[2 * length] == 0x47:
+            return "an MPEG transport stream"
+    return None
 
 
 def _check_iso(stream: BinaryIO, size: int) -> None:

@@ -42,11 +42,13 @@ from gsplat_core.io.recordings.calibration import (
 )
 from gsplat_core.io.recordings.contents import DESCRIPTION_FILE, Beside, Contents, FrameImages
 from gsplat_core.io.recordings.frame_files import ImageFiles, check_sizes, warn_of_rotation
+from gsplat_core.io.recordings.packed_eyes import warn_of_packed_eyes
 from gsplat_core.io.recordings.plain_files import (
     Findings,
     UnreadableFile,
     all_stay_inside,
     check_plain,
+    decode_picture,
     frame_number,
     list_images,
     stays_inside,
@@ -293,6 +295,8 @@ def _inspect_folder(path: Path, findings: Findings) -> Contents | SessionContent
     if size is None or len(findings.problems) > known:
         return None
     warn_of_rotation(files, findings)
+    if eyes is None:
+        _warn_of_first(path, files[0], findings)
     right = None
     if eyes is not None:
         if check_sizes(eyes.right, size, "right image", findings) is None or not all_stay_inside(
@@ -301,6 +305,15 @@ def _inspect_folder(path: Path, findings: Findings) -> Contents | SessionContent
             return None
         right = ImageFiles(eyes.right, *size)
     return _with_sidecars(path, layout, ImageFiles(files, *size, times=times), None, findings, right)
+
+
+def _warn_of_first(path: Path, first: Path, findings: Findings) -> None:
+    """Warn if the first image holds two eyes. Damage is reported when the frames are read."""
+    try:
+        image = decode_picture(first).image
+    except UnreadableFile:
+        return
+    warn_of_packed_eyes(path, image, findings)
 
 
 def _video_folder(path: Path, videos: Sequence[Path], findings: Findings) -> Contents | None:

@@ -27,6 +27,7 @@ from gsplat_core.io.recordings.decoder import (
     orientation_of,
     recognise,
 )
+from gsplat_core.io.recordings.packed_eyes import warn_of_packed_eyes
 from gsplat_core.io.recordings.plain_files import DEPENDS, MAX_PIXELS, Findings, Picture, UnreadableFile, open_plain
 
 _NOT_SHOWN = -1
@@ -388,7 +389,9 @@ def _inspect(
     found = index.frame_count
     if not stream.frames and timing.times is not None and index.times and stream.time_base:
         found = round((index.times[-1] - index.times[0]) * stream.time_base * Fraction(fps)) + 1
-    if found < 0.98 * announced - 2 and not _is_edited(index):
+    # Neither a count nor usable times: the duration alone does not tell how many frames there were.
+    is_unknown = not stream.frames and index.unordered is not None
+    if found < 0.98 * announced - 2 and not _is_edited(index) and not is_unknown:
         findings.problem(path, f"the video ends early: {found} of about {announced} frames are there", _REENCODE)
         return None
     return _with_first_frame(path, container, index, timing, findings)
@@ -535,4 +538,5 @@ def _with_first_frame(
             f"{_REENCODE}, or cut off its beginning (ffmpeg -ss SECONDS -i IN -c:v libx264 OUT.mp4)",
         )
         return None
+    warn_of_packed_eyes(path, first.image, findings)
     return video

@@ -40,6 +40,12 @@ def test_specs_of_resolves_device_and_gpu(monkeypatch, device, found, expected):
     assert (engine.device, engine.gpu) == expected
 
 
+@pytest.mark.parametrize("device", ["cuda:1000", "cuda:", "gpu", "cuda:-1"])
+def test_stream_settings_refuse_unknown_devices(device):
+    with pytest.raises(ValueError, match="device"):
+        engine_of(device)
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [

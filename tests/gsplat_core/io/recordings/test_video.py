@@ -125,6 +125,14 @@ def test_uneven_timestamps_are_kept_unless_rounded_by_container(
     assert any("apart" in note for note in recording.notes) == is_kept
 
 
+def test_repeated_times_before_a_pause_are_read_as_evenly_spaced(tmp_path: Path) -> None:
+    path = videos.write_timed(tmp_path / "v.mkv", list(range(60)), 30, Fraction(1, 30))
+    videos.set_times(path, [66 * (index // 2) for index in range(59)] + [20_000])
+    recording = open_recording(path)
+    assert [frame.pts_ns for frame in recording] == [round(k * 1e9 / 30) for k in range(60)]
+    assert any("29 of its 60 frame times are repeated" in note for note in recording.notes)
+
+
 def test_constant_rate_timestamps_are_restored_from_rounded_ones(tmp_path: Path) -> None:
     path = videos.write_timed(
         tmp_path / "v.mkv", [round(index * 1000 / 30) for index in range(12)], 30, Fraction(1, 1000)
@@ -207,6 +215,19 @@ def test_open_recording_of_empty_folder_is_refused(tmp_path: Path, refused: Refu
 def test_folder_without_recording_is_refused(tmp_path: Path, refused: Refused) -> None:
     (tmp_path / "notes.txt").write_text("hello")
     refused(tmp_path, RecordingMissing, "notes.txt")
+
+
+@pytest.mark.parametrize(
+    ("format_name", "said"), [("mpegts", "an MPEG transport stream"), ("mpeg", "an MPEG program stream")]
+)
+def test_refused_video_formats_are_named(tmp_path: Path, refused: Refused, format_name: str, said: str) -> None:
+    with av.open(str(tmp_path / "video.mp4"), "w", format=format_name) as container:
+        stream = container.add_stream("mpeg2video", rate=25)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        for level in range(4):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.full((48, 64, 3), 40 * level, np.uint8))))
+        container.mux(stream.encode())
+    refused(tmp_path, RecordingInvalid, f"the file is {said}", "re-encode it")
 
 
 def test_text_file_named_mp4_is_refused(tmp_path: Path, refused: Refused, capfd: pytest.CaptureFixture[str]) -> None:

@@ -1,0 +1,74 @@
+"""Pictures that hold both eyes are warned of, and others are not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from gsplat_core.io.recordings import open_recording
+from gsplat_core.io.recordings.packed_eyes import TWO_EYES
+from operators.sources.registry import open_source
+
+
+def _textured(rng: np.random.Generator, width: int) -> np.ndarray:
+    noise = rng.integers(0, 256, (160, width, 3), dtype=np.uint8)
+    return cv2.GaussianBlur(noise, (0, 0), 2) * 2
+
+
+@pytest.mark.parametrize(("stereo", "axis"), [("side_by_side", 1), ("top_bottom", 0)])
+def test_a_packed_pair_is_warned_of_until_it_is_split(tmp_path: Path, rng: np.random.Generator, stereo, axis) -> None:
+    scene = _textured(rng, 220)
+    left, right = scene[:, 16:216], scene[:, :200]
+    for number in range(2):
+        cv2.imwrite(str(tmp_path / f"{number:03d}.png"), np.concatenate([left, right], axis))
+    notes = [note for note in open_recording(tmp_path).notes if TWO_EYES in note]
+    assert len(notes) == 1 and f"?stereo={stereo}" in notes[0]
+    split = open_source(f"recording:{tmp_path}?stereo={stereo}")
+    assert "right_image" in split.description.fields
+    assert not any(TWO_EYES in note for note in split.description.notes)
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_one_eye_is_not_warned_of(tmp_path: Path, rng: np.random.Generator, mirrored: bool) -> None:
+    half = _textured(rng, 200)
+    other = half[:, ::-1] if mirrored else _textured(rng, 200)
+    cv2.imwrite(str(tmp_path / "0.png"), np.concatenate([half, other], 1))
+    assert not any(TWO_EYES in note for note in open_recording(tmp_path).notes)
+
+
+@pytest.mark.parametrize("size", [(16, 16), (1, 640), (640, 1)])
+def test_small_pictures_are_compared_without_error(size: tuple[int, int]) -> None:
+    from gsplat_core.io.recordings.packed_eyes import warn_of_packed_eyes
+    from gsplat_core.io.recordings.plain_files import Findings
+
+    findings = Findings(strict=True)
+    warn_of_packed_eyes(Path("x"), np.zeros((*size, 3), np.uint8), findings)
+    assert not findings.warnings
+
+
+@pytest.mark.recordings
+@pytest.mark.parametrize("name", ["scared_pair", "others/organ_still", "hamlyn_pair"])
+def test_real_pairs_are_warned_of_when_packed(recordings_dir: Path, tmp_path: Path, name: str) -> None:
+    frame = next(iter(open_recording(recordings_dir / name)))
+    assert frame.right_image is not None
+    for folder, axis in (("beside", 1), ("above", 0)):
+        packed = np.concatenate([frame.image, frame.right_image], axis)
+        (tmp_path / folder).mkdir()
+        cv2.imwrite(str(tmp_path / folder / "0.png"), packed[..., ::-1])
+        assert any(TWO_EYES in note for note in open_recording(tmp_path / folder).notes)
+
+
+@pytest.mark.recordings
+@pytest.mark.parametrize(
+    "name",
+    ["cutting", "heart", "sinus", "colon"]
+    + [
+        f"others/{name}"
+        for name in ("laparoscopy", "resting_bowel", "stereomis_like", "colonoscopy_a", "pelvis_stills")
+    ],
+)
+def test_real_recordings_of_one_eye_are_not_warned_of(recordings_dir: Path, name: str) -> None:
+    assert not any(TWO_EYES in note for note in open_recording(recordings_dir / name).notes)
