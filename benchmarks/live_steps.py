@@ -201,13 +201,15 @@ def measure(path: str, arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def figures_of(series: dict[str, list[float]], settled: int) -> dict[str, float]:
-    """Return the means after the first `settled` frames, and median and minimum of the displayed pictures."""
+    """Return the means after the first `settled` frames, median and minimum of the displayed pictures, and their smallest
+    difference to the previous frame (`margin_worst_db`)."""
     kept = {name: np.array(values[settled:]) for name, values in series.items()}
     figures = {name: round(float(np.nanmean(values)), 2) for name, values in kept.items()}
     shown = kept["shown_db"]
     worst = {
         "shown_median_db": round(float(np.nanmedian(shown)), 2),
         "shown_worst_db": round(float(np.nanmin(shown)), 2),
+        "margin_worst_db": round(float(np.nanmin(shown - kept["copy_db"])), 2),
     }
     return figures | worst
 

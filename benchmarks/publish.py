@@ -255,7 +255,7 @@ TABLES = (
         ROOM_COLUMNS,
         (
             Row("`cutting`, four rooms", "cuda/rooms_cutting", asked="43 dB, p99 33 ms, 1 late"),
-            Row("the same with `--mps`", "cuda/rooms_cutting_mps", asked="43 dB, p99 33 ms, 1 late"),
+            Row("the same with MPS (`rooms.py --mps`)", "cuda/rooms_cutting_mps", asked="43 dB, p99 33 ms, 1 late"),
         ),
     ),
     Table(
