@@ -24,6 +24,9 @@ if TYPE_CHECKING:
     from gsplat_core.training.losses import LossKind
     from gsplat_core.training.strategies.strategy import StrategyKind
 
+StereoLayout = Literal["side_by_side", "top_bottom"]
+"""Places of the left and right eye in a picture that holds both: left and right half, or upper and lower half."""
+
 FIELDS: Registry[FieldKind[Any]] = Registry(
     "deformation field",
     {

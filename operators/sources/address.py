@@ -13,14 +13,14 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Literal, Self, get_args, overload
+from typing import Self, get_args, overload
 from urllib.parse import parse_qsl, urlsplit
 
+from gsplat_core.choices import StereoLayout
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.value_ranges import plain_float
 from operators.settings import MAX_SEED, check_option
 
-StereoLayout = Literal["side_by_side", "top_bottom"]
 MAX_FPS = 1000.0
 MAX_SPEED = 1000.0
 MAX_WAITING = 64

@@ -11,12 +11,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from gsplat_core.choices import StereoLayout
 from gsplat_core.endoscope.sequence import picture_fault
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings.calibration import default_camera
 from gsplat_core.io.recordings.packed_eyes import TWO_EYES
 from gsplat_core.scene.frames import Frame, resized_frame
-from operators.sources.address import StereoLayout
 from operators.sources.live import LiveSource
 from operators.sources.source import FrameSource, ReportingSource, SourceDescription, SourceState
 
@@ -180,7 +180,8 @@ class SplitSource(DerivedSource):
                 f"{about.name} has pictures of {about.width_px}x{about.height_px} px, which are not two eyes {self._layout.replace('_', ' ')}"
             )
         camera = about.camera
-        if camera == default_camera(about.width_px, about.height_px):
+        # The camera of a scaled recording differs from the default one of its size by rounding.
+        if np.allclose(camera.K, default_camera(about.width_px, about.height_px).K, rtol=0.01):
             camera = default_camera(width_px, height_px)
         elif camera.K[0, 2] < width_px and camera.K[1, 2] < height_px:
             camera = replace(camera, width_px=width_px, height_px=height_px)

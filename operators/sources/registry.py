@@ -11,9 +11,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import cast, get_args
 
+from gsplat_core.choices import StereoLayout
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.registry import Registry
-from operators.sources.address import PARSERS, SourceOptions, StereoLayout, UrlAddress
+from operators.sources.address import PARSERS, SourceOptions, UrlAddress
 from operators.sources.source import FrameSource
 
 __all__ = ["SOURCES", "SourceFactory", "SourceOptions", "check_address", "open_source", "split_address"]

@@ -42,13 +42,12 @@ from gsplat_core.io.recordings.calibration import (
 )
 from gsplat_core.io.recordings.contents import DESCRIPTION_FILE, Beside, Contents, FrameImages
 from gsplat_core.io.recordings.frame_files import ImageFiles, check_sizes, warn_of_rotation
-from gsplat_core.io.recordings.packed_eyes import warn_of_packed_eyes
+from gsplat_core.io.recordings.packed_eyes import OneEye, stated_layout, warn_of_packed_eyes
 from gsplat_core.io.recordings.plain_files import (
     Findings,
     UnreadableFile,
     all_stay_inside,
     check_plain,
-    decode_picture,
     frame_number,
     list_images,
     stays_inside,
@@ -295,8 +294,6 @@ def _inspect_folder(path: Path, findings: Findings) -> Contents | SessionContent
     if size is None or len(findings.problems) > known:
         return None
     warn_of_rotation(files, findings)
-    if eyes is None:
-        _warn_of_first(path, files[0], findings)
     right = None
     if eyes is not None:
         if check_sizes(eyes.right, size, "right image", findings) is None or not all_stay_inside(
@@ -305,15 +302,6 @@ def _inspect_folder(path: Path, findings: Findings) -> Contents | SessionContent
             return None
         right = ImageFiles(eyes.right, *size)
     return _with_sidecars(path, layout, ImageFiles(files, *size, times=times), None, findings, right)
-
-
-def _warn_of_first(path: Path, first: Path, findings: Findings) -> None:
-    """Warn if the first image holds two eyes. Damage is reported when the frames are read."""
-    try:
-        image = decode_picture(first).image
-    except UnreadableFile:
-        return
-    warn_of_packed_eyes(path, image, findings)
 
 
 def _video_folder(path: Path, videos: Sequence[Path], findings: Findings) -> Contents | None:
@@ -373,6 +361,9 @@ def _with_sidecars(
     if images is None:
         return None
     known = len(findings.problems)
+    eyes_layout = stated_layout(root, images, findings)
+    if eyes_layout is not None:
+        images, right_eye = OneEye(images, eyes_layout, right=False), OneEye(images, eyes_layout, right=True)
     size = (images.width_px, images.height_px)
     # A video given as a file has no sidecars.
     beside = Beside(root if root.is_dir() else None, images, findings)
@@ -380,6 +371,8 @@ def _with_sidecars(
     if calibration is None:
         calibration = beside.poses()
     right: FrameImages | None = right_eye or beside.right()
+    if right is None and (first := images.first_picture()) is not None:
+        warn_of_packed_eyes(root, first.image, findings)
     masks, depth = beside.masks(), beside.depth(described.get("depth_unit_mm"))
     tool_share = masks.check_polarity(findings) if masks else None
     valid_mask, labels, scans = beside.valid_mask(), beside.labels(), beside.scans()

@@ -1,18 +1,24 @@
-"""Detection of pictures that hold both eyes of a stereo endoscope, side by side or one above the other.
+"""Pictures that hold both eyes of a stereo endoscope, side by side or one above the other.
 
-Recorders of stereo endoscopes often store both eyes in one picture. Read as one eye, such a picture would be reconstructed as one
-wide scene without any error.
+Recorders of stereo endoscopes often store both eyes in one picture. The entry `stereo` of `recording.json` splits them (`OneEye`).
+Read as one eye, such pictures would be reconstructed as one wide scene without any error, so a warning is given
+(`warn_of_packed_eyes`).
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import get_args
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsplat_core.io.recordings.plain_files import Findings
+from gsplat_core.choices import StereoLayout
+from gsplat_core.io.recordings.calibration import read_json
+from gsplat_core.io.recordings.contents import DESCRIPTION_FILE, FrameImages
+from gsplat_core.io.recordings.plain_files import Findings, Picture, stays_inside
 
 TWO_EYES = "its pictures seem to hold both eyes"
 """Text of the warning. A source that splits its pictures into two eyes leaves the warning out."""
@@ -37,21 +43,73 @@ The real stereo pairs among the recordings have 0.83 to 0.97, halves of other pi
 """
 
 
+class OneEye:
+    """`FrameImages` of one eye, cut out of images that hold both eyes. Each eye decodes the images for itself."""
+
+    def __init__(self, images: FrameImages, layout: StereoLayout, *, right: bool) -> None:
+        self._images, self._layout, self._right = images, layout, right
+        self.files: tuple[Path, ...] = images.files
+        self.numbers: list[int | None] = images.numbers
+        self.frame_count: int = images.frame_count
+        self.times: Sequence[float] | None = images.times
+        self.fps: float | None = images.fps
+        self.keeps_times: bool = images.keeps_times
+        beside = layout == "side_by_side"
+        self.width_px: int = images.width_px // 2 if beside else images.width_px
+        self.height_px: int = images.height_px if beside else images.height_px // 2
+
+    def frames(self, findings: Findings) -> Iterator[Picture | None]:
+        """Yield the pictures of the eye in order; None for one that cannot be read at all. Only the left eye reports problems."""
+        for picture in self._images.frames(Findings() if self._right else findings):
+            yield None if picture is None else self._cut(picture)
+
+    def first_picture(self) -> Picture | None:
+        """Return the eye's first picture; None if it cannot be decoded."""
+        picture = self._images.first_picture()
+        return None if picture is None else self._cut(picture)
+
+    def _cut(self, picture: Picture) -> Picture:
+        half = _halves(picture.image, self._layout)[int(self._right)]
+        return Picture(np.ascontiguousarray(half), picture.damage)
+
+
+def stated_layout(root: Path, images: FrameImages, findings: Findings) -> StereoLayout | None:
+    """Return the entry `stereo` of the recording's `recording.json`; None without one, or after a problem."""
+    path = root / DESCRIPTION_FILE
+    if not path.is_file() or not stays_inside(root, path, Findings()):
+        return None
+    # Problems of the file as a whole are reported when its other entries are read.
+    stated = (read_json(path, Findings()) or {}).get("stereo")
+    if stated is None:
+        return None
+    for layout in get_args(StereoLayout):
+        if stated == layout:
+            side, length = ("wide", images.width_px) if layout == "side_by_side" else ("high", images.height_px)
+            if length % 2:
+                findings.problem(
+                    path, f"stereo is {stated!r}, and the pictures are {length} px {side}", "Give an even number"
+                )
+                return None
+            return layout
+    findings.problem(path, f"stereo is {stated!r:.40}", f"Give {' or '.join(get_args(StereoLayout))}")
+    return None
+
+
 def warn_of_packed_eyes(path: Path, image: NDArray[np.uint8], findings: Findings) -> None:
     """Warn if a picture, RGB uint8 [H, W, 3], holds two eyes. `path` is the file or folder named in the warning."""
-    for how, stereo in (("side by side", "side_by_side"), ("one above the other", "top_bottom")):
-        if _similarity(*_halves(image, stereo)) > _SAME_ABOVE:
+    for how, layout in zip(("side by side", "one above the other"), get_args(StereoLayout), strict=True):
+        if _similarity(*_halves(image, layout)) > _SAME_ABOVE:
             findings.warn(
                 path,
                 f"{TWO_EYES}, {how}, and are read as those of one eye",
-                f"Append ?stereo={stereo} to the path to split them",
+                f'To split them, give a folder with them and a {DESCRIPTION_FILE} that states "stereo": "{layout}"',
             )
             return
 
 
-def _halves(image: NDArray[np.uint8], stereo: str) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+def _halves(image: NDArray[np.uint8], layout: StereoLayout) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     height, width = image.shape[0] // 2, image.shape[1] // 2
-    if stereo == "side_by_side":
+    if layout == "side_by_side":
         return image[:, :width], image[:, width : 2 * width]
     return image[:height], image[height : 2 * height]
 

@@ -27,7 +27,6 @@ from gsplat_core.io.recordings.decoder import (
     orientation_of,
     recognise,
 )
-from gsplat_core.io.recordings.packed_eyes import warn_of_packed_eyes
 from gsplat_core.io.recordings.plain_files import DEPENDS, MAX_PIXELS, Findings, Picture, UnreadableFile, open_plain
 
 _NOT_SHOWN = -1
@@ -538,5 +537,4 @@ def _with_first_frame(
             f"{_REENCODE}, or cut off its beginning (ffmpeg -ss SECONDS -i IN -c:v libx264 OUT.mp4)",
         )
         return None
-    warn_of_packed_eyes(path, first.image, findings)
     return video

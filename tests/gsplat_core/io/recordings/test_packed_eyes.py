@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from gsplat_core.io.recordings import open_recording
+from gsplat_core.errors import RecordingInvalid
+from gsplat_core.io.recordings import open_recording, validate_recording
 from gsplat_core.io.recordings.packed_eyes import TWO_EYES
+from operators.sources.address import SourceOptions
 from operators.sources.registry import open_source
 
 
@@ -25,10 +30,73 @@ def test_a_packed_pair_is_warned_of_until_it_is_split(tmp_path: Path, rng: np.ra
     for number in range(2):
         cv2.imwrite(str(tmp_path / f"{number:03d}.png"), np.concatenate([left, right], axis))
     notes = [note for note in open_recording(tmp_path).notes if TWO_EYES in note]
-    assert len(notes) == 1 and f"?stereo={stereo}" in notes[0]
+    assert len(notes) == 1 and f'"stereo": "{stereo}"' in notes[0]
     split = open_source(f"recording:{tmp_path}?stereo={stereo}")
     assert "right_image" in split.description.fields
     assert not any(TWO_EYES in note for note in split.description.notes)
+
+
+def _packed(folder: Path, rng: np.random.Generator, stereo: str, size: tuple[int, int] = (200, 160)) -> np.ndarray:
+    axis = 1 if stereo == "side_by_side" else 0
+    eyes = [_textured(rng, size[0])[: size[1]] for _ in range(2)]
+    for number in range(3):
+        cv2.imwrite(str(folder / f"{number:03d}.png"), np.concatenate(eyes, axis)[..., ::-1])
+    return np.stack(eyes)
+
+
+@pytest.mark.parametrize("stereo", ["side_by_side", "top_bottom"])
+def test_recording_json_splits_pictures_into_two_eyes(tmp_path: Path, rng: np.random.Generator, stereo: str) -> None:
+    eyes = _packed(tmp_path, rng, stereo)
+    description = {
+        "format": "intrasplat-recording",
+        "version": 1,
+        "stereo": stereo,
+        "stereo_baseline_mm": 4.0,
+        "fps": 25,
+    }
+    (tmp_path / "recording.json").write_text(json.dumps(description))
+    recording = open_recording(tmp_path)
+    assert (recording.width_px, recording.height_px, recording.camera.K[0, 2]) == (200, 160, 100)
+    assert not any(TWO_EYES in note for note in recording.notes)
+    frames = list(recording)
+    assert len(frames) == 3
+    for frame in frames:
+        assert frame.right_image is not None and frame.right_camera is not None
+        np.testing.assert_array_equal(np.stack([frame.image, frame.right_image]), eyes)
+
+
+@pytest.mark.parametrize(
+    ("stereo", "said"),
+    [("left_right", "Give side_by_side or top_bottom"), (1, "stereo is 1"), ("top_bottom", "161 px high")],
+)
+def test_unusable_stereo_entry_is_refused(
+    tmp_path: Path, stereo: object, said: str, refused: Callable[..., str]
+) -> None:
+    cv2.imwrite(str(tmp_path / "0.png"), np.full((161, 200, 3), 90, np.uint8))
+    description = {"format": "intrasplat-recording", "version": 1, "stereo": stereo}
+    (tmp_path / "recording.json").write_text(json.dumps(description))
+    refused(tmp_path, RecordingInvalid, "recording.json", said)
+
+
+def test_damaged_packed_picture_is_reported_once(tmp_path: Path, rng: np.random.Generator) -> None:
+    _packed(tmp_path, rng, "side_by_side")
+    (tmp_path / "recording.json").write_text(
+        '{"format": "intrasplat-recording", "version": 1, "stereo": "side_by_side"}'
+    )
+    data = (tmp_path / "001.png").read_bytes()
+    (tmp_path / "001.png").write_bytes(data[: len(data) // 2] + bytes(40) + data[len(data) // 2 + 40 :])
+    problems = validate_recording(tmp_path).problems
+    assert len(problems) == 1 and "001.png" in str(problems[0])
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.3])
+def test_address_splits_a_scaled_recording_with_the_assumed_camera(
+    tmp_path: Path, rng: np.random.Generator, scale: float
+) -> None:
+    _packed(tmp_path, rng, "side_by_side", (200, 151))
+    with closing(open_source(f"recording:{tmp_path}?stereo=side_by_side", SourceOptions(scale))) as source:
+        about = source.description
+        assert about.camera.K[0, 2] == pytest.approx(about.width_px / 2)
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
