@@ -118,7 +118,7 @@ def test_small_pictures_are_compared_without_error(size: tuple[int, int]) -> Non
 
 
 @pytest.mark.recordings
-@pytest.mark.parametrize("name", ["scared_pair", "others/organ_still", "hamlyn_pair"])
+@pytest.mark.parametrize("name", ["scared_pair", "others/organ_still", "hamlyn_pair", "heart"])
 def test_real_pairs_are_warned_of_when_packed(recordings_dir: Path, tmp_path: Path, name: str) -> None:
     frame = next(iter(open_recording(recordings_dir / name)))
     assert frame.right_image is not None
