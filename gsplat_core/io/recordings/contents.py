@@ -87,10 +87,6 @@ class FrameImages(Protocol):
         """Yield the pictures in order; None for one that cannot be read at all."""
         ...
 
-    def first_picture(self) -> Picture | None:
-        """Return the first picture; None if it cannot be decoded."""
-        ...
-
 
 class _SidecarData(NamedTuple):
     """Sidecar data of one image, and the problems found in them."""

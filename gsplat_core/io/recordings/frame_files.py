@@ -231,13 +231,6 @@ class ImageFiles:
                 findings.problem(path, str(error), "Export this frame again, or remove it with its sidecars")
                 yield None
 
-    def first_picture(self) -> Picture | None:
-        """Return the first picture; None if it cannot be decoded, which `frames` reports."""
-        try:
-            return decode_picture(self.files[0])
-        except UnreadableFile:
-            return None
-
 
 class MaskFiles:
     """Reader of tool masks. Files mark tools with 1, 255 or 65535; returned masks mark tissue with 1."""

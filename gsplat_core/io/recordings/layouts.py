@@ -363,6 +363,13 @@ def _with_sidecars(
     known = len(findings.problems)
     eyes_layout = stated_layout(root, images, findings)
     if eyes_layout is not None:
+        if right_eye is not None or calibration is not None or (root / "images_right").exists():
+            findings.problem(
+                root / DESCRIPTION_FILE,
+                f"it states stereo {eyes_layout!r}, and cameras.json or pictures of a right eye are there too",
+                "Remove one of them; recording.json can also state the camera of one eye",
+            )
+            return None
         images, right_eye = OneEye(images, eyes_layout, right=False), OneEye(images, eyes_layout, right=True)
     size = (images.width_px, images.height_px)
     # A video given as a file has no sidecars.
@@ -371,7 +378,7 @@ def _with_sidecars(
     if calibration is None:
         calibration = beside.poses()
     right: FrameImages | None = right_eye or beside.right()
-    if right is None and (first := images.first_picture()) is not None:
+    if right is None and (first := next(iter(images.frames(Findings())), None)) is not None:
         warn_of_packed_eyes(root, first.image, findings)
     masks, depth = beside.masks(), beside.depth(described.get("depth_unit_mm"))
     tool_share = masks.check_polarity(findings) if masks else None

@@ -64,11 +64,6 @@ class OneEye:
         for picture in self._images.frames(Findings() if self._right else findings):
             yield None if picture is None else self._cut(picture)
 
-    def first_picture(self) -> Picture | None:
-        """Return the eye's first picture; None if it cannot be decoded."""
-        picture = self._images.first_picture()
-        return None if picture is None else self._cut(picture)
-
     def _cut(self, picture: Picture) -> Picture:
         half = halves(picture.image, self._layout)[int(self._right)]
         return Picture(np.ascontiguousarray(half), picture.damage)

@@ -78,6 +78,26 @@ def test_unusable_stereo_entry_is_refused(
     refused(tmp_path, RecordingInvalid, "recording.json", said)
 
 
+@pytest.mark.parametrize("beside", ["cameras.json", "images_right", "left and right"])
+def test_stereo_entry_beside_other_eyes_or_cameras_is_refused(
+    tmp_path: Path, rng: np.random.Generator, beside: str, refused: Callable[..., str]
+) -> None:
+    names = ["0_left.png", "0_right.png"] if beside == "left and right" else ["0.png"]
+    for name in names:
+        cv2.imwrite(str(tmp_path / name), _textured(rng, 320))
+    if beside == "images_right":
+        (tmp_path / beside).mkdir()
+        cv2.imwrite(str(tmp_path / beside / "0.png"), _textured(rng, 320))
+    elif beside == "cameras.json":
+        camera = {"width": 320, "height": 160, "fx": 300, "fy": 300, "cx": 160, "cy": 80}
+        frame = {"file": "0.png", "camera_to_world": np.eye(4).tolist()}
+        (tmp_path / beside).write_text(json.dumps(camera | {"frames": [frame]}))
+    (tmp_path / "recording.json").write_text(
+        '{"format": "intrasplat-recording", "version": 1, "stereo": "side_by_side"}'
+    )
+    refused(tmp_path, RecordingInvalid, "states stereo 'side_by_side'", "Remove one of them")
+
+
 def test_damaged_packed_picture_is_reported_once(tmp_path: Path, rng: np.random.Generator) -> None:
     _packed(tmp_path, rng, "side_by_side")
     (tmp_path / "recording.json").write_text(
