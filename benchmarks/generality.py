@@ -19,7 +19,7 @@ import shlex
 import statistics
 import sys
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -409,7 +409,7 @@ def generality_text(folder: Path = FOLDER) -> str:
                     "Ended with an error, so that the figures are those of the other runs:\n\n" + "\n".join(runs)
                 )
             parts.append(
-                f"{_origin(own[0])}; {_runs(own)} runs of `{own[0]['command']}` and the same for the other recordings."
+                f"{_origin(own)}; {_runs(own)} runs of `{own[0]['command']}` and the same for the other recordings."
             )
         for title, needed, text_of in (
             ("Tool masks", ("tools", "cutting_masks"), tools_text),
@@ -423,20 +423,21 @@ def generality_text(folder: Path = FOLDER) -> str:
             firsts = [own[0] for own in found.values() if own]
             parts += [f"## {title}, {name}", text_of(results)]
             parts.append(
-                f"{_origin(firsts[0], is_timed=False)}; " + ", ".join(f"`{each['command']}`" for each in firsts) + "."
+                f"{_origin(firsts, is_timed=False)}; " + ", ".join(f"`{each['command']}`" for each in firsts) + "."
             )
     if len(parts) == 2:
         parts.append("Not measured yet.")
     return "\n\n".join(parts) + "\n"
 
 
-def _origin(line: Mapping[str, Any], *, is_timed: bool = True) -> str:
-    """Return commit, date and machine of a log line as text; of timed runs with the machine's interruptions."""
-    about = line["machine"]
+def _origin(lines: Sequence[Mapping[str, Any]], *, is_timed: bool = True) -> str:
+    """Return commit, date and machine of log lines as text; of timed runs with the machine's largest interruptions."""
+    first, about = lines[0], lines[0]["machine"]
+    commits = " and ".join(dict.fromkeys(line["commit"] for line in lines))
     gpu = f"{about['gpu']}, " if "gpu" in about else ""
     return (
-        f"Measured at commit {line['commit']}, {line['date']}, {gpu}{about['cores']} cores of {about['cpu']}, torch {about['torch']}"
-        f"{pauses_text(about) if is_timed else ''}"
+        f"Measured at commit {commits}, {first['date']}, {gpu}{about['cores']} cores of {about['cpu']}, torch {about['torch']}"
+        f"{pauses_text(line['machine'] for line in lines) if is_timed else ''}"
     )
 
 

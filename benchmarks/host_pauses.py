@@ -14,7 +14,7 @@ import os
 import statistics
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 SECONDS = 3.0
@@ -89,22 +89,31 @@ def host_pauses() -> dict[str, Any]:
     return {"1": interruptions(1), str(threads): interruptions(threads)}
 
 
-def _pace_text(figures: Mapping[str, float]) -> str:
+def pauses_text(machines: Iterable[Mapping[str, Any]]) -> str:
+    """Return a clause about the largest interruptions of logged machines, one per run; empty if none are logged."""
+    logged = [machine["pauses"] for machine in machines if "pauses" in machine]
+    clauses = []
+    for threads in dict.fromkeys(threads for pauses in logged for threads in pauses):
+        each = [pauses[threads] for pauses in logged if threads in pauses]
+        clauses.append(
+            f"{threads} busy loop{'s' if threads != '1' else ''} for up to {_largest(each, 'longest_ms'):.0f} ms"
+            f" ({_largest(each, 'long_per_s'):.1f} times per second for more than {LONG_MS:.0f} ms){_pace_text(each)}"
+        )
+    return f", which interrupted {' and '.join(clauses)} while it was idle" if clauses else ""
+
+
+def _pace_text(figures: Iterable[Mapping[str, float]]) -> str:
     """Return a clause about slow intervals; empty if they are not logged."""
-    if "slow_share" not in figures:
+    logged = [each for each in figures if "slow_share" in each]
+    if not logged:
         return ""
-    return f" and slowed them to less than half of their pace for {100 * figures['slow_share']:.1f} % of the time"
+    return (
+        f" and slowed them to less than half of their pace for {100 * _largest(logged, 'slow_share'):.1f} % of the time"
+    )
 
 
-def pauses_text(machine: Mapping[str, Any]) -> str:
-    """Return a clause about the interruptions of a logged machine; empty if they are not logged."""
-    if "pauses" not in machine:
-        return ""
-    found = [
-        f"{threads} busy loop{'s' if threads != '1' else ''} for up to {each['longest_ms']:.0f} ms ({each['long_per_s']:.1f} times per second for more than {LONG_MS:.0f} ms){_pace_text(each)}"
-        for threads, each in machine["pauses"].items()
-    ]
-    return f", which interrupted {' and '.join(found)} while it was idle"
+def _largest(figures: Iterable[Mapping[str, float]], name: str) -> float:
+    return max(each[name] for each in figures)
 
 
 if __name__ == "__main__":

@@ -378,16 +378,18 @@ def table_text(table: Table, logs: Path = LOGS, front: bool = False) -> str:
 def provenance(table: Table, logs: Path = LOGS) -> str:
     """Return a sentence for each machine and commit at which the table's figures were measured."""
     measured: dict[str, set[str]] = {}
+    machines: dict[str, list[Mapping[str, Any]]] = {}
     for line in (line for row in table.rows for line in lines_of(row, logs)):
         about = line["machine"]
         gpu = f"{about['gpu']}, " if "gpu" in about else ""
         name = f"{gpu}{about['cores']} cores of {about['cpu']}, {about['instruction_set']}, torch {about['torch']}"
-        measured.setdefault(f"commit {line['commit']}, {line['date']}, {name}{pauses_text(about)}", set()).add(
-            line["benchmark"]
-        )
-    if len(measured) == 1:
-        return f"Measured at {next(iter(measured))}."
-    return " ".join(f"{', '.join(sorted(names))}: measured at {what}." for what, names in sorted(measured.items()))
+        what = f"commit {line['commit']}, {line['date']}, {name}"
+        measured.setdefault(what, set()).add(line["benchmark"])
+        machines.setdefault(what, []).append(about)
+    stated = [(f"{what}{pauses_text(machines[what])}", names) for what, names in sorted(measured.items())]
+    if len(stated) == 1:
+        return f"Measured at {stated[0][0]}."
+    return " ".join(f"{', '.join(sorted(names))}: measured at {what}." for what, names in stated)
 
 
 def front_gpus(table: Table, logs: Path = LOGS) -> str:
