@@ -34,6 +34,10 @@ SHOWN_WITHIN_S = 0.005
 AUTO_SHARE, AUTO_MOST_MS, LEAST_SHARE = 0.6, 18.3, 0.34
 """Default display deadline, as a share of the frame interval and its upper limit in milliseconds, and default share of the
 interval that is guaranteed for training."""
+LATEST_SHARE = 0.85
+"""Share of the frame interval after a frame's arrival at which guaranteed training also ends, minus the display latency, so
+that the picture is displayed before the next frame arrives (results/live.md).
+"""
 FIRST_MS = 20.0
 """Display deadline of a scene's first frame after its arrival, in milliseconds."""
 FIRST_AT_MOST_STEPS = 60
@@ -59,7 +63,7 @@ class ClockSettings:
     """
     least_share: float | None = None
     """Share of the frame interval guaranteed for training with an automatic deadline, even past the
-    deadline. None: device default.
+    deadline, but not past `LATEST_SHARE`. None: device default.
     """
     least_most_ms: float | None = None
     """Upper limit in milliseconds of the time that `least_share` guarantees, so that pictures of slow streams are not
@@ -147,7 +151,8 @@ class FrameClock:
         self._learn_interval(arrived_ns, frame.seq)
         until_ns = arrived_ns + (FIRST_MS * 1e6 if first else self.show_after_ns) - self.display_ns
         if settings.budget_ms is None and not first and not behind:
-            until_ns = max(until_ns, self.now_ns() + self.least_ns)
+            latest_ns = arrived_ns + LATEST_SHARE * self.interval_ns - self.display_ns
+            until_ns = max(until_ns, min(latest_ns, self.now_ns() + self.least_ns))
         return Budget.until(
             until_ns * 1e-9,
             at_least=settings.first_at_least_steps or 1 if first else self.least_steps(behind),

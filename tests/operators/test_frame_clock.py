@@ -7,7 +7,7 @@ import math
 import pytest
 
 from gsplat_core.errors import InvalidSetting
-from operators.frame_clock import LEAST_SHARE, ClockSettings, FrameClock
+from operators.frame_clock import LATEST_SHARE, LEAST_SHARE, ClockSettings, FrameClock
 
 
 @pytest.fixture
@@ -22,23 +22,31 @@ def test_budget_deadline_leaves_time_for_display(clock, frame, fake_time):
     assert (budget.at_least, budget.at_most) == (1, clock.settings.at_most_steps)
 
 
-def test_budget_of_late_frame_is_least_share_of_interval(clock, frame, fake_time):
+@pytest.mark.parametrize("share", [None, 0.1])
+def test_budget_of_late_frame_is_least_share_of_interval(frame, fake_time, share):
+    clock = FrameClock(ClockSettings(least_share=share), 30.0, fake_time)
     arrived_ns = fake_time.ns
-    fake_time.pass_ms(200)
+    fake_time.pass_ms(14)
     left_s = clock.budget(frame(0, arrived_ns=arrived_ns)).deadline_s - fake_time.ns * 1e-9
-    assert left_s == pytest.approx(LEAST_SHARE * clock.interval_ns * 1e-9)
-    short = FrameClock(ClockSettings(least_share=0.1), 30.0, fake_time)
-    left_s = short.budget(frame(0, arrived_ns=arrived_ns)).deadline_s - fake_time.ns * 1e-9
-    assert left_s == pytest.approx(0.1 * short.interval_ns * 1e-9)
+    assert left_s == pytest.approx((share or LEAST_SHARE) * clock.interval_ns * 1e-9)
 
 
 @pytest.mark.parametrize(("fps", "left_ms"), [(30.0, 0.2e3 / 30), (6.0, 16.0)])
 def test_budget_of_late_frame_is_limited_by_least_most_ms(frame, fake_time, fps, left_ms):
     clock = FrameClock(ClockSettings(least_share=0.2, least_most_ms=16.0), fps, fake_time)
     arrived_ns = fake_time.ns
-    fake_time.pass_ms(200)
+    fake_time.pass_ms(18)
     left_s = clock.budget(frame(0, arrived_ns=arrived_ns)).deadline_s - fake_time.ns * 1e-9
     assert left_s == pytest.approx(1e-3 * left_ms)
+
+
+@pytest.mark.parametrize("late_ms", [25, 32, 200])
+def test_budget_of_late_frame_ends_in_time_for_its_picture(clock, frame, fake_time, late_ms):
+    clock.display_ns = 3e6
+    arrived_ns = fake_time.ns
+    fake_time.pass_ms(late_ms)
+    deadline_s = clock.budget(frame(0, arrived_ns=arrived_ns)).deadline_s
+    assert deadline_s == pytest.approx((arrived_ns + LATEST_SHARE * clock.interval_ns - 3e6) * 1e-9)
 
 
 def test_budget_of_late_frame_with_queue_has_no_extra_time(clock, frame, fake_time):
