@@ -388,7 +388,7 @@ def generality_text(folder: Path = FOLDER) -> str:
         "RECORDINGS` runs the default commands on every recording of a folder. A figure is the median over the runs, with the worst run in brackets. PSNR is over "
         "tissue. The displayed frame was trained on before it is shown, so its PSNR is a training error. Differences to the previous frame are of single frames after "
         "the first second. Without a GPU, live chooses the size at which the machine keeps up; in small pictures the previous frame scores more. A late frame "
-        "is one whose own picture was not on the screen when the next frame arrived. The picture of a withheld frame shows the content of an earlier one; ages of used frames leave such pictures out. On machines whose processors are slow at times, ages and worst frames are worse ([live.md](live.md#hosts-whose-processors-stall)).",
+        "is one whose own picture was not on the screen when the next frame arrived. The picture of a withheld frame shows the content of an earlier one; ages of used frames leave such pictures out. On machines whose processors are slow at times, ages and worst frames are worse ([live.md](live.md#hosts-whose-processors-stall)), as on one of the two hosts of the live runs on a GPU ([live.md](live.md#a-busier-host)).",
     ]
     for device, lines in lines_of(folder).items():
         name = "one GPU" if device == "cuda" else "two CPU cores"
