@@ -232,6 +232,17 @@ def bind_probe(settings: ServiceSettings) -> list[socket.socket]:
     return bound
 
 
+async def probe_socket_is_there(settings: ServiceSettings) -> CheckResult:
+    """Check that the runtime folder with the Unix socket of `bind_probe` was not removed while the service runs."""
+    if (settings.runtime_dir / SOCKET).exists():
+        return CheckResult(True, f"{SOCKET} is there", needed=False)
+    return CheckResult(
+        False,
+        f"the runtime folder or its {SOCKET} was removed; restart the service when no stream is needed",
+        needed=False,
+    )
+
+
 def _unix(path: Path) -> socket.socket:
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:

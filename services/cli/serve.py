@@ -17,7 +17,7 @@ from gsplat_core.errors import InvalidSetting, UserError
 from services.api.app import assembled, new_app
 from services.api.observability import log_to_stderr, say_start
 from services.api.server import bind, certificate_of, serve
-from services.api.service import bind_probe
+from services.api.service import bind_probe, probe_socket_is_there
 from services.audit import AuditInUse, AuditLog, AuditUnwritable, Keeping, verify
 from services.audit.log import AUDIT_FILE
 from services.auth.keys import KEYS_FILE, ApiKey, KeyConflict, KeyStore, Role, append_key_change
@@ -47,6 +47,7 @@ def serve_command(
     refuse_unfinished_restore(settings)
     make_state_private(settings.data_dir, settings.uploaded_recordings.folder, settings.jobs.folder)
     parts = assembled(settings)
+    parts = replace(parts, checks={**parts.checks, "runtime": lambda: probe_socket_is_there(settings)})
     certificate = certificate_of(settings, parts.events)
     if certificate is not None:
         parts = replace(

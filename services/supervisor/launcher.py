@@ -28,8 +28,8 @@ from typing import Any, NoReturn, Protocol
 
 from gsplat_core.errors import UserError
 from services.bus.messages import MOST_BYTES, packed_json, parsed_json
-from services.bus.runtime import ProcessIdentity, RuntimeFolder, check_path, read_json, write_json
-from services.errors import AlreadyRunning, BadMessage, NoAnswer
+from services.bus.runtime import ProcessIdentity, RuntimeFolder, check_path, own_folder, read_json, write_json
+from services.errors import AlreadyRunning, BadMessage, NoAnswer, RuntimeFolderUnusable
 from services.private_files import keep_files_private
 from services.settings import masked_address
 from services.supervisor.worker import ORPHAN_DRAIN_S, Parent, identity_of
@@ -184,6 +184,8 @@ class ByLauncher:
         self._direct = Direct()
         self._own_pid: int | None = None
         self._keeping: asyncio.Task[None] | None = None
+        self._fails = False
+        """True while no launcher can be started, so that nothing waits for one."""
         self.ready = asyncio.Event()
         """Event that is set while the launcher accepts requests."""
 
@@ -256,7 +258,7 @@ class ByLauncher:
     async def _is_there(self, module: str) -> bool:
         """Return True if the launcher accepts requests. For a module in `LOADS_LONG`, wait up to `LOADING_S` for it
         first."""
-        if not self.ready.is_set() and self._keeping is not None and module in LOADS_LONG:
+        if not self.ready.is_set() and self._keeping is not None and not self._fails and module in LOADS_LONG:
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(self.ready.wait(), LOADING_S)
         return self.ready.is_set()
@@ -264,32 +266,47 @@ class ByLauncher:
     async def _keep(self) -> None:
         """Keep a launcher running: start it if needed, then ping it periodically."""
         while True:
-            if recorded_launcher(self._folder) is None:
-                self.ready.clear()
-                if self._own_pid is None or status_of_child(self._own_pid) is not None or not _runs(self._own_pid):
-                    self._clean()
-                    self._own_pid = await self._direct.start(
-                        "services.supervisor.launcher",
-                        [
-                            "--folder",
-                            os.fspath(self._folder.path),
-                            "--orphan-after-s",
-                            str(self._orphan_after_s),
-                            "--supervisor",
-                            json.dumps(self._own),
-                        ],
-                        self._folder.path / "launcher.log",
-                        {},
-                    )
-                await asyncio.sleep(POLL_S)
-                continue
             try:
-                await self._ask("ping", supervisor=self._own)
-                self.ready.set()
-            except (NoAnswer, BadMessage, OSError) as error:
+                pause_s = await self._check()
+                self._fails = False
+            except (OSError, RuntimeFolderUnusable) as error:
                 self.ready.clear()
-                log.warning("the launcher does not answer: %s", error)
-            await asyncio.sleep(PING_S)
+                if not self._fails:
+                    log.warning("the launcher cannot be started: %s; processes are started directly", error)
+                self._fails, pause_s = True, PING_S
+            await asyncio.sleep(pause_s)
+
+    async def _check(self) -> float:
+        """Start the launcher, or ping a running one, and return the time until the next check in seconds.
+
+        The runtime folder is created if it has been removed, which also ended the launcher.
+        """
+        if recorded_launcher(self._folder) is None:
+            self.ready.clear()
+            if self._own_pid is None or status_of_child(self._own_pid) is not None or not _runs(self._own_pid):
+                own_folder(self._folder.path)
+                self._clean()
+                self._own_pid = await self._direct.start(
+                    "services.supervisor.launcher",
+                    [
+                        "--folder",
+                        os.fspath(self._folder.path),
+                        "--orphan-after-s",
+                        str(self._orphan_after_s),
+                        "--supervisor",
+                        json.dumps(self._own),
+                    ],
+                    self._folder.path / "launcher.log",
+                    {},
+                )
+            return POLL_S
+        try:
+            await self._ask("ping", supervisor=self._own)
+            self.ready.set()
+        except (NoAnswer, BadMessage, OSError) as error:
+            self.ready.clear()
+            log.warning("the launcher does not answer: %s", error)
+        return PING_S
 
     async def _ask(self, command: str, **arguments: Any) -> dict[str, Any]:
         try:
@@ -335,6 +352,8 @@ LOADED = (
 LAUNCHER_POLL_S = 0.2
 REQUEST_S = 1.0
 """Timeout in seconds for reading a request and sending its answer."""
+ENDING = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+"""Signals that end the launcher and its processes."""
 MOST_REMEMBERED = 256
 """Maximum number of exit statuses that the launcher keeps until they are queried."""
 
@@ -400,6 +419,8 @@ class Launcher:
             raise ValueError(f"{module[:60]!r} is not forked, only {', '.join(FORKED)}")
         environment = {str(name): str(value) for name, value in dict(request["environment"]).items()}
         output = os.open(str(request["log"]), os.O_CREAT | os.O_WRONLY | os.O_APPEND | os.O_CLOEXEC, 0o600)
+        # Until the new process has no handlers of the launcher, `Launcher.stop` would take its signals.
+        unblocked = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
         try:
             pid = os.fork()
             if pid == 0:
@@ -409,6 +430,7 @@ class Launcher:
             self._children.add(pid)
             return pid
         finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, unblocked)
             os.close(output)
 
     def _end_children(self) -> None:
@@ -440,8 +462,9 @@ def _become(module: str, arguments: Sequence[str], environment: Mapping[str, str
     code = 1
     try:
         os.setsid()
-        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        for number in ENDING:
             signal.signal(number, signal.SIG_DFL)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING)
         os.dup2(output, 1)
         os.dup2(output, 2)
         os.environ.update(environment)
@@ -480,7 +503,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     supervisor = None if given.supervisor is None else identity_of(given.supervisor)
     launcher = Launcher(folder.path / SOCKET, Parent(supervisor, given.orphan_after_s))
-    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+    for number in ENDING:
         signal.signal(number, launcher.stop)
     write_json(folder.path / RECORD, asdict(ProcessIdentity.own()))
     try:

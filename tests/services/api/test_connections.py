@@ -7,6 +7,7 @@ import base64
 import contextlib
 import json
 import logging
+import shutil
 import socket
 import tempfile
 import threading
@@ -18,7 +19,7 @@ import pytest
 from services.api import Parts, new_app
 from services.api.guard import network_of_address
 from services.api.server import AddressBound, BoundedListener, DrainingServer, bind, config_of
-from services.api.service import MOST_CONNECTIONS, MOST_HEAD_BYTES, ProbeListener, bind_probe
+from services.api.service import MOST_CONNECTIONS, MOST_HEAD_BYTES, ProbeListener, bind_probe, probe_socket_is_there
 from services.errors import CannotServe
 from services.settings import ServiceSettings
 from tests.services.api.conftest import fakes
@@ -218,6 +219,20 @@ def test_probe_listener_answers_while_idle_connections_are_open(served):
         for _ in range(3 * MOST_CONNECTIONS):
             open_.enter_context(socket.create_connection(("127.0.0.1", probe)))
         assert answer(tcp(probe), LIVE).startswith(b"HTTP/1.1 200")
+
+
+def test_readiness_states_removed_runtime_folder():
+    with tempfile.TemporaryDirectory(prefix="isp-") as folder:
+        runtime = Path(folder) / "runtime"
+        runtime.mkdir()
+        settings = ServiceSettings(paths={"runtime": runtime})
+        [listener] = bind_probe(settings)
+        with listener:
+            found = asyncio.run(probe_socket_is_there(settings))
+            assert (found.ok, found.detail) == (True, "probe.sock is there")
+            shutil.rmtree(runtime)
+            found = asyncio.run(probe_socket_is_there(settings))
+            assert (found.ok, found.needed) == (False, False) and "restart the service" in found.detail
 
 
 def test_bind_probe_raises_if_port_or_socket_is_taken_or_folder_missing(tmp_path):

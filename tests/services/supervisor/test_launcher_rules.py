@@ -7,6 +7,7 @@ import os
 import signal
 import socket
 import sys
+import time
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
@@ -190,6 +191,34 @@ def test_by_launcher_pings_every_second_and_restarts_ended_launcher(tmp_path, mo
     assert there == [True, True, False, True, True, True, False]
 
 
+def test_by_launcher_creates_removed_runtime_folder_and_does_not_wait_for_what_cannot_start(
+    tmp_path, monkeypatch, caplog
+):
+    folder = tmp_path / "runtime"
+    by = launchers.ByLauncher(RuntimeFolder(folder))
+    by._direct = direct = Started()
+    monkeypatch.setattr(launchers, "status_of_child", lambda pid: None)
+    monkeypatch.setattr(launchers, "_runs", lambda pid: True)
+
+    async def watch() -> None:
+        folder.rmdir()
+        folder.touch()  # a file in place of the folder
+        by.open()
+        await asyncio.sleep(2.5)
+        pid = await by.start("services.supervisor.engine", [], tmp_path / "log", {})
+        assert (pid, direct.modules) == (100, [("services.supervisor.engine", 2.5)])
+        folder.unlink()
+        await asyncio.sleep(1.0)
+        await by.close(stop=False)
+
+    in_virtual_time(watch())
+    assert direct.modules[1:] == [("services.supervisor.launcher", 3.0)]
+    assert folder.stat().st_mode & 0o777 == 0o700
+    assert [record.getMessage() for record in caplog.records] == [
+        f"the launcher cannot be started: [Errno 20] Not a directory: '{folder / launchers.RECORD}'; processes are started directly"
+    ]
+
+
 @pytest.mark.parametrize(("argument", "code"), [("7", 7), ("wrong", 1)])
 def test_forked_process_has_environment_log_session_and_exit_code(tmp_path, monkeypatch, argument, code):
     module = ModuleType("forked_by_a_test")
@@ -212,6 +241,25 @@ def test_forked_process_has_environment_log_session_and_exit_code(tmp_path, monk
     assert sorted(int(line.split()[0]) for line in lines[:3]) == sorted((signal.SIGTERM, signal.SIGINT, signal.SIGHUP))
     assert lines[3:5] == [f"yes ['{argument}'] True", "error"]
     assert "INTRASPLAT_FORKED" not in os.environ
+
+
+def test_process_that_is_ended_right_after_its_fork_does_not_miss_the_signal(launcher, tmp_path, monkeypatch):
+    module = ModuleType("forked_by_a_test")
+    module.main = lambda arguments: time.sleep(2.0) or 0  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    monkeypatch.setattr(launchers, "FORKED", (module.__name__,))
+    request = {"module": module.__name__, "arguments": [], "environment": {}, "log": str(tmp_path / "log")}
+    before = signal.signal(signal.SIGTERM, launcher.stop)
+    try:
+        for _ in range(10):
+            ours, its = socket.socketpair()
+            with ours, its:
+                pid = launcher._start(request, its)
+            os.kill(pid, signal.SIGTERM)
+            assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == -signal.SIGTERM
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert not launcher._stopped and signal.SIGTERM not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
 
 
 class Ended:
