@@ -258,11 +258,15 @@ class Frame:
         return replace(self, **fields)
 
 
+PLANES = ("depth", "depth_confidence", "mask", "loss_mask", "labels")
+"""Fields of `Frame` with one value per pixel of the left image."""
+
+
 def resized_frame(frame: Frame, width_px: int, height_px: int) -> Frame:
     """Resize a frame: images and scans by area averaging, masks, labels and depth by nearest-neighbour sampling."""
     if (width_px, height_px) == (frame.width_px, frame.height_px):
         return frame
-    planes = {name: getattr(frame, name) for name in ("depth", "depth_confidence", "mask", "loss_mask", "labels")}
+    planes = {name: getattr(frame, name) for name in PLANES}
     scan = frame.ranges
     right, right_camera = frame.right_image, frame.right_camera
     return frame.with_fields(

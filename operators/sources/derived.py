@@ -16,7 +16,7 @@ from gsplat_core.endoscope.sequence import picture_fault
 from gsplat_core.errors import InvalidSetting
 from gsplat_core.io.recordings.calibration import default_camera
 from gsplat_core.io.recordings.packed_eyes import TWO_EYES
-from gsplat_core.scene.frames import Frame, resized_frame
+from gsplat_core.scene.frames import PLANES, Frame, resized_frame
 from operators.sources.live import LiveSource
 from operators.sources.source import FrameSource, ReportingSource, SourceDescription, SourceState
 
@@ -144,7 +144,11 @@ class SplitSource(DerivedSource):
     """
 
     def __init__(self, source: FrameSource, layout: StereoLayout) -> None:
-        """Wrap a source. Raises InvalidSetting if it already has right pictures, or its camera is not that of one eye."""
+        """Wrap a source with pictures of their full size.
+
+        Raises:
+            InvalidSetting: if it already has right pictures, has range scans, or its camera is not that of one eye.
+        """
         self._layout = layout
         super().__init__(source, self._described(source.description))
 
@@ -156,12 +160,12 @@ class SplitSource(DerivedSource):
 
         beside = self._layout == "side_by_side"
         right = frame.image[:, width_px : 2 * width_px] if beside else frame.image[height_px : 2 * height_px]
+        planes = {name: getattr(frame, name) for name in PLANES}
         return replace(
             frame,
             image=left(frame.image),
             right_image=np.ascontiguousarray(right[:height_px, :width_px]),
-            depth=None if frame.depth is None else left(frame.depth),
-            mask=None if frame.mask is None else left(frame.mask),
+            **{name: left(plane) for name, plane in planes.items() if plane is not None},
         )
 
     def _half(self, width_px: int, height_px: int) -> tuple[int, int]:
@@ -173,16 +177,20 @@ class SplitSource(DerivedSource):
     def _described(self, about: SourceDescription) -> SourceDescription:
         if "right_image" in about.fields:
             raise InvalidSetting(f"{about.name} has a right picture for each frame; leave out stereo={self._layout}")
+        if "ranges" in about.fields:
+            raise InvalidSetting(
+                f"{about.name} has range scans, which cannot be split; leave out stereo={self._layout}"
+            )
         width_px, height_px = self._half(about.width_px, about.height_px)
-        sides = (about.width_px, width_px) if self._layout == "side_by_side" else (about.height_px, height_px)
-        if sides[0] != 2 * sides[1]:
+        if (about.width_px if self._layout == "side_by_side" else about.height_px) < 2:
             raise InvalidSetting(
                 f"{about.name} has pictures of {about.width_px}x{about.height_px} px, which are not two eyes {self._layout.replace('_', ' ')}"
             )
-        camera = about.camera
-        # The camera of a scaled recording differs from the default one of its size by rounding.
-        if np.allclose(camera.K, default_camera(about.width_px, about.height_px).K, rtol=0.01):
+        camera, notes = about.camera, [note for note in about.notes if TWO_EYES not in note]
+        if np.allclose(camera.K, default_camera(about.width_px, about.height_px).K):
             camera = default_camera(width_px, height_px)
+            assumed, of_one = (f"f = {each.K[0, 0]:.1f} px" for each in (about.camera, camera))
+            notes = [note.replace(assumed, of_one) for note in notes]
         elif camera.K[0, 2] < width_px and camera.K[1, 2] < height_px:
             camera = replace(camera, width_px=width_px, height_px=height_px)
         else:
@@ -197,7 +205,7 @@ class SplitSource(DerivedSource):
             camera=camera,
             fields=about.fields | {"right_image"},
             digest=None,
-            notes=tuple(note for note in about.notes if TWO_EYES not in note),
+            notes=tuple(notes),
         )
 
 

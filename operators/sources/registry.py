@@ -99,7 +99,10 @@ def open_source(address: str | os.PathLike[str], options: SourceOptions | None =
     if text.startswith(_TWO_SOURCES):
         return _joined(text[len(_TWO_SOURCES) :], options)
     text, layout = _stereo_of(text, options)
-    options = replace(options, stereo=None)
+    scale = options.scale
+    if layout is not None:
+        # Scaled pictures may have no column between the eyes, so the eyes are scaled instead.
+        options = replace(options, stereo=None, scale=1.0)
     scheme, rest = split_address(text)
     if scheme in _OF_PATHS and not rest.partition("?")[0].strip():
         raise InvalidSetting(f"{scheme}: the path is empty; give it as {scheme}:PATH")
@@ -118,7 +121,7 @@ def open_source(address: str | os.PathLike[str], options: SourceOptions | None =
         )
     else:
         source = SOURCES[scheme](rest, options)
-    return source if layout is None else _split(source, layout)
+    return source if layout is None else _split(source, layout, scale)
 
 
 def check_address(address: str) -> None:
@@ -157,18 +160,24 @@ def _stereo_of(address: str, options: SourceOptions) -> tuple[str, StereoLayout 
     layout = found["layout"]
     if layout not in get_args(StereoLayout):
         raise InvalidSetting(f"stereo is {layout!r:.60}; choose {' or '.join(get_args(StereoLayout))}")
-    # `?stereo=x&more` becomes `?more`, and `&stereo=x` is removed.
+    # `?stereo=x&more` becomes `?more`, `#stereo=x&more` becomes `#more`, and `&stereo=x` is removed.
     before, after = address[: found.start()], address[found.end() :]
-    if found["before"] == "?" and after.startswith("&"):
-        after = "?" + after[1:]
+    if found["before"] in "?#" and after.startswith("&"):
+        after = found["before"] + after[1:]
     return before + after, cast(StereoLayout, layout)
 
 
-def _split(source: FrameSource, layout: StereoLayout) -> FrameSource:
-    from operators.sources.derived import SplitSource
+def _split(source: FrameSource, layout: StereoLayout, scale: float) -> FrameSource:
+    from operators.sources.derived import ScaledSource, SplitSource
+    from operators.sources.live import MIN_SIDE_PX, check_size
 
     try:
-        return SplitSource(source, layout)
+        split = SplitSource(source, layout)
+        if scale == 1:
+            return split
+        camera = split.description.camera.scaled(scale)
+        check_size(split.description.name, camera.width_px, camera.height_px, least=MIN_SIDE_PX)
+        return ScaledSource(split, scale)
     except InvalidSetting:
         source.close()
         raise

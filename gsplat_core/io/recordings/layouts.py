@@ -59,6 +59,10 @@ if TYPE_CHECKING:
     from gsplat_core.io.sessions.reader import SessionContents
 
 
+_UNREAD = frozenset(
+    {".tif", ".tiff", ".bmp", ".webp", ".jp2", ".gif", ".dcm", ".ppm", ".pgm", ".exr", ".heic", ".avif"}
+)
+"""Suffixes of image formats that are not read."""
 _LEFT = re.compile(r"(?<![a-z])(left|l)(?![a-z])", re.IGNORECASE)
 _RIGHT = re.compile(r"(?<![a-z])(right|r)(?![a-z])", re.IGNORECASE)
 
@@ -126,7 +130,7 @@ def frame_times(files: Sequence[Path], findings: Findings) -> tuple[float, ...] 
     findings.warn(
         files[0].parent,
         f"image numbers skip {len(gaps)} time{'s' * (len(gaps) > 1)}, first from {first.name} to {second.name}",
-        "The frames that are not there are left out as a gap in time",
+        "The frames of the missing numbers are left out as a gap in time",
     )
     return tuple((number - numbers[0]) / step for number in numbers)
 
@@ -288,6 +292,7 @@ def _inspect_folder(path: Path, findings: Findings) -> Contents | SessionContent
         what = f"found {', '.join(names[:8])}{', …' if len(names) > 8 else ''}" if names else "the folder is empty"
         findings.problem(folder, f"no video and no PNG or JPEG images: {what}", f"Give {_LAYOUTS}", missing=True)
         return None
+    _warn_of_unread(folder, findings)
     known = len(findings.problems)
     size = check_sizes(files, None, "image", findings) if all_stay_inside(path, files, findings) else None
     times = frame_times(files, findings)
@@ -302,6 +307,14 @@ def _inspect_folder(path: Path, findings: Findings) -> Contents | SessionContent
             return None
         right = ImageFiles(eyes.right, *size)
     return _with_sidecars(path, layout, ImageFiles(files, *size, times=times), None, findings, right)
+
+
+def _warn_of_unread(folder: Path, findings: Findings) -> None:
+    """Warn of images beside those that are read, in formats that are not read."""
+    names = sorted(entry.name for entry in folder.iterdir() if entry.suffix.lower() in _UNREAD and entry.name[0] != ".")
+    if names:
+        count = f"{len(names)} image{'s' * (len(names) > 1)}"
+        findings.warn(folder, f"{count} of other formats ({', '.join(names[:3])}{', …' if len(names) > 3 else ''})", "They are not read; convert them to PNG to use them")  # fmt: skip
 
 
 def _video_folder(path: Path, videos: Sequence[Path], findings: Findings) -> Contents | None:
@@ -362,6 +375,8 @@ def _with_sidecars(
         return None
     known = len(findings.problems)
     eyes_layout = stated_layout(root, images, findings)
+    if len(findings.problems) > known:
+        return None
     if eyes_layout is not None:
         if right_eye is not None or calibration is not None or (root / "images_right").exists():
             findings.problem(
@@ -378,8 +393,8 @@ def _with_sidecars(
     if calibration is None:
         calibration = beside.poses()
     right: FrameImages | None = right_eye or beside.right()
-    if right is None and (first := next(iter(images.frames(Findings())), None)) is not None:
-        warn_of_packed_eyes(root, first.image, findings)
+    if right is None:
+        warn_of_packed_eyes(root, images, findings, may_state=layout != "cameras")
     masks, depth = beside.masks(), beside.depth(described.get("depth_unit_mm"))
     tool_share = masks.check_polarity(findings) if masks else None
     valid_mask, labels, scans = beside.valid_mask(), beside.labels(), beside.scans()

@@ -7,7 +7,8 @@ Read as one eye, such pictures would be reconstructed as one wide scene without 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import get_args
 
@@ -31,6 +32,10 @@ _STEP = 16
 """Distance of neighbouring blocks in pixels."""
 _LARGEST_SHIFT = 0.3
 """Largest disparity that is searched, as a share of the width of an eye."""
+_VERTICAL = 6
+"""Largest vertical shift that is searched, in pixels of the reduced halves: the eyes of an endoscope are not rectified."""
+_SEARCHED, _SEARCH_STEP = 60, 10
+"""Number of pictures at the start in which one with texture is searched, and the distance of those that are tried."""
 _DETAIL_SIGMA = 6.0
 """Standard deviation in pixels of the blur that is subtracted, so that shading of the field of view does not count as similarity."""
 _LEAST_DETAIL = 2.0
@@ -39,7 +44,7 @@ _LEAST_BLOCKS = 8
 _SAME_ABOVE = 0.6
 """Median correlation of the blocks above which the halves show one scene.
 
-Pictures of two eyes have at least 0.71 in the real recordings and 0.85 in synthesised ones, halves of other pictures at most 0.41
+Pictures of two eyes have at least 0.71 in the real recordings and 0.85 in synthesised ones, halves of other pictures at most 0.49
 (benchmarks/packed_eyes.py).
 """
 
@@ -80,10 +85,10 @@ def stated_layout(root: Path, images: FrameImages, findings: Findings) -> Stereo
         return None
     for layout in get_args(StereoLayout):
         if stated == layout:
-            side, length = ("wide", images.width_px) if layout == "side_by_side" else ("high", images.height_px)
-            if length % 2:
+            if (images.width_px if layout == "side_by_side" else images.height_px) < 2:
+                size = f"{images.width_px}x{images.height_px} px"
                 findings.problem(
-                    path, f"stereo is {stated!r}, and the pictures are {length} px {side}", "Give an even number"
+                    path, f"stereo is {stated!r}, and the pictures are {size}", "Give pictures of two eyes"
                 )
                 return None
             return layout
@@ -91,16 +96,38 @@ def stated_layout(root: Path, images: FrameImages, findings: Findings) -> Stereo
     return None
 
 
-def warn_of_packed_eyes(path: Path, image: NDArray[np.uint8], findings: Findings) -> None:
-    """Warn if a picture, RGB uint8 [H, W, 3], holds two eyes. `path` is the file or folder named in the warning."""
-    for how, layout in zip(("side by side", "one above the other"), get_args(StereoLayout), strict=True):
-        if similarity(*halves(image, layout)) > _SAME_ABOVE:
-            findings.warn(
-                path,
-                f"{TWO_EYES}, {how}, and are read as those of one eye",
-                f'To split them, give a folder with them and a {DESCRIPTION_FILE} that states "stereo": "{layout}"',
-            )
+def warn_of_packed_eyes(path: Path, images: FrameImages, findings: Findings, *, may_state: bool) -> None:
+    """Warn if the first picture with texture holds two eyes.
+
+    Args:
+        path: file or folder named in the warning.
+        images: pictures, of which a few are decoded.
+        findings: receives the warning.
+        may_state: True if the recording may state the entry `stereo`, which the warning then proposes.
+    """
+    for picture in islice(images.frames(Findings()), 0, _SEARCHED, _SEARCH_STEP):
+        if picture is None:
+            continue
+        found = {layout: similarity(*halves(picture.image, layout)) for layout in get_args(StereoLayout)}
+        for layout, alike in found.items():
+            if alike is not None and alike > _SAME_ABOVE:
+                what = f"{TWO_EYES}, {_HOW[layout]}, and are read as those of one eye"
+                findings.warn(path, what, _remedy(layout, may_state))
+                return
+        if any(alike is not None for alike in found.values()):
             return
+
+
+_HOW: Mapping[StereoLayout, str] = {"side_by_side": "side by side", "top_bottom": "one above the other"}
+
+
+def _remedy(layout: StereoLayout, may_state: bool) -> str:
+    if not may_state:
+        return "Split them, and give the left ones in images/ and the right ones in images_right/"
+    return (
+        f"To split them, give a folder with them and a {DESCRIPTION_FILE} with"
+        f' {{"format": "intrasplat-recording", "version": 1, "stereo": "{layout}"}}'
+    )
 
 
 def halves(image: NDArray[np.uint8], layout: StereoLayout) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
@@ -111,11 +138,11 @@ def halves(image: NDArray[np.uint8], layout: StereoLayout) -> tuple[NDArray[np.u
     return image[:height], image[height : 2 * height]
 
 
-def similarity(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> float:
-    """Return the median over blocks of the left half of the best correlation with the same rows of the right half; 0 if fewer than
-    `_LEAST_BLOCKS` blocks have texture."""
+def similarity(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> float | None:
+    """Return the median over blocks of the left half of the best correlation with nearby rows of the right half; None if fewer
+    than `_LEAST_BLOCKS` blocks have texture."""
     if min(left.shape[:2]) < _BLOCK:
-        return 0.0
+        return None
     ours, theirs = _detail(left), _detail(right)
     height, width = ours.shape
     margin = round(_LARGEST_SHIFT * width)
@@ -123,12 +150,13 @@ def similarity(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> float:
     for y in range(0, height - _BLOCK + 1, _STEP):
         for x in range(0, width - _BLOCK + 1, _STEP):
             block = ours[y : y + _BLOCK, x : x + _BLOCK]
-            strip = theirs[y : y + _BLOCK, max(0, x - margin) : x + _BLOCK + margin]
+            rows = slice(max(0, y - _VERTICAL), y + _BLOCK + _VERTICAL)
+            strip = theirs[rows, max(0, x - margin) : x + _BLOCK + margin]
             if block.std() < _LEAST_DETAIL:
                 continue
             textured = strip.std() >= _LEAST_DETAIL
             best.append(float(cv2.matchTemplate(strip, block, cv2.TM_CCOEFF_NORMED).max()) if textured else 0.0)
-    return float(np.median(best)) if len(best) >= _LEAST_BLOCKS else 0.0
+    return float(np.median(best)) if len(best) >= _LEAST_BLOCKS else None
 
 
 def _detail(image: NDArray[np.uint8]) -> NDArray[np.float32]:

@@ -8,6 +8,7 @@ EndoGaussian, Deform3DGS and SurgicalGaussian use it on EndoNeRF's clips, which 
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing
 from functools import cached_property
@@ -16,6 +17,7 @@ from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 
+from gsplat_core.endoscope.sequence import picture_fault
 from gsplat_core.errors import InvalidInput, InvalidSetting
 from gsplat_core.io.recordings.contents import Contents
 from gsplat_core.io.recordings.layouts import inspect
@@ -168,6 +170,7 @@ def validate_recording(path: str | os.PathLike[str]) -> ValidationReport:
         return ValidationReport({"path": printable(os.fspath(path))}, findings.problems, findings.warnings)
     decoded = intact = causes = 0
     tissue = 0.0
+    empty: Counter[str] = Counter()
     damaged = DamagedFrames()
     for frame in contents.frames(findings):
         if len(findings.problems) >= MAX_REPORTED_PROBLEMS:
@@ -183,10 +186,18 @@ def validate_recording(path: str | os.PathLike[str]) -> ValidationReport:
                 findings.warn(f"{contents.root}, frame {frame.seq}", f"it is damaged: {frame.damage}", _DAMAGE_ADVICE)
         else:
             intact += 1
+            empty.update([fault] if (fault := picture_fault(frame.image)) else [])
             tissue += 1.0 if frame.mask is None else float(frame.mask.mean())
     if damaged.count:
         what = f"{damaged.count} frames are damaged, or may depend on damaged ones: {damaged.numbers()}"
         findings.warn(contents.root, what, _DAMAGE_ADVICE)
+    if empty:
+        causes_of = ", ".join(f"{fault}: {count}" for fault, count in empty.most_common())
+        what = f"{empty.total()} of {decoded} frames show nothing ({causes_of})"
+        if empty.total() == decoded:
+            findings.problem(contents.root, what, "Give a recording of tissue")
+        else:
+            findings.warn(contents.root, what, "They are withheld, and nothing is trained on them")
     images, calibration = contents.images, contents.calibration
     facts: dict[str, object] = {
         "path": printable(os.fspath(path)),

@@ -52,7 +52,7 @@ def all_of(source):
 def test_split_source_splits_picture_into_two_eyes(frame, layout, size):
     whole = default_camera(24, 16)
     mask, depth = np.ones((16, 24), np.uint8), np.full((16, 24), 50, np.float32)
-    given = [frame(k, mask=mask, depth=depth) for k in range(3)]
+    given = [frame(k, mask=mask, depth=depth, labels=mask, loss_mask=mask, depth_confidence=depth) for k in range(3)]
     source = SplitSource(Given(given, whole), layout)
     assert isinstance(source, FrameSource) and isinstance(source, ReportingSource)
     about = source.description
@@ -61,7 +61,8 @@ def test_split_source_splits_picture_into_two_eyes(frame, layout, size):
     for split, full in zip(all_of(source), given, strict=True):
         axis = 1 if layout == "side_by_side" else 0
         np.testing.assert_array_equal(np.concatenate([split.image, split.right_image], axis), full.image)
-        assert split.mask.shape == split.depth.shape == size[::-1] and split.image.flags.c_contiguous
+        planes = (split.mask, split.depth, split.labels, split.loss_mask, split.depth_confidence)
+        assert {plane.shape for plane in planes} == {size[::-1]} and split.image.flags.c_contiguous
     assert source.state is SourceState.ENDED and source.counts() == {}
 
 
@@ -73,9 +74,11 @@ def test_split_source_refuses_calibration_of_whole_picture():
         SplitSource(Given([], both), "side_by_side")
 
 
-def test_split_source_refuses_odd_width_and_stereo_source():
-    with pytest.raises(InvalidSetting, match="not two eyes side by side"):
-        SplitSource(Given([], default_camera(25, 16)), "side_by_side")
+def test_split_source_refuses_one_column_stereo_source_and_scans():
+    with pytest.raises(InvalidSetting, match="1x16 px, which are not two eyes side by side"):
+        SplitSource(Given([], Camera.from_focal(30.0, 1, 16)), "side_by_side")
+    with pytest.raises(InvalidSetting, match="range scans"):
+        SplitSource(Given([], default_camera(24, 16), fields=frozenset({"ranges"})), "top_bottom")
     with pytest.raises(InvalidSetting, match="has a right picture for each frame"):
         SplitSource(Given([], default_camera(24, 16), fields=frozenset({"right_image"})), "top_bottom")
 

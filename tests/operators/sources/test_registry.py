@@ -10,6 +10,7 @@ import pytest
 from gsplat_core.errors import InvalidSetting, RecordingMissing
 from gsplat_core.io.recordings import open_recording, synthesize
 from operators.applications.session import FirstFrames
+from operators.sources import registry
 from operators.sources.recording import RecordingSource
 from operators.sources.registry import SOURCES, SourceOptions, open_source
 
@@ -89,3 +90,18 @@ def test_open_source_refuses_empty_address(address, monkeypatch, tmp_path):
 def test_source_options_refuse_invalid_fps(value):
     with pytest.raises(InvalidSetting, match="fps is"):
         SourceOptions(fps=value)
+
+
+@pytest.mark.parametrize(
+    ("address", "rest"),
+    [
+        ("rtsp://h/s?stereo=side_by_side", "rtsp://h/s"),
+        ("rtsp://h/s?stereo=side_by_side&a=b", "rtsp://h/s?a=b"),
+        ("rtsp://h/s?a=b&stereo=side_by_side#stall_s=7", "rtsp://h/s?a=b#stall_s=7"),
+        ("rtsp://h/s#stereo=side_by_side", "rtsp://h/s"),
+        ("rtsp://h/s#stereo=side_by_side&stall_s=7&transport=udp", "rtsp://h/s#stall_s=7&transport=udp"),
+        ("rtsp://h/s#stall_s=7&stereo=side_by_side&transport=udp", "rtsp://h/s#stall_s=7&transport=udp"),
+    ],
+)
+def test_stereo_option_is_removed_from_address_alone(address, rest):
+    assert registry._stereo_of(address, SourceOptions()) == (rest, "side_by_side")

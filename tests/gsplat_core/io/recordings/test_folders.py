@@ -47,6 +47,31 @@ def test_validation_report_of_a_good_recording(endonerf_folder: Path) -> None:
     json.dumps(facts)
 
 
+@pytest.mark.parametrize("shade", [0, 255, None])
+def test_recording_that_shows_nothing_is_a_problem_and_some_such_frames_a_note(
+    tmp_path: Path, make: SimpleNamespace, shade: int | None
+) -> None:
+    for index in range(4):
+        empty = index < 3 if shade is None else True
+        image = np.full((40, 48, 3), shade or 0, np.uint8) if empty else make.frame_image(index)
+        cv2.imwrite(str(tmp_path / f"{index}.png"), image)
+    report = validate_recording(tmp_path)
+    if shade is None:
+        assert report.ok and any("3 of 4 frames show nothing (black: 3)" in str(each) for each in report.warnings)
+    else:
+        fault = "black" if shade == 0 else "one colour"
+        assert [f"4 of 4 frames show nothing ({fault}: 4)" in str(each) for each in report.problems] == [True]
+
+
+def test_images_of_formats_that_are_not_read_are_noted(tmp_path: Path, make: SimpleNamespace) -> None:
+    for name in ("01.png", "02.png", "03.tif", "04.BMP", "05.webp", "06.tiff", "._07.tif", "notes.txt"):
+        (tmp_path / name).touch()
+        if name.endswith(".png"):
+            cv2.imwrite(str(tmp_path / name), make.frame_image(1))
+    [note] = [note for note in open_recording(tmp_path).notes if "other formats" in note]
+    assert "4 images of other formats (03.tif, 04.BMP, 05.webp, …). They are not read; convert them to PNG" in note
+
+
 def test_cameras_json_intrinsics_poses_and_valid_mask(cameras_folder: Path, make: SimpleNamespace) -> None:
     recording = open_recording(cameras_folder)
     assert recording.frame_count == 5 and recording.fps == 20

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -13,7 +14,7 @@ import pytest
 
 from gsplat_core.errors import RecordingInvalid
 from gsplat_core.io.recordings import open_recording, validate_recording
-from gsplat_core.io.recordings.packed_eyes import TWO_EYES
+from gsplat_core.io.recordings.packed_eyes import TWO_EYES, halves, similarity
 from operators.sources.address import SourceOptions
 from operators.sources.registry import open_source
 
@@ -44,6 +45,54 @@ def _packed(folder: Path, rng: np.random.Generator, stereo: str, size: tuple[int
     return np.stack(eyes)
 
 
+@pytest.mark.parametrize("shift", [0, 4])
+@pytest.mark.parametrize("black", [False, True])
+def test_packed_pair_is_noticed_if_shifted_vertically_or_after_black_pictures(
+    tmp_path: Path, rng: np.random.Generator, shift: int, black: bool
+) -> None:
+    scene = _textured(rng, 220)
+    packed = np.concatenate([scene[: 160 - shift, 16:216], scene[shift:, :200]], 1)
+    for number in range(12):
+        cv2.imwrite(str(tmp_path / f"{number:03d}.png"), packed * (number > 9 or not black))
+    notes = [note for note in open_recording(tmp_path).notes if TWO_EYES in note]
+    assert len(notes) == 1
+    # The note's text is a complete recording.json.
+    (tmp_path / "recording.json").write_text(re.search(r"{.*}", notes[0])[0])  # type: ignore[index]
+    recording = open_recording(tmp_path)
+    assert recording.width_px == 200 and not any(TWO_EYES in note for note in recording.notes)
+
+
+def test_note_on_cameras_json_does_not_propose_stereo_entry(tmp_path: Path, rng: np.random.Generator) -> None:
+    scene = _textured(rng, 220)
+    cv2.imwrite(str(tmp_path / "0.png"), np.concatenate([scene[:, 16:216], scene[:, :200]], 1))
+    camera = {"width": 400, "height": 160, "fx": 300, "fy": 300, "cx": 200, "cy": 80}
+    frame = {"file": "0.png", "camera_to_world": np.eye(4).tolist()}
+    (tmp_path / "cameras.json").write_text(json.dumps(camera | {"frames": [frame]}))
+    [note] = [note for note in open_recording(tmp_path).notes if TWO_EYES in note]
+    assert "images_right/" in note and "recording.json" not in note
+
+
+@pytest.mark.parametrize(("stereo", "size"), [("side_by_side", (161, 401)), ("top_bottom", (321, 200))])
+def test_middle_row_or_column_of_odd_pictures_is_left_out(
+    tmp_path: Path, rng: np.random.Generator, stereo: str, size: tuple[int, int]
+) -> None:
+    image = rng.integers(0, 256, (*size, 3), dtype=np.uint8)
+    cv2.imwrite(str(tmp_path / "0.png"), image[..., ::-1])
+    height, width = size[0] // (2 if stereo == "top_bottom" else 1), 200
+    eyes = (image[:height, :width], image[height : 2 * height, :width] if stereo == "top_bottom" else image[:, 200:400])
+    split = open_source(f"recording:{tmp_path}?stereo={stereo}")
+    (tmp_path / "recording.json").write_text(
+        json.dumps({"format": "intrasplat-recording", "version": 1, "stereo": stereo})
+    )
+    with closing(split), closing(open_source(f"recording:{tmp_path}")) as stated:
+        for source in (split, stated):
+            source.open()
+            frame = source.read(30)
+            assert frame is not None and frame.right_image is not None
+            np.testing.assert_array_equal(frame.image, eyes[0])
+            np.testing.assert_array_equal(frame.right_image, eyes[1])
+
+
 @pytest.mark.parametrize("stereo", ["side_by_side", "top_bottom"])
 def test_recording_json_splits_pictures_into_two_eyes(tmp_path: Path, rng: np.random.Generator, stereo: str) -> None:
     eyes = _packed(tmp_path, rng, stereo)
@@ -67,15 +116,17 @@ def test_recording_json_splits_pictures_into_two_eyes(tmp_path: Path, rng: np.ra
 
 @pytest.mark.parametrize(
     ("stereo", "said"),
-    [("left_right", "Give side_by_side or top_bottom"), (1, "stereo is 1"), ("top_bottom", "161 px high")],
+    [("left_right", "Give side_by_side or top_bottom"), (1, "stereo is 1"), ("side_by_side", "1x200 px")],
 )
 def test_unusable_stereo_entry_is_refused(
     tmp_path: Path, stereo: object, said: str, refused: Callable[..., str]
 ) -> None:
-    cv2.imwrite(str(tmp_path / "0.png"), np.full((161, 200, 3), 90, np.uint8))
+    cv2.imwrite(str(tmp_path / "0.png"), np.full((200, 1, 3), 90, np.uint8))
     description = {"format": "intrasplat-recording", "version": 1, "stereo": stereo}
     (tmp_path / "recording.json").write_text(json.dumps(description))
     refused(tmp_path, RecordingInvalid, "recording.json", said)
+    report = validate_recording(tmp_path)
+    assert len(report.problems) == 1 and not any(TWO_EYES in str(each) for each in report.warnings)
 
 
 @pytest.mark.parametrize("beside", ["cameras.json", "images_right", "left and right"])
@@ -109,14 +160,20 @@ def test_damaged_packed_picture_is_reported_once(tmp_path: Path, rng: np.random.
     assert len(problems) == 1 and "001.png" in str(problems[0])
 
 
-@pytest.mark.parametrize("scale", [1.0, 0.3])
+@pytest.mark.parametrize("scale", [1.0, 0.51, 0.13])
 def test_address_splits_a_scaled_recording_with_the_assumed_camera(
     tmp_path: Path, rng: np.random.Generator, scale: float
 ) -> None:
     _packed(tmp_path, rng, "side_by_side", (200, 151))
     with closing(open_source(f"recording:{tmp_path}?stereo=side_by_side", SourceOptions(scale))) as source:
         about = source.description
+        assert (about.width_px, about.height_px) == (round(200 * scale), round(151 * scale))
         assert about.camera.K[0, 2] == pytest.approx(about.width_px / 2)
+        assert any("f = 180.0 px" in note for note in about.notes)
+        source.open()
+        frame = source.read(30)
+        assert frame is not None and frame.right_image is not None
+        assert frame.image.shape == frame.right_image.shape == (about.height_px, about.width_px, 3)
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
@@ -127,14 +184,10 @@ def test_one_eye_is_not_warned_of(tmp_path: Path, rng: np.random.Generator, mirr
     assert not any(TWO_EYES in note for note in open_recording(tmp_path).notes)
 
 
-@pytest.mark.parametrize("size", [(16, 16), (1, 640), (640, 1)])
-def test_small_pictures_are_compared_without_error(size: tuple[int, int]) -> None:
-    from gsplat_core.io.recordings.packed_eyes import warn_of_packed_eyes
-    from gsplat_core.io.recordings.plain_files import Findings
-
-    findings = Findings(strict=True)
-    warn_of_packed_eyes(Path("x"), np.zeros((*size, 3), np.uint8), findings)
-    assert not findings.warnings
+@pytest.mark.parametrize("size", [(16, 16), (1, 640), (640, 1), (200, 300)])
+def test_pictures_without_texture_are_not_compared(size: tuple[int, int]) -> None:
+    for layout in ("side_by_side", "top_bottom"):
+        assert similarity(*halves(np.zeros((*size, 3), np.uint8), layout)) is None
 
 
 @pytest.mark.recordings
