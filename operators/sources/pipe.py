@@ -227,10 +227,13 @@ class PipeSource(StreamSource):
             if self._describes_itself:
                 line = self._line(None)
                 if not line.startswith(FRAME):
-                    raise SourceLost(
-                        f"{self._name} is out of sync: {line[:16]!r} instead of the start of a frame. Restart its writer."
-                    )
+                    raise self._out_of_sync(line)
             yield self._exactly(self._raw.frame_bytes)
+
+    def _out_of_sync(self, found: bytes) -> SourceLost:
+        return SourceLost(
+            f"{self._name} is out of sync: {found[:16]!r} instead of the start of a frame. Restart its writer."
+        )
 
     def _read_header(self, until_s: float | None) -> None:
         header = Y4mHeader.parse(self._line(until_s))
@@ -241,6 +244,8 @@ class PipeSource(StreamSource):
         """Read up to the next line end, which is consumed."""
         while b"\n" not in self._pending:
             if len(self._pending) > MOST_HEADER_BYTES:
+                if self._raw is not None:
+                    raise self._out_of_sync(self._pending)
                 raise InvalidSetting(
                     f"{self._name} does not describe itself (it begins with {self._pending[:16]!r}); give ?size=640x512&format=rgb24"
                 )

@@ -307,6 +307,8 @@ def require_shown(outcome: RunOutcome) -> None:
         name = "the source" if source is None else source.description.name
         state = source.state_sentence if source is not None and source.state_sentence else outcome.stop_reason
         hint = "check that it is sending, or give more --seconds" if live else "check that it holds frames"
+        if source is not None and source.counts.get("cut_off"):
+            hint = "its data end within the first frame: check the size and format that the address states"
         raise NothingShown(f"nothing was shown: no frame came from {name} in {outcome.wall_s:.1f} s ({state}); {hint}")
     came = f"nothing was shown: {frames} {'frame' if frames == 1 else 'frames'} came"
     if not withheld:

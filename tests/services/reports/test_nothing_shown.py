@@ -81,6 +81,8 @@ def test_nothing_shown_states_source_state_if_no_frame_came():
     )
     assert "(end of stream)" in error_sentence(run_outcome("live", source(0), withheld()))
     assert error_sentence(run_outcome("replay", source(0))).endswith("check that it holds frames")
+    cut = error_sentence(run_outcome("live", source(0, counts={"cut_off": 1}), withheld()))
+    assert cut.endswith("check the size and format that the address states")
 
 
 def test_nothing_shown_if_run_ended_before_first_picture():
