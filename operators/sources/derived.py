@@ -161,8 +161,7 @@ class SplitSource(DerivedSource):
         beside = self._layout == "side_by_side"
         right = frame.image[:, width_px : 2 * width_px] if beside else frame.image[height_px : 2 * height_px]
         planes = {name: getattr(frame, name) for name in PLANES}
-        return replace(
-            frame,
+        return frame.with_fields(
             image=left(frame.image),
             right_image=np.ascontiguousarray(right[:height_px, :width_px]),
             **{name: left(plane) for name, plane in planes.items() if plane is not None},

@@ -217,7 +217,7 @@ def test_pipe_source_raises_source_lost_if_out_of_sync(fifo, reading, written, a
     written(fifo, b"YUV4MPEG2 W6 H4 F25:1 Cmono\n", b"FRAME\n", bytes(24), after)
     stream = reading(open_source(f"pipe:{fifo}", ALL))
     assert stream.frame().seq == 0
-    with pytest.raises(SourceLost, match="out of sync: b'12345678.* instead of the start of a frame"):
+    with pytest.raises(SourceLost, match=r"out of sync: b'12345678.* instead of the start of a frame"):
         stream.source.read(30)
 
 
