@@ -461,7 +461,7 @@ class Operations(StepOperations):
         Arguments of gsplat 1.6 that 1.5.3 does not have are given by name.
 
         Shapes, where `...` are any batch dimensions, common to all arguments:
-            means [..., N, 3]; quats [..., N, 4] wxyz, of any length but zero; scales [..., N, 3]; opacities [..., N];
+            means [..., N, 3]; quats [..., N, 4] wxyz, of any length from 1e-18 to 1e18; scales [..., N, 3]; opacities [..., N];
             colors [..., N, D] or [..., C, N, D] when `sh_degree` is None, else coefficients [..., N, K, 3] or
             [..., C, N, K, 3] with K >= (sh_degree + 1)², displayed as max(0, 0.5 + sum). None if `render_mode` has no RGB; D may
             be 0 if it has depth;
@@ -482,7 +482,7 @@ class Operations(StepOperations):
             render_mode: "RGB", "D" (depth z of the centres, weighted by alpha), "ED" (divided by alpha), "RGB+D" or "RGB+ED"
                 (depth is the last channel). "d", "Ed", "RGB-d" and "RGB-Ed" have the distance along the pixel's ray from the
                 camera to the highest density of each Gaussian in place of z. They need quats, scales and tiles of 16 px.
-                With a fisheye camera it is the distance to the Gaussian's centre.
+                With a fisheye camera it is the distance to the Gaussian's centre. Not with with_eval3d.
             absgrad: after backward, `meta["means2d"].absgrad` holds the sum of absolute gradients (Ye et al. 2024).
             rasterize_mode: "antialiased" scales the opacity by sqrt(det Σ / det (Σ + blur)) (Yu et al. 2024).
             camera_model: "pinhole", "ortho" or "fisheye" (equidistant).
@@ -491,7 +491,7 @@ class Operations(StepOperations):
                 "antialiased" to at least 0.005. "1.5.3" limits them to 0.999 and 0. A value at its limit has no gradient.
                 All other constants are equal.
             return_normals: `meta["normals"]` [..., C, H, W, 3] holds the sum of weight times shortest axis of the Gaussians in
-                world axes, towards the camera. Needs quats, scales and tiles of 16 px.
+                world axes, towards the camera. Needs quats, scales and tiles of 16 px. Not with with_eval3d.
             global_z_order: False blends the splats of a tile in the order of the distance of their centre, not of its z.
             extra_signals: further values [..., (C,) N, E], blended with the weights of the colours into
                 `meta["render_extra_signals"]` [..., C, H, W, E]; or [..., (C,) N, K, E] with `extra_signals_sh_degree`, blended
@@ -710,7 +710,9 @@ def blended_along_rays(
     for image in range(images):
         scene = image // dims[-1]
         view, K = flat(viewmats, 2)[image], flat(Ks, 2)[image]
-        centres, turned, sizes = flat(means, 2)[scene], flat(quats, 2)[scene], flat(scales, 2)[scene]
+        centres, turned = flat(means, 2)[scene], flat(quats, 2)[scene]
+        # As in the covariance, the sign of a scale has no effect, and a flat Gaussian is visible.
+        sizes = flat(scales, 2)[scene].abs().clamp(min=torch.finfo(scales.dtype).tiny)
         rays, axes = ops.splat_rays(centres, turned, sizes, view, K, settings.camera_model)
         if settings.camera_model == "fisheye":
             local = centres @ view[:3, :3].T + view[:3, 3]

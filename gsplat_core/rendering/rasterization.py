@@ -6,21 +6,20 @@ same result.
 
 from __future__ import annotations
 
-import contextlib
 import difflib
 import functools
 import inspect
 from collections.abc import Callable, Collection
 from dataclasses import replace
-from typing import Any, NamedTuple, ParamSpec, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from gsplat_core.ops.arguments import require_shape
 from gsplat_core.ops.compositing import rasterize_to_pixels
 from gsplat_core.ops.frame import STATUS_NEEDED, STATUS_OVERFLOW, Frame, View, WeightedFrame, render_frame
+from gsplat_core.ops.modes import in_plain_mode
 from gsplat_core.ops.native import CUDA_MISSING
 from gsplat_core.ops.packed_projection import values_of_rows, visible_harmonics
 from gsplat_core.ops.projection import fully_fused_projection
@@ -48,40 +47,7 @@ from gsplat_core.transfers import HostCopy
 
 __all__ = ["RenderOutput", "rasterization", "render"]
 
-P = ParamSpec("P")
-R = TypeVar("R")
 F = TypeVar("F", Frame, WeightedFrame)
-_AUTOCAST_DEVICES = ("cpu", "cuda")
-
-
-def in_plain_mode(function: Callable[P, R]) -> Callable[P, R]:
-    """Return `function`, which then runs without autocasting and refuses transforms that it would compute wrongly.
-
-    Products in half precision would misplace and misorder splats. Forward-mode derivatives of the compiled operations would
-    be zero.
-
-    Raises:
-        NotImplementedError: inside `torch.func.vmap`, `grad`, `jvp` and the like, and inside `forward_ad.dual_level`.
-    """
-
-    @functools.wraps(function)
-    def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        if not torch.compiler.is_compiling() and (
-            torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0
-        ):
-            raise NotImplementedError(
-                f"{function.__name__}() has no transforms of torch.func and no forward-mode derivatives; give batch"
-                " dimensions in place of vmap, and use backward() or torch.autograd.grad for gradients"
-            )
-        enabled = [device for device in _AUTOCAST_DEVICES if torch.is_autocast_enabled(device)]
-        if not enabled:
-            return function(*args, **kwargs)
-        with contextlib.ExitStack() as stack:
-            for device in enabled:
-                stack.enter_context(torch.autocast(device, enabled=False))
-            return function(*args, **kwargs)
-
-    return call
 
 
 NATIVE_CONSTANTS = "1.6"
@@ -315,6 +281,7 @@ class RenderOutput(NamedTuple):
     """Expected z [H, W] in the scene's unit, weighted by contribution; 0 where alpha is 0."""
 
 
+@in_plain_mode
 def render(gaussians: Gaussians, camera: Camera, background: Tensor | None = None, depth: bool = True) -> RenderOutput:
     """Render the Gaussians from one camera (Kerbl et al. 2023).
 

@@ -21,11 +21,12 @@ from gsplat_core.ops.arguments import (
     pack_surfels,
 )
 from gsplat_core.ops.depth_to_normal import depth_to_normal
+from gsplat_core.ops.modes import in_plain_mode
 from gsplat_core.ops.surfel_blending import rasterize_to_pixels_2dgs
 from gsplat_core.ops.surfel_projection import fully_fused_projection_2dgs, sparse_gradients
 from gsplat_core.ops.tiles import isect_offset_encode, isect_tiles
 from gsplat_core.rendering.pipeline import Meta, Signal, check_shapes, view_colors
-from gsplat_core.rendering.rasterization import in_plain_mode, step_by_step
+from gsplat_core.rendering.rasterization import step_by_step
 from gsplat_core.rendering.settings import (
     CONSTANTS,
     EPS2D,
@@ -74,7 +75,7 @@ def rasterization_2dgs(
     Differentiable in means, quats, scales, opacities, colors, viewmats and backgrounds.
 
     Shapes, where `...` are any batch dimensions, common to all arguments:
-        means [..., N, 3]; quats [..., N, 4] wxyz, of any length but zero, whose rotated z axis is the normal; scales
+        means [..., N, 3]; quats [..., N, 4] wxyz, of any length from 1e-18 to 1e18, whose rotated z axis is the normal; scales
         [..., N, 3], of which the third has no effect; opacities [..., N]; colors [..., N, D] or [..., C, N, D] when
         `sh_degree` is None, else coefficients [..., N, K, 3] or [..., C, N, K, 3] with K >= (sh_degree + 1)², displayed as
         max(0, 0.5 + sum); D may be 0 if `render_mode` has depth; viewmats [..., C, 4, 4] world to camera, OpenCV axes; Ks

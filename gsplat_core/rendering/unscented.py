@@ -76,10 +76,12 @@ def with_unscented_camera(
         special.append("camera_model='ftheta'")
     if special and not camera.with_ut:
         raise InvalidInput(f"{', '.join(special)} need with_ut=True")
-    if special and (settings.has_distance or settings.normals):
+    # Both are blended by the ellipses of the splats in an undistorted picture.
+    other_rays = [*special, *(["with_eval3d"] if camera.with_eval3d else [])]
+    if other_rays and (settings.has_distance or settings.normals):
         raise NotImplementedError(
-            f"distance along the rays and normals are not supported with {', '.join(special)}; use the render modes D and ED,"
-            " or undistort the pictures"
+            f"distance along the rays and normals are not supported with {', '.join(other_rays)}; use the render modes D and ED"
+            + (", or undistort the pictures" if special else ", or leave with_eval3d out")
         )
     if arguments.viewmats.dim() < 3 or means.dim() < 2:
         raise InvalidInput(f"viewmats must be [..., C, 4, 4], got {list(arguments.viewmats.shape)}")

@@ -16,9 +16,11 @@ from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.arguments import require_shape, require_trailing
+from gsplat_core.ops.modes import in_plain_mode
 from gsplat_core.ops.native import register_gradient
 
 
+@in_plain_mode
 def rasterize_to_pixels(
     means2d: Tensor,
     conics: Tensor,

@@ -8,9 +8,11 @@ import torch
 from torch import Tensor
 
 from gsplat_core.ops.arguments import check_covariance_arguments, require_float32
+from gsplat_core.ops.modes import in_plain_mode
 from gsplat_core.ops.native import register_gradient
 
 
+@in_plain_mode
 def quat_scale_to_covar_preci(
     quats: Tensor, scales: Tensor, compute_covar: bool = True, compute_preci: bool = True, triu: bool = False
 ) -> tuple[Tensor | None, Tensor | None]:

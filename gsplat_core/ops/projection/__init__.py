@@ -17,11 +17,13 @@ from gsplat_core.ops.arguments import (
     check_sparse_gradient,
     require_float32,
 )
+from gsplat_core.ops.modes import in_plain_mode
 from gsplat_core.ops.native import register_gradient
 from gsplat_core.ops.packed_projection import intrinsics_gradient, project_visible, world_covariances
 from gsplat_core.scene.cameras import CAMERA_MODELS
 
 
+@in_plain_mode
 def fully_fused_projection(
     means: Tensor,
     covars: Tensor | None,

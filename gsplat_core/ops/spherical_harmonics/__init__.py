@@ -9,9 +9,11 @@ import torch
 from torch import Tensor
 
 from gsplat_core.ops.arguments import check_spherical_harmonics_arguments, require_float32
+from gsplat_core.ops.modes import in_plain_mode
 from gsplat_core.ops.native import register_gradient
 
 
+@in_plain_mode
 def spherical_harmonics(degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None = None) -> Tensor:
     """Evaluate spherical harmonics in given directions, as gsplat 1.5.3.
 

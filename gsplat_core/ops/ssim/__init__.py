@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.autograd import Function
 
 from gsplat_core.errors import InvalidInput
+from gsplat_core.ops.modes import in_plain_mode
 from gsplat_core.ops.native import differentiable_once, register_gradient
 
 MAX_CHANNELS = 32
@@ -49,6 +50,7 @@ def _require_float32(image: Tensor, target: Tensor) -> None:
             )
 
 
+@in_plain_mode
 def fused_ssim(img1: Tensor, img2: Tensor, padding: str = "same", train: bool = True) -> Tensor:
     """Compute the mean structural similarity of pictures, with the signature of the package `fused-ssim`.
 

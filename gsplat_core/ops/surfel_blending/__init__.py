@@ -15,6 +15,7 @@ from torch import Tensor
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.arguments import require_shape, require_trailing
 from gsplat_core.ops.compositing import MAX_ALPHA, MIN_ALPHA, blend_pairs, blended_pairs
+from gsplat_core.ops.modes import in_plain_mode
 from gsplat_core.ops.native import register_gradient
 
 MAX_CHANNELS = 16
@@ -23,6 +24,7 @@ MAX_CHANNELS = 16
 SurfelImages = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 
 
+@in_plain_mode
 def rasterize_to_pixels_2dgs(
     means2d: Tensor,
     ray_transforms: Tensor,

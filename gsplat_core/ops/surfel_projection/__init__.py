@@ -15,9 +15,11 @@ from gsplat_core.ops.arguments import (
     pack_surfels,
     require_float32,
 )
+from gsplat_core.ops.modes import in_plain_mode
 from gsplat_core.ops.native import register_gradient
 
 
+@in_plain_mode
 def fully_fused_projection_2dgs(
     means: Tensor,
     quats: Tensor,

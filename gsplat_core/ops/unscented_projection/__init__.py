@@ -25,6 +25,7 @@ from gsplat_core.ops.arguments import (
     require_same_kind,
     require_shape,
 )
+from gsplat_core.ops.modes import in_plain_mode
 from gsplat_core.ops.native import register_gradient
 from gsplat_core.poses.se3 import RollingShutterType, Shutter
 from gsplat_core.scene.cameras import CAMERA_MODELS
@@ -214,6 +215,7 @@ def _ellipses(
     )
 
 
+@in_plain_mode
 def fully_fused_projection_with_ut(
     means: Tensor,
     quats: Tensor,

@@ -15,6 +15,7 @@ from torch.utils.checkpoint import checkpoint
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.arguments import require_kernels, require_same_kind, require_shape
+from gsplat_core.ops.modes import in_plain_mode
 from gsplat_core.ops.native import register_gradient
 from gsplat_core.ops.unscented_projection import UnscentedTransformParameters, checked_camera, sigma_offsets
 from gsplat_core.poses.se3 import RollingShutterType, Shutter
@@ -227,6 +228,7 @@ def _blend_tiles(
     return torch.cat([blended, through[..., -1:]], -1)
 
 
+@in_plain_mode
 def rasterize_to_pixels_eval3d(
     means: Tensor,
     quats: Tensor,

@@ -264,7 +264,7 @@ class SelectiveAdam(torch.optim.Adam):
             (parameter,) = group["params"]
             if parameter.grad is None or not parameter.numel():
                 continue
-            if not rows or parameter.numel() % rows:
+            if parameter.shape[:1] != (rows,):
                 raise InvalidInput(
                     f"visibility has {rows} values for a parameter of shape {list(parameter.shape)};"
                     " it needs one per row"

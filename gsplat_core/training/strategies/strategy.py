@@ -375,9 +375,12 @@ def relocate(
         generator: source of the random numbers, on the device of `mask`.
 
     Raises:
-        InvalidParameters: if `mask` has another type or length, or a trainable parameter has no optimiser.
+        InvalidParameters: if `mask` has another type or length or selects all Gaussians, or a trainable parameter has no
+            optimiser.
     """
     mask = _checked(params, mask)
+    if len(mask) and mask.all():
+        raise InvalidParameters(f"mask selects all {len(mask)} Gaussians; none is left whose place they could take")
     dead, alive = mask.nonzero()[:, 0], (~mask).nonzero()[:, 0]
     relocate_rows(params, optimizers, state, dead, alive, binoms, min_opacity, generator)
 
@@ -404,7 +407,13 @@ def relocate_rows(
         tensor[dead] = tensor[places]
         return Parameter(tensor, tensor.requires_grad)
 
-    update_rows(moved, lambda _, values: values.index_fill_(0, places, 0), params, optimizers)
+    def restarted(_: str, values: Tensor) -> Tensor:
+        values.index_fill_(0, places, 0)
+        # A moment that is not finite, as of a Gaussian with a NaN opacity, would make the moved row NaN again.
+        values[dead] = values[dead].where(values[dead].isfinite(), 0)
+        return values
+
+    update_rows(moved, restarted, params, optimizers)
     for _, rows in _rows_of(state):
         rows[places] = 0
 
@@ -484,6 +493,8 @@ def inject_noise_to_position(
 
 def draw(weights: Tensor, count: int, generator: torch.Generator | None = None) -> Tensor:
     """Draw `count` indices with replacement in proportion to `weights` [N], int64 [count]; a NaN is never drawn."""
+    if count == 0:
+        return torch.zeros(0, dtype=torch.int64, device=weights.device)
     weights = weights.nan_to_num(0.0)
     if len(weights) <= LARGEST_MULTINOMIAL:
         return torch.multinomial(weights, count, replacement=True, generator=generator)

@@ -61,6 +61,25 @@ def test_distance_to_tilted_plate_is_measured_along_ray():
     torch.testing.assert_close(normals, -normal.expand_as(normals), rtol=0, atol=1e-3)
 
 
+@pytest.mark.parametrize("camera_model", ["pinhole", "ortho", "fisheye"])
+def test_distance_and_normals_ignore_the_sign_of_scales_and_see_flat_gaussians(camera_model: str):
+    given = plate(2.0, 0.1) | {"scales": torch.tensor([[1.0, 1.2, 1e-6]])}
+    if camera_model == "ortho":
+        given["Ks"] = given["Ks"] * torch.tensor([[0.3, 1, 1], [1, 0.3, 1], [1, 1, 1]])
+    options = {"width": WIDTH, "height": HEIGHT, "render_mode": "RGB-Ed", "return_normals": True}
+    found = []
+    for factor in ([1.0, 1.0, 1.0], [1.0, 1.0, -1.0], [-1.0, 1.0, 1.0], [1.0, -1.0, 0.0]):
+        scales = (given["scales"] * torch.tensor(factor)).requires_grad_()
+        image, _, meta = rasterization(**(given | {"scales": scales}), camera_model=camera_model, **options)
+        image.sum().backward()
+        assert scales.grad is not None
+        found.append((image.detach(), meta["normals"].detach(), (scales.grad * torch.tensor(factor))[:, :2]))
+    assert found[0][0][..., 3].max() > 1.5 and found[0][1].any()
+    for each in found[1:]:
+        for one, other in zip(found[0], each, strict=True):
+            torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-3)
+
+
 @pytest.mark.parametrize("packed", [False, True])
 @pytest.mark.parametrize("cameras", [1, 2])
 def test_distance_and_normals_without_gaussians_are_zero(cameras: int, packed: bool):

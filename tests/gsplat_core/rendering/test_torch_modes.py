@@ -9,7 +9,7 @@ import torch
 from torch.autograd import forward_ad
 
 import gsplat_core
-from gsplat_core import rasterization, rasterization_2dgs
+from gsplat_core import Camera, Gaussians, rasterization, rasterization_2dgs, render
 
 RENDER = {
     "dense": lambda *a: rasterization(*a, 24, 16, packed=False)[0],
@@ -54,6 +54,43 @@ def test_rendering_rejects_vmap_and_forward_mode(render):
     with forward_ad.dual_level(), pytest.raises(NotImplementedError, match="no forward-mode derivatives"):
         of_means(forward_ad.make_dual(means, torch.ones_like(means)))
     assert of_means(means).any()
+
+
+def _scene_of(means):
+    _, quats, scales, opacities, colors, _, _ = arguments()
+    scene = Gaussians(means, quats, scales.log(), opacities.logit(), colors[:, None])
+    return render(scene, Camera.from_focal(20.0, 24, 16)).image
+
+
+OPERATIONS = {
+    "render": _scene_of,
+    "spherical_harmonics": lambda means: gsplat_core.spherical_harmonics(1, means, torch.ones(30, 4, 3)),
+    "quat_scale_to_covar_preci": lambda means: gsplat_core.quat_scale_to_covar_preci(torch.ones(30, 4), means.abs())[0],
+    "world_to_cam": lambda means: gsplat_core.world_to_cam(means, torch.eye(3).repeat(30, 1, 1), torch.eye(4)[None])[0],
+    "fully_fused_projection": lambda means: gsplat_core.fully_fused_projection(
+        means, None, *arguments()[1:3], *arguments()[5:], 24, 16
+    )[1],
+    "fully_fused_projection_2dgs": lambda means: gsplat_core.fully_fused_projection_2dgs(
+        means, *arguments()[1:3], *arguments()[5:], 24, 16
+    )[1],
+    "fully_fused_projection_with_ut": lambda means: gsplat_core.fully_fused_projection_with_ut(
+        means, *arguments()[1:4], *arguments()[5:], 24, 16
+    )[1],
+    "fused_ssim": lambda means: gsplat_core.fused_ssim(means.reshape(1, 3, 5, 6), torch.ones(1, 3, 5, 6)),
+}
+
+
+@pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated")  # by torch itself when jvp is first used
+@pytest.mark.parametrize("name", OPERATIONS)
+def test_operations_reject_forward_mode_and_are_unchanged_under_autocast(name):
+    means, function = arguments()[0], OPERATIONS[name]
+    with pytest.raises(NotImplementedError, match=rf"{name}\(\) has no transforms"):
+        torch.func.jvp(function, (means,), (torch.ones_like(means),))
+    with forward_ad.dual_level(), pytest.raises(NotImplementedError, match="no forward-mode derivatives"):
+        function(forward_ad.make_dual(means, torch.ones_like(means)))
+    expected = function(means)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert torch.equal(function(means), expected) and expected.any()
 
 
 @pytest.mark.parametrize("render", RENDER.values(), ids=RENDER.keys())

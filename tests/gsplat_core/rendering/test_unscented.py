@@ -152,6 +152,8 @@ def test_rolling_shutter_harmonics_use_pose_at_middle_of_readout():
         ({"with_ut": True, "sparse_grad": True}, InvalidInput, "leave sparse_grad out"),
         ({"with_ut": True, "covars": torch.eye(3).expand(60, 3, 3)}, InvalidInput, "quats and scales"),
         ({"with_ut": True, "radial_coeffs": torch.zeros(1, 6), "render_mode": "Ed"}, NotImplementedError, "D and ED"),
+        ({"with_eval3d": True, "render_mode": "RGB-Ed"}, NotImplementedError, "leave with_eval3d out"),
+        ({"with_eval3d": True, "return_normals": True}, NotImplementedError, "leave with_eval3d out"),
     ],
 )
 def test_unsupported_combination_error_names_alternative(options, error, words):

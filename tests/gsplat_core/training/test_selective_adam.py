@@ -31,8 +31,9 @@ def test_selective_adam_updates_only_visible_rows_without_bias_correction(dtype)
     assert optimizer.state[parameter]["exp_avg"].shape == parameter.shape
 
 
-def test_selective_adam_refuses_mask_of_wrong_length():
+@pytest.mark.parametrize("length", [1, 2, 3, 5, 12])
+def test_selective_adam_refuses_mask_of_wrong_length(length):
     parameter = torch.zeros(4, 3, requires_grad=True)
     parameter.grad = torch.ones(4, 3)
     with pytest.raises(InvalidInput, match="one per row"):
-        SelectiveAdam([parameter], 1e-8, (0.9, 0.999)).step(torch.ones(5, dtype=torch.bool))
+        SelectiveAdam([parameter], 1e-8, (0.9, 0.999)).step(torch.ones(length, dtype=torch.bool))

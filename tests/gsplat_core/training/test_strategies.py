@@ -409,10 +409,32 @@ def test_mcmc_relocates_gaussian_with_nan_opacity():
     params, optimizers = scene()
     with torch.no_grad():
         params["opacities"][3] = float("nan")
+    moments = [
+        state[name]
+        for each in optimizers.values()
+        for state in each.state.values()
+        for name in ("exp_avg", "exp_avg_sq")
+    ]
+    assert moments
+    for values in moments:
+        values[3] = float("nan")
     strategy = MCMCStrategy(refine_start_iter=0, refine_every=1, cap_max=COUNT + 1)
     strategy.step_post_backward(params, optimizers, strategy.initialize_state(), 1, {}, lr=0.0)
     assert len(params["means"]) == COUNT + 1 and params["opacities"].isfinite().all()
     assert 3 not in params["label"]
+    for each in optimizers.values():
+        for state in each.state.values():
+            assert state["exp_avg"].isfinite().all() and state["exp_avg_sq"].isfinite().all()
+
+
+def test_relocation_of_no_gaussian_changes_nothing_and_of_all_is_refused():
+    params, optimizers = scene()
+    before = {name: tensor.detach().clone() for name, tensor in params.items()}
+    ops.relocate(params, optimizers, {}, torch.zeros(COUNT, dtype=torch.bool), binomials())
+    ops.sample_add(params, optimizers, {}, 0, binomials())
+    with pytest.raises(InvalidInput, match=f"selects all {COUNT} Gaussians"):
+        ops.relocate(params, optimizers, {}, torch.ones(COUNT, dtype=torch.bool), binomials())
+    assert all(torch.equal(params[name], before[name]) for name in before)
 
 
 @pytest.mark.parametrize(
