@@ -297,6 +297,7 @@ class DepthOp(Operator):
         choice: `auto` or another value accepted by `check_depth`. Raises InvalidSetting otherwise.
         camera: camera of the frames.
         in_background: estimate depth in a background thread.
+        as_recorded: pass frames on as they are, as a live stream did that recorded them.
         has_time: allow `auto` to use estimators slower than the camera's frame rate.
         device: device of estimators that are not limited to the CPU.
         held_out: returns True for evaluation frames, which keep their recorded depth but are never passed to an
@@ -310,6 +311,7 @@ class DepthOp(Operator):
         choice: str,
         camera: Camera,
         in_background: bool = False,
+        as_recorded: bool = False,
         has_time: bool = False,
         device: str = "cpu",
         held_out: Callable[[Frame], bool] = lambda frame: False,
@@ -317,7 +319,7 @@ class DepthOp(Operator):
     ) -> None:
         check_depth(choice)
         self.choice, self.camera, self.held_out = choice, camera, held_out
-        self.has_time, self.device = has_time, device
+        self.as_recorded, self.has_time, self.device = as_recorded, has_time, device
         self.background = BackgroundDepth(choice, camera, device=device) if in_background else None
         """Estimator whose thread this operator starts and stops; None without `in_background`."""
         self._finder: DepthFinder | None = None
@@ -332,7 +334,7 @@ class DepthOp(Operator):
         self._counts = DepthCounts()
         if self.background is not None:
             self.background.start()
-        else:
+        elif not self.as_recorded:
             self._finder = DepthFinder(self.choice, self.camera, has_time=self.has_time, device=self.device)
 
     def stop(self) -> None:

@@ -216,6 +216,7 @@ class Pipeline(Application):
             choice="recorded" if pace.session is not None else settings.depth,
             camera=about.camera,
             in_background=pace.clock is not None,
+            as_recorded=pace.session is not None,
             # A finished model does not use depth.
             has_time=learns and pace.clock is None,
             device=settings.device,

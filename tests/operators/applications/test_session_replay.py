@@ -79,6 +79,14 @@ def eventful(frame: Frame) -> Frame:
     return frame.with_fields(loss_mask=loss_mask)
 
 
+def with_edges_in_depth(frame: Frame) -> Frame:
+    """Return the frame with a step in its measured depth, whose pixels a replay of a recording gives less confidence."""
+    assert frame.depth is not None
+    depth = frame.depth.copy()
+    depth[:, : 20 + frame.seq] *= 0.8
+    return frame.with_fields(depth=depth)
+
+
 def of_two_eyes(frame: Frame) -> Frame:
     """Return the frame without measured depth, with a cut at frame 6 and a smaller size from frame 11 on."""
     frame = frame.with_fields(depth=None, depth_origin=None, new_scene="cut" if frame.seq == 6 else None)
@@ -128,7 +136,7 @@ def replayed(folder: Path, **settings) -> RunOutcome:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("change", [as_it_is, eventful])
+@pytest.mark.parametrize("change", [as_it_is, eventful, with_edges_in_depth])
 def test_session_replay_reproduces_shown_pictures_byte_for_byte(tmp_path, change):
     live = record(tmp_path, change)
     recorded = live.find(RecordingResult)
