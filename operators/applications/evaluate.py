@@ -314,13 +314,21 @@ class _Work:
             end_s = min(end_s, self.playback.last_s)
         from_s = min([end_s - LAST_S, *(place.first[0] for place in places)])
         with self._log("retention") as record:
-            return evaluate_retention(
+            found = evaluate_retention(
                 self._frames("retention", from_s),
                 self._of_final_model(),
                 window_s=(self.model.time_window_s[0], end_s),
                 places=places,
                 record=record,
             )
+        for place in found.places:
+            for stay, score in ((place.visits.first, place.first), (place.visits.again, place.again)):
+                if not score.frames:
+                    covered = " to ".join(f"{each:.4g}" for each in self.model.time_window_s)
+                    self.notes.append(
+                        f"no frame was scored from {stay[0]:g} to {stay[1]:g} s; the model covers {covered} s"
+                    )
+        return found
 
     def _causal(self) -> CausalRun:
         settings = self._learning_settings()

@@ -499,6 +499,10 @@ def evaluation_table(report: EvaluationReport) -> list[str]:
         values = decibels(score.psnr_tissue_db), decibels(score.psnr_frame_db), ssim, decibels(score.worst_db)
         rows.append((f"{each.name}: {each.what}", str(score.frames), *values))
         rows += [_baseline(future(b), b.frames, b.psnr_tissue_db, b.psnr_frame_db) for b in each.baselines]
+    for place in [] if report.retention is None else report.retention.places:
+        for visit, stay, kept in (("first", place.first_s, place.first), ("again", place.again_s, place.again)):
+            what = f"place, {visit}: {stay[0]:.2f} to {stay[1]:.2f} s"
+            rows.append(_baseline(what, kept.frames, kept.psnr_tissue_db, kept.psnr_frame_db))
     if not found:
         rows += [_baseline(future(b), b.frames, b.psnr_tissue_db, b.psnr_frame_db) for b in report.baselines]
     widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]

@@ -143,7 +143,7 @@ class Requests:
             ClientError: if the answer is too large or too slow.
         """
         try:
-            with self._http.stream(method, path, **options) as answer:
+            with self._http.stream(method, checked_path(path), **options) as answer:
                 content = bytearray()
                 until_s = time.monotonic() + SLOWEST * self._timeout_s
                 for piece in answer.iter_bytes(CHUNK_BYTES):
@@ -195,7 +195,7 @@ class Requests:
         try:
             with (
                 PartialFile(file, overwrite=overwrite) as partial,
-                self._http.stream(method, path, **options) as answer,
+                self._http.stream(method, checked_path(path), **options) as answer,
             ):
                 if not answer.is_success:
                     raise refused_by(_with_body(answer, _read_some(answer)), self.url)
@@ -237,6 +237,14 @@ def checked_url(url: str) -> str:
             f"{url!r:.200} is no address of a server ({error}); give one such as https://room-1.example:8000"
         ) from error
     raise ClientError(f"{url!r:.200} is no address of a server; give one such as https://room-1.example:8000")
+
+
+def checked_path(path: str) -> str:
+    """Return a path of the API. Raises ClientError if a name in it would address something else, such as `../keys`."""
+    for segment in path.split("/")[1:]:
+        if segment in (".", "..") or set(segment) & set("?#%\\"):
+            raise ClientError(f"the request {path!r:.200} has a name that the service cannot have: {segment!r:.60}")
+    return path
 
 
 def checked_key(key: str) -> str:

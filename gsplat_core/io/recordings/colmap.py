@@ -320,6 +320,11 @@ def _images_of_text(path: Path) -> Iterator[tuple[int, tuple[float, ...], int, s
     is_points = False  # every second line, which may be empty, lists an image's points
     for line, text in _lines(path):
         if is_points or not text:
+            if text and not _lists_points(text):
+                raise RecordingInvalid(
+                    f"{path}: line {line} lists no points of the image in the line before: {text[:80]!r}; after each image, a"
+                    " line with its points is needed, which may be empty"
+                )
             is_points = False
             continue
         is_points = True
@@ -331,6 +336,16 @@ def _images_of_text(path: Path) -> Iterator[tuple[int, tuple[float, ...], int, s
         if len(parsed[1]) != 7:
             raise _malformed(path, line, text)
         yield parsed
+
+
+def _lists_points(text: str) -> bool:
+    """Return True if the text has three numbers for each point, judged by their count and the last one."""
+    values = text.split()
+    try:
+        float(values[-1])
+    except ValueError:
+        return False
+    return len(values) % 3 == 0
 
 
 def _points_of_text(path: Path) -> Iterator[tuple[float, ...]]:

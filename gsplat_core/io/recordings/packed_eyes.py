@@ -25,7 +25,7 @@ TWO_EYES = "its pictures seem to hold both eyes"
 """Text of the warning. A source that splits its pictures into two eyes leaves the warning out."""
 
 _WIDTH = 160
-"""Width in pixels to which each half is reduced."""
+"""Width in pixels to which each wider half is reduced."""
 _BLOCK = 24
 """Side of the compared blocks in pixels of the reduced halves."""
 _STEP = 16
@@ -161,7 +161,9 @@ def similarity(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> float | Non
 
 def _detail(image: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Return the grey levels of a half, reduced to `_WIDTH` columns, without their large-scale shading: float32 [H, W]."""
-    height = max(2 * _BLOCK, round(image.shape[0] * _WIDTH / image.shape[1]))
-    grey = cv2.resize(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), (_WIDTH, height), interpolation=cv2.INTER_AREA)
+    # Not enlarged: a block of a small half would then hold too little to be told from others.
+    width = min(_WIDTH, image.shape[1])
+    height = max(1, round(image.shape[0] * width / image.shape[1]))
+    grey = cv2.resize(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), (width, height), interpolation=cv2.INTER_AREA)
     levels = grey.astype(np.float32)
     return levels - cv2.GaussianBlur(levels, (0, 0), _DETAIL_SIGMA)

@@ -18,6 +18,7 @@ from services.client.requests import (
     MOST_PROBLEM_BYTES,
     Requests,
     checked_key,
+    checked_path,
     checked_url,
     picture_of,
     tls_context,
@@ -244,3 +245,19 @@ def test_tls_context_verifies_certificate_unless_disabled(tmp_path: Path) -> Non
         junk.write_bytes(content)
         with pytest.raises(ClientError, match=why):
             tls_context(str(junk))
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/v1/replays/1/results/../../keys",
+        "/v1/streams/./x",
+        "/v1/streams/a?b",
+        "/v1/streams/a#b",
+        "/v1/models/a%2F",
+    ],
+)
+def test_checked_path_refuses_names_that_address_something_else(path):
+    with pytest.raises(ClientError, match="has a name that the service cannot have"):
+        checked_path(path)
+    assert checked_path("/v1/replays/1/results/report.html") == "/v1/replays/1/results/report.html"

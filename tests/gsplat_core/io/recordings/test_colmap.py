@@ -96,6 +96,7 @@ def test_read_colmap_refuses_malformed_binary_scene(tmp_path, file, change, reas
         ("images.txt", " 10 set", " ten set", "line 2"),
         ("images.txt", " 10 set", " set", "line 2"),
         ("images.txt", " 10 set/", " 10 /", "not inside images"),
+        ("images.txt", "\n\n", "\n", "line 3 lists no points of the image in the line before"),
         ("cameras.txt", "20 PINHOLE", "10 PINHOLE", "defines camera 10 twice"),
         ("cameras.txt", "PINHOLE 40 30 50.0", "PINHOLE 40 30 1e-4", "0.0001 and 50 px; they must be at least 0.001"),
         ("images.txt", "set/001.png", "set/002.png", "has the image 'set/002.png' twice"),
