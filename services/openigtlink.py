@@ -163,6 +163,7 @@ class MessageServer:
                 if not full:
                     self._clients.add(client)
             if full:
+                log.warning("%s is refused: %d clients are connected already", address[0], MOST_CLIENTS)
                 client.close()
                 continue
             log.info("%s is connected", address[0])

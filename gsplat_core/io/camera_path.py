@@ -145,10 +145,15 @@ def _inria_path(text: bytes, name: str) -> CameraPath:
 def _check_rotation(name: str, key: str, pose: NDArray[np.float64]) -> None:
     rotation = pose[:3, :3]
     off = float(np.abs(np.clip(rotation, -2, 2) @ np.clip(rotation, -2, 2).T - np.eye(3)).max())
-    if off > ROTATION_TOLERANCE or np.linalg.det(rotation) < 0 or pose[3].tolist() != [0, 0, 0, 1]:
-        raise InvalidInput(
-            f"{name}: {key} must be a rotation and a translation, with 0 0 0 1 as its last row; its rotation is off by {off:.3g}"
-        )
+    if pose[3].tolist() != [0, 0, 0, 1]:
+        why = f"its last row is {' '.join(f'{value:g}' for value in pose[3])}"
+    elif off > ROTATION_TOLERANCE:
+        why = f"its rotation is off by {off:.3g}"
+    elif np.linalg.det(rotation) < 0:
+        why = "it mirrors"
+    else:
+        return
+    raise InvalidInput(f"{name}: {key} must be a rotation and a translation, with 0 0 0 1 as its last row; {why}")
 
 
 def _waypoint(reader: JsonObject) -> Waypoint:
