@@ -194,10 +194,7 @@ def validate_recording(path: str | os.PathLike[str]) -> ValidationReport:
     if empty:
         causes_of = ", ".join(f"{fault}: {count}" for fault, count in empty.most_common())
         what = f"{empty.total()} of {decoded} frames show nothing ({causes_of})"
-        if empty.total() == decoded:
-            findings.problem(contents.root, what, "Give a recording of tissue")
-        else:
-            findings.warn(contents.root, what, "They are withheld, and nothing is trained on them")
+        findings.warn(contents.root, what, "They are withheld, and nothing is trained on them")
     images, calibration = contents.images, contents.calibration
     facts: dict[str, object] = {
         "path": printable(os.fspath(path)),

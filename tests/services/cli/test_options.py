@@ -32,6 +32,8 @@ def may_work(option: str, value: str) -> bool:
     """Return true if the value could be valid. The test skips such values."""
     if option in NAMES:
         return value in NAMES[option]
+    if option == "--steps" and value == "auto":
+        return True
     try:
         if option in VALID:
             return int(float(value)) in VALID[option] if value.strip() == value else True
