@@ -18,12 +18,13 @@ _AUTOCAST_DEVICES = ("cpu", "cuda")
 def in_plain_mode(function: Callable[P, R]) -> Callable[P, R]:
     """Return `function`, which then runs without autocasting and refuses transforms that it would compute wrongly.
 
-    Products in half precision would misplace and misorder splats. Forward-mode derivatives of the compiled operations would
-    be zero.
+    Forward-mode derivatives of the compiled operations would be zero.
 
     Raises:
         NotImplementedError: inside `torch.func.vmap`, `grad`, `jvp` and the like, and inside `forward_ad.dual_level`.
     """
+
+    plain = without_autocast(function)
 
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -34,6 +35,16 @@ def in_plain_mode(function: Callable[P, R]) -> Callable[P, R]:
                 f"{function.__name__}() has no transforms of torch.func and no forward-mode derivatives; give batch"
                 " dimensions in place of vmap, and use backward() or torch.autograd.grad for gradients"
             )
+        return plain(*args, **kwargs)
+
+    return call
+
+
+def without_autocast(function: Callable[P, R]) -> Callable[P, R]:
+    """Return `function`, which then runs without autocasting: products in half precision would misplace and misorder splats."""
+
+    @functools.wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
         enabled = [device for device in _AUTOCAST_DEVICES if torch.is_autocast_enabled(device)]
         if not enabled:
             return function(*args, **kwargs)

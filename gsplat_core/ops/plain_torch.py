@@ -14,7 +14,7 @@ from torch import Tensor
 
 from gsplat_core.errors import InvalidInput
 from gsplat_core.ops.arguments import FOV_MARGIN, require_same_kind, require_shape, require_trailing
-from gsplat_core.ops.modes import in_plain_mode
+from gsplat_core.ops.modes import without_autocast
 from gsplat_core.scene.gaussians import COLOUR, LOG_SCALE, OPACITY, POSITION, RAW_COLUMNS, ROTATION, width_of
 
 BASIS_GROUPS = (POSITION, ROTATION, LOG_SCALE, COLOUR)
@@ -373,7 +373,7 @@ PROJECTIONS = {"pinhole": _pinhole, "ortho": _ortho, "fisheye": _fisheye}
 """Image points and Jacobians of each camera model."""
 
 
-@in_plain_mode
+@without_autocast
 def proj(
     means: Tensor, covars: Tensor, Ks: Tensor, width: int, height: int, camera_model: str = "pinhole"
 ) -> tuple[Tensor, Tensor]:
@@ -405,7 +405,7 @@ def proj(
     return means2d, jacobian @ covars @ jacobian.mT
 
 
-@in_plain_mode
+@without_autocast
 def world_to_cam(means: Tensor, covars: Tensor, viewmats: Tensor) -> tuple[Tensor, Tensor]:
     """Return centres [..., C, N, 3] and covariances [..., C, N, 3, 3] in the axes of each camera.
 

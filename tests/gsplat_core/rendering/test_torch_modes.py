@@ -66,7 +66,6 @@ OPERATIONS = {
     "render": _scene_of,
     "spherical_harmonics": lambda means: gsplat_core.spherical_harmonics(1, means, torch.ones(30, 4, 3)),
     "quat_scale_to_covar_preci": lambda means: gsplat_core.quat_scale_to_covar_preci(torch.ones(30, 4), means.abs())[0],
-    "world_to_cam": lambda means: gsplat_core.world_to_cam(means, torch.eye(3).repeat(30, 1, 1), torch.eye(4)[None])[0],
     "fully_fused_projection": lambda means: gsplat_core.fully_fused_projection(
         means, None, *arguments()[1:3], *arguments()[5:], 24, 16
     )[1],
@@ -91,6 +90,19 @@ def test_operations_reject_forward_mode_and_are_unchanged_under_autocast(name):
     expected = function(means)
     with torch.autocast("cpu", dtype=torch.bfloat16):
         assert torch.equal(function(means), expected) and expected.any()
+
+
+@pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated")  # by torch itself when jvp is first used
+def test_plain_torch_operations_are_unchanged_under_autocast_and_have_forward_derivatives():
+    means, covars = arguments()[0], 0.1 * torch.eye(3).expand(30, 3, 3)
+    views, Ks = arguments()[5:]
+    to_camera = lambda each: gsplat_core.world_to_cam(each, covars, views)
+    project = lambda each: gsplat_core.proj(*to_camera(each), Ks, 24, 16)[0]
+    expected = (*to_camera(means), project(means))
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert all(torch.equal(*pair) for pair in zip(expected, (*to_camera(means), project(means)), strict=True))
+    _, tangent = torch.func.jvp(project, (means,), (torch.ones_like(means),))
+    torch.testing.assert_close(tangent, (project(means + 1e-3) - project(means - 1e-3)) / 2e-3, rtol=1e-2, atol=1e-2)
 
 
 @pytest.mark.parametrize("render", RENDER.values(), ids=RENDER.keys())

@@ -165,3 +165,18 @@ def test_causal_protocol_uses_gaussian_count_of_run(
     learned = found.score
     assert (learned.start_from_motion, learned.depth_from_motion) == ((True, True) if prior else (config.start_from_motion, config.depth_from_motion))  # fmt: skip
     assert found.motion_prior == (prior or config.motion_prior) and (found.steps_per_frame, found.seed) == (12, 7)
+
+
+def test_retention_notes_stays_without_a_scored_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    visits = (evaluate.Visits((0.0, 1.0), (2.0, 3.0)), evaluate.Visits((0.0, 1.0), (5.0, 6.5)))
+    made = work(tmp_path, places=visits)
+    made.model = SimpleNamespace(time_window_s=(0.0, 4.0))  # type: ignore[assignment]
+    made.playback = SimpleNamespace(round_s=0.0, last_s=4.0)  # type: ignore[assignment]
+    monkeypatch.setattr(made, "_log", lambda name: nullcontext())
+    monkeypatch.setattr(made, "_frames", lambda *which: ())
+    monkeypatch.setattr(made, "_of_final_model", lambda: None)
+    scored = lambda stay: SimpleNamespace(frames=5 if stay[1] <= 4 else 0)
+    places = [SimpleNamespace(visits=each, first=scored(each.first), again=scored(each.again)) for each in visits]
+    monkeypatch.setattr(evaluate, "evaluate_retention", lambda *given, **options: SimpleNamespace(places=places))
+    assert made._retention().places == places
+    assert made.notes == ["no frame was scored from 5 to 6.5 s; the model covers 0 to 4 s"]

@@ -64,3 +64,13 @@ def test_evaluation_table_of_live_run_ends_with_ages() -> None:
     assert lines[1].split()[-2] == "–"
     live.age_when_shown = None
     assert len(runs.evaluation_table(report(live=live))) == 3
+
+
+def test_evaluation_table_lists_both_stays_at_each_place() -> None:
+    place = Facts(first_s=(0.0, 2.0), again_s=(60.0, 62.5), first=score(30.0), again=score(28.0))
+    kept = Facts(last=score(31.0), last_range_s=(50.0, 62.5), places=[place])
+    lines = runs.evaluation_table(report(retention=kept))
+    assert [line.split()[-3:] for line in lines[-2:]] == [["12", "30.00", "29.00"], ["12", "28.00", "27.00"]]
+    assert lines[-2].startswith("  place, first: 0.00 to 2.00 s") and lines[-1].startswith(
+        "  place, again: 60.00 to 62.50 s"
+    )
